@@ -9,11 +9,10 @@ the transmission (hw/transmission.py), on which the known-device conditions rest
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import (
@@ -23,6 +22,7 @@ from haptic_loop.cli.session_cli import (
     hold_session,
     steady_scenario,
 )
+from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
 from haptic_loop.hw.identify import (
@@ -50,12 +50,12 @@ _LIMITS = (
     "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "
     "between parts of a record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale; of all "
     "sittings the least. It does not see friction that changes with temperature or wear, nor that of a handle behind "
-    "its transmission apart from the motor's. What may be a dashpot behind a spring with 2 ms of memory or more is not "
-    "in delta, for it damps nothing at high frequency; a shorter memory counts as damping. A hand that rests on the "
-    "handle springs it: refused from 5 N/m on. One that only damps is not in the bound if nobody touched the handle in "
-    "one of the sittings. Dry friction is left out "
-    "of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the amplifier is not in "
-    "delta: it belongs to the delay. The bound holds up to the speed of the records; hw.bridge stops a handle there."
+    "its transmission apart from the motor's. What may be a dashpot behind a spring with 2 ms of memory or more is "
+    "not in delta, for it damps nothing at high frequency; a shorter memory counts as damping. A hand that rests on "
+    "the handle springs it: refused from 5 newtons per metre on. One that only damps is not in the bound if nobody "
+    "touched the handle in one of the sittings. Dry friction is left out of delta: it dissipates too, but ever less "
+    "than a viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay. The bound "
+    "holds up to the speed of the records; hw.bridge stops a handle there."
 )
 _TRANSMISSION_LIMITS = (
     "The bounds of motor and transmission (95 %, and 0.5 % for the encoder's scale) describe a spring and a damper in "
@@ -106,8 +106,6 @@ def main(argv: list[str]) -> int:
     """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
     args = _parser().parse_args(argv)
     scenario, settings = steady_scenario(args, "hw.identify"), check_link(args)
-    if scenario.unit == "rad":
-        raise InputError('unit is "rad": hw.identify records handles in metres; measure the damping of a wheel by hand')
     if boards_behind(args, scenario):
         raise InputError(f"--port is {args.port}: identify one board at a time, with a scenario of its device")
     low, high = args.band
@@ -186,14 +184,15 @@ def _sitting(
     With `clamped` handles it is a chirp of this part of the force, and nothing is estimated from it alone.
     """
     asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
-    swing = Swing.of(scenario, args.speed, 1e-3 * args.travel)
+    r = scenario.lever  # the options are for the hand
+    swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # a lighter device than declared is stopped there
-    session = session_for(asks_nothing, settings, cap=max(args.force, *swing.force), speed=fastest)
+    session = session_for(asks_nothing, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
     def played(link: int) -> Excitation:
         force, motion = (args.force, swing) if clamped is None else (clamped * args.force, None)
-        return chirp(scenario.channels, scenario.T, link, force, args.band, args.seconds, motion)
+        return chirp(scenario.channels, scenario.T, link, r * force, args.band, args.seconds, motion)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
@@ -205,9 +204,9 @@ def _sitting(
             told = "clamp every handle to the bench; then press a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
-    alone = nobody(scenario, args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
+    alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
     seconds = played(1).seconds - 0.2  # the lead has the ramp
-    live = hold_session(args, session, plan, seconds, out, alone, args.coulomb)
+    live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
         try:
@@ -253,7 +252,7 @@ def _with_transmissions(
         try:
             first, *others = (records_of(s.recorder, s.session)[i] for s in (free, *clamped))
             step = free.session.units.encoder_step[i]
-            bounds.append(transmission_bounds(first, others, scenario.T, step, free.axes[i].friction))
+            bounds.append(transmission_bounds(first, others, scenario.T, step, free.axes[i].friction, scenario.lever))
         except ValueError as error:
             return replace(report, no_transmissions=f"axis {i + 1}: {error}")
     return replace(report, transmissions=bounds)
@@ -262,9 +261,9 @@ def _with_transmissions(
 def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
     """Write one [[device]] table for a scenario file; a transmission that was not identified is the scenario's."""
     device, mass = scenario.axis_devices[i], e.friction.mass
-    lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
-    speed = np.floor(1e3 * e.viscosity.speed) / 1e3
-    lines.append(f"credible_speed = {speed:.3f}  # [m/s] of the record: delta is not known beyond it")
+    lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {_floored(e.delta, 6)}"]
+    comment = in_unit("# [m/s] of the record: delta is not known beyond it")
+    lines.append(f"credible_speed = {_floored(e.viscosity.speed, 3)}  {comment}")
     if isinstance(device, RigidDevice):
         return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
     if bounds:
@@ -273,9 +272,10 @@ def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[Transmissio
         lines += ['kind = "compliant"', *(f"{name} = {getattr(known, name):.6g}" for name in names)]
         lines += ["[device.guaranteed]  # with 95 % confidence, at the forces of the record"]
         least, most = ("motor_mass_min", "transmission_damping_min"), "transmission_damping_max"
-        lines += [f"{name} = {np.floor(1e6 * getattr(known, name)) / 1e6:.6f}" for name in least]
-        lines += [f"{most} = {np.ceil(1e6 * getattr(known, most)) / 1e6:.6f}"]
-        return "\n".join([*lines, f"transmission_stiffness_max = {np.ceil(known.transmission_stiffness_max):.1f}", ""])
+        lines += [f"{name} = {_floored(getattr(known, name), 6)}" for name in least]
+        lines += [f"{most} = {-float(_floored(-getattr(known, most), 6)):.6g}"]
+        stiffest = f"{-float(_floored(-known.transmission_stiffness_max, 0)):.6g}"
+        return "\n".join([*lines, f"transmission_stiffness_max = {stiffest}", ""])
     if (transmission := e.transmission) is not None:
         motor, handle, stiffness = transmission.motor_mass, transmission.handle_mass, transmission.stiffness
     else:
@@ -284,6 +284,12 @@ def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[Transmissio
         handle, stiffness = mass - motor, device.transmission_stiffness
     masses = [f"motor_mass = {motor:.6g}", f"handle_mass = {handle:.6g}"]
     return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
+
+
+def _floored(value: float, decimals: int) -> str:
+    """Return a number that is never above `value`, with `decimals` or, where it is small, four digits."""
+    decimals = max(decimals, 3 - math.floor(math.log10(abs(value)))) if value else decimals
+    return f"{math.floor(value * 10**decimals) / 10**decimals:.{decimals}f}"
 
 
 def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
@@ -304,8 +310,8 @@ def _figures(report: _Report) -> render.Table:
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{getattr(friction, name):.5g} ± {2 * friction.errors[name]:.2g}" for name in names]
-        bound = f"{np.floor(1e4 * axis.delta) / 1e4:.4f}" if report.bounded else "-"  # never above the bound
-        cells.append((str(i), *figures, mode, bound, f"{np.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
+        bound = _floored(axis.delta, 4) if report.bounded else "-"  # never above the bound
+        cells.append((str(i), *figures, mode, bound, f"{math.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
     heads = (
         *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),
         "up to [m/s]",

@@ -11,7 +11,7 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -90,6 +90,7 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # parse_args calls it
         """Parse as argparse does; refuse empty values, and a --json file that cannot be written."""
+        self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
             what = "option" if rest[0].startswith("-") else "word"
@@ -115,6 +116,11 @@ class Parser(argparse.ArgumentParser):
         return did_you_mean(word.partition("=")[0], known)
 
     def error(self, message: str) -> NoReturn:
+        """Raise InputError, with the units of the scenario that the options name."""
+        scenarios = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+        scenarios.add_argument("--scenario", default=DEFAULT)
+        with suppress(argparse.ArgumentError, InputError):
+            speak(load(scenarios.parse_known_args(self._words)[0].scenario).unit)
         if choice := _CHOICE.fullmatch(message):
             allowed = choice[3].replace("'", "")
             raise InputError(f"{choice[1]} is {choice[2]}, allowed are {allowed}")

@@ -124,7 +124,7 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
         return min(1.0, known) / scenario.lever
     if args.max_speed > known:
         raise InputError(
-            f"--max-speed is {args.max_speed:g} m/s, the least credible_speed of the devices is {known:g}: "
+            f"--max-speed is {args.max_speed:g}, the devices' least credible_speed is {known:g} metres/s at the hand: "
             "their damping is not known beyond it (hw.identify --speed)"
         )
     return args.max_speed / scenario.lever

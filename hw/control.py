@@ -286,7 +286,9 @@ class Drive:
         about = limits.cap, T, units, expected, still, config.theta == 0, limits.lever
         self._test = monitor.EncoderTest(*about) if settings.test_encoders else None
         self._last_test = monitor.EncoderTest(*about, alive=True) if settings.test_encoders else None
-        self._encoders = monitor.EncoderMonitor(units.encoder_step, units.force_step, T, still, limits.lever)
+        self._encoders = monitor.EncoderMonitor(
+            units.encoder_step, units.force_step, T, still, limits.lever, limits.cap
+        )
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick

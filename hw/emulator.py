@@ -223,7 +223,7 @@ class _EmulatedPlant:
             self._w = self._next_outside() * (not self.still)
         f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
         for _ in range(self._substeps):
-            friction = self.coulomb * np.tanh(self.s[n : n + m] / _SLIP) if self.coulomb else 0.0
+            friction = self.coulomb * np.tanh(self.s[n : n + m] * self.scenario.lever / _SLIP) if self.coulomb else 0.0
             self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])
             self.fastest = max(self.fastest, float(np.abs(self.s[n : n + m]).max()))
 

@@ -24,7 +24,8 @@ What friction dissipates per speed squared is least at high speed, where b alone
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -306,6 +307,28 @@ def nonviscous(x: Array, T: float, step: float, found: Friction) -> Array:
 def _speed_window(step: float, T: float) -> float:
     """Return the standard deviation [s] of the shortest window in which rounding leaves _SPEED_NOISE."""
     return max(T, (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3))
+
+
+#: power of the radius by which figures at the hand, in metres, become those of a rotary axis, in radians
+_SQUARED = "mass viscous stiffness delta thinning thinning_error lasting motor_mass handle_mass motor_mass_min"
+_SQUARED += " transmission_stiffness transmission_stiffness_max"
+_SQUARED += " transmission_damping transmission_damping_min transmission_damping_max"
+_POWERS = dict.fromkeys(_SQUARED.split(), 2) | dict.fromkeys(["coulomb", "constant", "drift", "static", "rms"], 1)
+_POWERS |= dict.fromkeys(["slip", "reach", "periods", "speed"], -1) | {"drag": 3}
+_Figures = TypeVar("_Figures")  # a dataclass of figures
+
+
+def at_radius(figures: _Figures, r: float) -> _Figures:
+    """Return the figures of an axis that a hand holds at the radius r [m], from those in metres at the hand."""
+
+    def turned(values: dict[str, Any]) -> dict[str, Any]:
+        return {
+            name: np.multiply(value, r ** _POWERS[name]).tolist() for name, value in values.items() if name in _POWERS
+        }
+
+    each: Any = figures
+    errors = {"errors": turned(each.errors)} if isinstance(figures, Friction) else {}
+    return each if r == 1.0 else replace(each, **turned(vars(each)), **errors)
 
 
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:

@@ -3,8 +3,7 @@
 The excitation is a chirp of a small force, slow motion at half of it, a swing that reaches the speed of a session, a
 chirp of the swing's force, then silence: a force that does not depend on the motion closes no loop, so no certificate
 is needed. Mass and friction come from the balance of forces (hw/friction.py), which must be one of viscous friction
-(hw/viscosity.py); the transmission comes from the spectra of what force is left and of the motion: least squares over
-the chirp's frequencies.
+(hw/viscosity.py); the transmission comes from the spectra of what force is left and of the motion, by least squares.
 """
 
 from __future__ import annotations
@@ -16,18 +15,16 @@ if __name__ == "__main__":  # before the imports, which --help does without
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array, frozen
 from haptic_loop.hw.control import Controller
-from haptic_loop.hw.friction import Friction, dry_friction, friction
+from haptic_loop.hw.friction import Friction, at_radius, dry_friction, friction
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session
-from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
+from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, viscosity
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
@@ -35,13 +32,8 @@ _LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's fo
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest
 _CYCLES = 3  # of each of them
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
-_MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
-_PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
-_STARTS = 2  # of these, from which the fit begins
-_SPECTRUM = 250  # frequencies that are compared first
-_SLOWEST_HZ, _LOUD = 20.0, 0.2  # where the motion tells of a transmission; part of the strongest force there
-_FLOOR = 1e-12  # of a ratio whose logarithm is taken
-_OUTLIER = 0.1  # of a logarithm, from which it counts less: a resonance is narrow
+_BAND_HZ = (20.0, 300.0)  # where the motion tells of a transmission
+_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # log m1, log m2, log k, log d, b, lag and delay
 _STEPS = 40  # of a fit
 _VAGUE = 0.3  # part of the motion that may stay unexplained: beyond, it is not this transmission
 _SPRUNG = 5.0  # [N/m] from which on it may be a hand: a cable has less
@@ -181,19 +173,23 @@ class Estimate:
         return min(self.friction.delta, self.viscosity.lasting)
 
 
-def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Estimate:
+def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: float = 1.0) -> Estimate:
     """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], period [s], encoder step [m].
+
+    Radians and N m of an axis that a hand holds at the radius `lever` [m] are fitted as metres and N at the hand.
 
     Raises ValueError where the device did not move, a hand holds it, nothing is left of its damping, or its damping
     falls with speed or frequency.
     """
     if np.ptp(x) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x) / step:.0f} encoder steps, at least 20 are needed")
-    law = friction(x, force, T, step)
+    hand = lever * x, force / lever, T
+    found = friction(*hand, lever * step)
+    law, allowed = at_radius(found, lever), _SPRUNG * lever**2
     # one that is too uncertain to exclude a hand is refused as well
-    if (most := law.stiffness + 2 * law.errors["stiffness"]) > _SPRUNG:
+    if (most := law.stiffness + 2 * law.errors["stiffness"]) > allowed:
         raise ValueError(
-            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, at most {_SPRUNG:g} may be): a hand "
+            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, at most {allowed:.3g} may be): a hand "
             "or a finger rests on it? Its damping would be taken for the device's; let go, or loosen the spring"
         )
     if law.delta <= 0:
@@ -201,79 +197,32 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Esti
             f"the record does not tell viscous from dry friction: {law.viscous:.3g} N s/m viscous, "
             f"{law.coulomb:.3g} N dry, {1e3 * law.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
-    examined = viscosity(x, force, T, step, law)
+    examined = at_radius(viscosity(*hand, lever * step, found), lever)
     if reason := doubt(examined, law):
         raise ValueError(reason)
-    return Estimate(law, None if rigid else _transmission(x, force, T, law), examined)
-
-
-# The transmission. The encoder is the motor's, where dry friction acts, so that the force less that friction drives a
-# linear plant. A record begins and ends at rest: the spectrum of its steps x[k+1] - x[k] over z - 1 is that of the
-# motion, without leakage.
-
-
-class _Spectrum:
-    """The expected response of a motor m1 and a handle m2 behind a spring k; p = [log m1, log b, log m2, log k]."""
-
-    def __init__(self, x: Array, force: Array, T: float) -> None:
-        F, steps, hz = np.fft.rfft(force), np.fft.rfft(np.diff(x, append=x[-1])), np.fft.rfftfreq(len(x), T)
-        heard = hz > _SLOWEST_HZ
-        heard &= np.abs(F) > _LOUD * np.abs(F[heard]).max()
-        self.T, self.z, self.force = T, np.exp(2j * np.pi * T * hz[heard]), F[heard]
-        self.motion = steps[heard] / (self.z - 1)
-
-    def model(self, p: Array, every: int = 1) -> NDArray[np.complex128]:
-        """Return the motion of this model at every so many frequencies, exact for a force held between ticks."""
-        import scipy
-
-        m1, b, m2, k = np.exp(p)
-        a = np.zeros((5, 5))
-        a[0, 2] = a[1, 3] = 1.0
-        a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
-        a[3, :2] = [k / m2, -k / m2]
-        held, z = np.asarray(scipy.linalg.expm(a * self.T), dtype=np.float64), self.z[::every]
-        apart, drive = z[:, None, None] * np.eye(4) - held[:4, :4], np.broadcast_to(held[:4, 4:], (z.size, 4, 1))
-        return np.linalg.solve(apart, drive)[:, 0, 0] * self.force[::every]
-
-    def decades(self, p: Array, every: int = 1) -> Array:
-        """Return the logarithms of the ratio of model and motion, by which a fit finds the mode from far away."""
-        return np.log(np.abs(self.model(p, every)) + _FLOOR) - np.log(np.abs(self.motion[::every]) + _FLOOR)
-
-    def error(self, p: Array) -> Array:
-        """Return motion less model, real and imaginary parts."""
-        error = self.motion - self.model(p)
-        return np.concatenate([error.real, error.imag])
-
-    def starts(self, found: Friction) -> list[Array]:
-        """Return initial parameters from those of a stiff device."""
-        every, points = max(1, self.z.size // _SPECTRUM), list[tuple[float, Array]]()
-        for hz, part in product(_MODES_HZ, _PARTS):
-            m1, m2 = part * found.mass, (1 - part) * found.mass
-            k = (2 * np.pi * hz) ** 2 * m1 * m2 / found.mass
-            point = np.array([np.log(m1), max(np.log(found.viscous), -2.0), np.log(m2), np.log(k)])
-            # absolute: a few frequencies of a resonance may lie far apart
-            points.append((float(np.abs(self.decades(point, every)).mean()), point))
-        best: dict[float, Array] = {}
-        for _, point in sorted(points, key=lambda entry: entry[0]):
-            best.setdefault(round(float(point[0]), 6), point)  # the best mode of every split
-        return list(best.values())[:_STARTS]
+    transmission = None if rigid else _transmission(*hand, found)
+    return Estimate(law, transmission and at_radius(transmission, lever), examined)
 
 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
-    """Return the transmission that explains a record, or None."""
+    """Return the transmission that explains the spectrum of a record, or None.
+
+    The encoder is the motor's, where dry friction acts: the force less that friction drives a linear plant.
+    """
     import scipy
 
-    spectrum, fits = _Spectrum(x, force - dry_friction(x, T, found), T), []
-    for start in spectrum.starts(found):
-        robust: dict[str, Any] = {"loss": "soft_l1", "f_scale": _OUTLIER, "max_nfev": _STEPS}
-        near = scipy.optimize.least_squares(spectrum.decades, start, **robust).x
-        fits.append(scipy.optimize.least_squares(spectrum.error, near, x_scale="jac", max_nfev=_STEPS))
+    spectrum = Spectra(x, force - dry_friction(x, T, found), T, band=_BAND_HZ, points=len(x))
+
+    def error(p: Array) -> Array:
+        return spectrum.error(np.append(p, 0.0), 1.0)  # without memory
+
+    how: dict[str, Any] = {"bounds": (_LEAST, np.inf), "x_scale": "jac", "max_nfev": _STEPS}
+    fits = [scipy.optimize.least_squares(error, start[:7], **how) for start in spectrum.starts(found)]
     fit = min(fits, key=lambda fit: fit.cost)
-    if 2 * fit.cost > (_VAGUE * np.linalg.norm(spectrum.motion)) ** 2:
+    if 2 * fit.cost > (_VAGUE * np.linalg.norm(spectrum.motion) / np.abs(spectrum.motion).max()) ** 2:
         return None
-    m1, _, m2, k = np.exp(fit.x)
-    mode = np.sqrt(k * (m1 + m2) / (m1 * m2)) / (2 * np.pi)
-    return _Transmission(float(m1), float(m2), float(k), float(mode))
+    m1, m2, k = np.exp(fit.x[:3])
+    return _Transmission(float(m1), float(m2), float(k), float(np.sqrt(k * (m1 + m2) / (m1 * m2)) / (2 * np.pi)))
 
 
 # from a session's record
@@ -372,7 +321,8 @@ def estimate(
         progress(i, scenario.channels, f"estimating axis {i + 1}")
         try:
             step = session.units.encoder_step[i]
-            estimates.append(identify(*records[i], scenario.T, step, device.transmission is None))
+            rigid = device.transmission is None
+            estimates.append(identify(*records[i], scenario.T, step, rigid, scenario.lever))
         except ValueError as error:
             raise ValueError(f"axis {i + 1}: {error}") from None
     return estimates

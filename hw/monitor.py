@@ -563,7 +563,7 @@ class EncoderTest:
         A STATE tells the force that acts after it, or with `at_once` (theta = 0) the one that acted before it.
         `lever` [m] turns a force into the torque of a rotary device.
         """
-        self._at_once, self._strongest = at_once, _TEST_FORCE * lever
+        self._at_once, self._strongest = at_once, [min(one, _TEST_FORCE * lever) for one in cap]
         self._cap, self._T, self._units, self._expected, self._alive = cap, T, units, expected, alive
         self._still = tuple(still or (1,) * len(cap))
         self._axis, self._last = -1, None
@@ -599,7 +599,7 @@ class EncoderTest:
         since = self._ticks - before
         if since <= 0:
             return (0.0,) * len(self._cap)
-        size = min(self._cap[self._axis], self._strongest * 2.0 ** (self._block + 1 - _BLOCKS))
+        size = self._strongest[self._axis] * 2.0 ** (self._block + 1 - _BLOCKS)
         sign = -1 if (since + half // 2) // half % 2 else 1
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
@@ -641,7 +641,7 @@ class EncoderTest:
 
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""
-        axis, most = self._axis + 1, min(self._strongest, self._cap[self._axis])
+        axis, most = self._axis + 1, self._strongest[self._axis]
         at = f"a test force of up to {most:g} N"
         if self._pushed < _PUSHED * most:
             tested = f"motor and encoder of axis {axis} are not tested"
@@ -658,7 +658,7 @@ class EncoderMonitor:
 
     No living hand holds a handle within one count under a changing force; an encoder with one broken channel still
     toggles between two counts. The force that the device reports is compared with that at the last motion, and a change
-    of more than 1 N is summed up over time. A mass M that a
+    of more than 1 N, or of half a weaker motor's force, is summed up over time. A mass M that a
     change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long. Under
     a force that does not change, of more than 0.3 N, no hand holds still for half a second: its tremor shows.
     """
@@ -670,9 +670,12 @@ class EncoderMonitor:
         T: float,
         still: Sequence[int] | None = None,
         lever: float = 1.0,
+        cap: Sequence[float] = (),
     ) -> None:
-        """`still` (m,) [counts] are within noise; `lever` [m] turns a force into a torque."""
+        """`still` (m,) [counts] are within noise; `lever` [m] turns a force into a torque, at most `cap` (m,) [N]."""
         self._lever = lever
+        #: (m,) [N] what stands for 1 N: half of what a weak motor can do
+        self._newton = [min(lever, most / 2) for most in cap] or [lever] * len(force_step)
         self._still = tuple(still or (1,) * len(force_step))
         self._quiet = [0.0] * len(force_step)  # [s] under a force without a motion
         self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
@@ -695,13 +698,14 @@ class EncoderMonitor:
             elif n < band[0]:
                 band[0] = n
             change = abs(force - self._reference[i])
-            if change > _CHANGE * self._lever:
+            newton = self._newton[i]
+            if change > _CHANGE * newton:
                 self._impulse[i] += change * ticks * self._T
             q = self._encoder_step[i] * still
-            if self._impulse[i] > max(_IMPULSE * self._lever, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
+            if self._impulse[i] > max(_IMPULSE * newton, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                 doing = f"it stands still while the force changes by {change:.3g} N"
                 raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
-            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING * self._lever else 0.0
+            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING * newton else 0.0
 
     @property
     def dead(self) -> str | None:

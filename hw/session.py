@@ -102,7 +102,7 @@ class Session:
             for i, (n, then, step) in enumerate(places, 1)
             if abs(n - then) * step < _ELSEWHERE / self.limits.lever
         ]
-        where = f"within {1e3 * _ELSEWHERE:g} mm of where it was in the sitting before"
+        where = f"within {1e3 * _ELSEWHERE / self.limits.lever:.3g} mm of where it was in the sitting before"
         return f"handle {', '.join(near)} is {where}: take it elsewhere and let go" if near else None
 
     @property

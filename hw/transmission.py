@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.hw.friction import Friction, dry_friction
+from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, an encoder of 5 um sees nothing of 1 N
@@ -88,19 +88,26 @@ class _Joint:
 
 
 def transmission_bounds(
-    free: tuple[Array, Array], clamped: Sequence[tuple[Array, Array]], T: float, step: float, friction: Friction
+    free: tuple[Array, Array],
+    clamped: Sequence[tuple[Array, Array]],
+    T: float,
+    step: float,
+    friction: Friction,
+    lever: float = 1.0,
 ) -> TransmissionBounds:
     """Bound one axis by its records, (displacements [m], forces [N]) (N,) each, of period T [s].
 
-    `step` [m] is the encoder's, `friction` that of the free record.
+    `step` [m] is the encoder's, `friction` that of the free record. Radians and N m of an axis that a hand holds at the
+    radius `lever` [m] are fitted as metres and N at the hand.
 
     Raises:
         ValueError: No spring and damper in parallel between two masses explain the records, or they do not tell them.
     """
-    records = []
+    records, friction = [], at_radius(friction, 1 / lever)
     for (x, force), held in ((free, False), *((record, True) for record in clamped)):
-        records.append(Spectra(x, force - dry_friction(x, T, friction), T, held, _BAND_HZ))
-    joint, everything = _Joint(records, step), [np.ones(r.hz.size, dtype=bool) for r in records]
+        dry = dry_friction(lever * x, T, friction)
+        records.append(Spectra(lever * x, force / lever - dry, T, held, _BAND_HZ))
+    joint, everything = _Joint(records, lever * step), [np.ones(r.hz.size, dtype=bool) for r in records]
     p = joint.fitted(joint.start(friction), everything)
     for r, error in zip(records, joint.errors(p), strict=True):
         if (rms := float(np.sqrt(np.mean(np.abs(error) ** 2)))) > _UNEXPLAINED:
@@ -126,8 +133,10 @@ def transmission_bounds(
     if most[3] > _LATE * T:
         raise ValueError(f"forces are up to {1e6 * most[3]:.0f} us late, at most {1e6 * _LATE * T:.0f} us are allowed")
     if not (least[0] > 0 and least[2] > 0):
-        raise ValueError(f"the transmission's damping, {b:.3g} N s/m, is not told from 0: at least {least[2]:.2g}")
-    return TransmissionBounds(least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0))
+        shown, lowest = lever**2 * b, lever**2 * least[2]
+        raise ValueError(f"the transmission's damping, {shown:.3g} N s/m, is not told from 0: at least {lowest:.2g}")
+    figures = least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0)
+    return at_radius(TransmissionBounds(*figures), lever)
 
 
 def _figures(p: Array) -> tuple[float, float, float, float]:

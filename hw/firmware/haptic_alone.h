@@ -22,8 +22,8 @@ typedef HA_REAL ha_real;
 
 #define HA_RISE 0.25f   /* [s] from zero to full gain */
 #define HA_FALL 0.1f    /* [s] from full gain to zero */
-#define HA_GROWTH 4.0f  /* [N/s] of the force that tests an axis */
-#define HA_TEST_MAX 0.8f /* [N] without an answer the axis is dead */
+#define HA_TEST_MAX 0.8f /* [N] without an answer to so much, or to half the cap, the axis is dead */
+#define HA_TEST 0.2f    /* [s] in which the force that tests an axis grows to it */
 #define HA_SWING 0.03f  /* [s] after which the testing force changes its sign */
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
@@ -32,7 +32,7 @@ enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_D
 typedef struct {
     ha_real range; /* [m] a handle beyond +-range stops the session */
     ha_real speed; /* [m/s] so does a faster one */
-    ha_real cap;   /* [N] no force exceeds this */
+    ha_real cap;   /* [N] no force exceeds this, and no test half of it */
     ha_real count; /* [m] encoder step; the test waits for a path of 12 steps */
 } ha_limits;
 
@@ -86,7 +86,8 @@ static inline void ha_stop(ha_runner *r, uint8_t cause)
  * positive; a wrong sign of motor or sensor makes it negative. */
 static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
-    ha_real step = x[r->axis] - r->before[r->axis], size = (ha_real)(HA_GROWTH * PROCESS_PERIOD) * r->tick;
+    ha_real step = x[r->axis] - r->before[r->axis], most = l->cap / 2 < (ha_real)HA_TEST_MAX ? l->cap / 2 : (ha_real)HA_TEST_MAX;
+    ha_real size = most * (ha_real)(PROCESS_PERIOD / HA_TEST) * r->tick;
     uint16_t swing = (uint16_t)(HA_SWING / PROCESS_PERIOD);
     r->work += r->force[r->axis] * step;
     r->path += step < 0 ? -step : step;
@@ -102,7 +103,7 @@ static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
             for (i = 0; i < PROCESS_CHANNELS; i++) r->reference[i] = x[i];
             r->phase = HA_RUNNING;
         }
-    } else if (size > (ha_real)HA_TEST_MAX) {
+    } else if (size > most) {
         ha_stop(r, HA_DEAD);
     } else {
         r->force[r->axis] = (r->tick / swing) % 2 ? -size : size;

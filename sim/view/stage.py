@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from haptic_loop.controller.lti import Array
+from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
@@ -141,7 +142,7 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
     if frame.note:
         first, *rest = textwrap.wrap(frame.note, _WIDTH)
         lines += [("last", first), *(("", line) for line in rest)]
-    return lines
+    return [(label, in_unit(value, scenario.unit)) for label, value in lines]
 
 
 def _limited(prepared: PreparedLoop) -> str:
@@ -245,7 +246,7 @@ class ShownScene:
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
             own = self._channels[i]
-            drawn.append((place, _figure(i, low[:, own], high[:, own], top)))
+            drawn.append((place, _figure(i, low[:, own], high[:, own], top, frame.prepared.scenario.unit)))
         return drawn
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
@@ -368,11 +369,11 @@ def _undress(spec: mujoco.MjSpec) -> None:
         spec.delete(part)
 
 
-def _figure(device: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:
+def _figure(device: int, low: Array, high: Array, top: float, unit: PositionUnit) -> mujoco.MjvFigure:
     """Return a figure of one device's forces (spans, axes) [N], drawn from least to largest in every span."""
     figure = mujoco.MjvFigure()
     mujoco.mjv_defaultFigure(figure)
-    figure.title, figure.xlabel = f"force on device {device + 1} [N]", "time [s]"
+    figure.title, figure.xlabel = in_unit(f"force on device {device + 1} [N]", unit), "time [s]"
     figure.flg_extend, figure.flg_legend = 0, 0
     figure.gridsize = [5, 5]
     figure.figurergba[:] = (1, 1, 1, 1)
@@ -642,7 +643,8 @@ class FlatPictures:
                 y = middle - value / most * (bottom - top) / 2
                 pen.line((left, y, right, y), _LIGHT)
                 pen.text((left - 40, y - 7), f"{value:+g}" if value else "0", _BLACK, self._font)
-            pen.text((left, bottom + 2), f"force on device {i + 1} [N], last {HISTORY:g} s", _BLACK, self._font)
+            label = in_unit(f"force on device {i + 1} [N], last {HISTORY:g} s", frame.prepared.scenario.unit)
+            pen.text((left, bottom + 2), label, _BLACK, self._font)
             x = np.linspace(left, right, _COLUMNS)
             for axis, channel in enumerate(_own(self.scene, i)):
                 for j in np.flatnonzero(np.isfinite(low[:, channel])):

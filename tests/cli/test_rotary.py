@@ -5,6 +5,7 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from haptic_loop import certify, design_coupling, simulate
@@ -13,6 +14,7 @@ from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.session import session_for
 from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.scenario import InputError, load, parse
+from haptic_loop.sim.view.stage import _figure
 
 WHEEL = Path(__file__).parents[2] / "examples/wheel.toml"
 LINEAR = re.compile(r"N s/m|N/m\b|m/N|(?<!\w)[mu]m\b|(?<!\w)m/s|kg(?! m2)|\d N(?! m)|\[N\]|\[m\]|_(m|n|N|mm)\b")
@@ -113,6 +115,26 @@ def test_wrong_rotary_fields_are_named(change, words):
     with pytest.raises(InputError) as error:
         parse(WHEEL.read_text().replace(*change))
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "unit"),
+    [
+        ("audit", ["--K", "-1"], "1e+09 N m/rad"),
+        ("audit", ["--K", "1", "--B", "-1"], "1e+06 N m s/rad"),
+        ("zwidth", ["--mark", "1e-9,1"], "N m/rad, B 0 to 1e6 N m s/rad"),
+    ],
+)
+def test_refused_options_are_rotary(command, words, unit):
+    with pytest.raises(InputError) as error:
+        import_module(f"haptic_loop.cli.{command}").main(["--scenario", str(WHEEL), *words])
+    assert unit in in_unit(str(error.value))
+
+
+def test_the_live_window_is_rotary():
+    """Also in a thread of its own, where no command has set the unit."""
+    figure = _figure(0, np.zeros((2, 1)), np.zeros((2, 1)), 1.0, load(WHEEL).unit)
+    assert figure.title == "force on device 1 [N m]"
 
 
 def test_sessions_ask_for_the_radius():

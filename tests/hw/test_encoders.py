@@ -354,3 +354,10 @@ def test_faults_of_missing_axes_are_refused(scenario):
         Emulator(scenario, (FaultInjection.parse("axis3:freeze"),))
     with pytest.raises(InputError, match="does not happen to one axis"):
         FaultInjection.parse("axis1:drop=0.5")
+
+
+def test_weak_motors_have_smaller_thresholds():
+    """A knob of 20 mN m at 20 mm: a dead encoder under 15 mN m is found as one under 3 N is at a strong motor."""
+    knob = EncoderMonitor((1e-4,), (1e-6,), T, None, 0.02, (0.02,))
+    with pytest.raises(SafetyStop, match="axis 1 does not follow"):
+        [knob.check((0,), (15_000,), 1) for _ in range(round(1.0 / T))]

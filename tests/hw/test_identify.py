@@ -102,6 +102,18 @@ def test_dry_friction_is_told_from_viscous():
     assert 0.98 * 1.37 < found.friction.delta < 1.37
 
 
+def test_a_knob_is_identified_in_radians():
+    """A knob of 10 g cm2 with 0.2 mN m s/rad and 0.1 mN m of dry friction, which a hand holds at 20 mm."""
+    T, lever, count = 1.2e-3, 0.02, 1e-4
+    force = chirp(1, T, 1, 0.2 * lever, (3.0, 60.0), 1.5).signal[:, 0]
+    at_hand = played(force / lever, T, 1e-5 / lever**2, 2e-4 / lever**2, 1e-4 / lever, substeps=16)
+    found = identify(np.round(at_hand / lever / count) * count, force, T, count, True, lever)
+    assert found.friction.mass == pytest.approx(1e-5, rel=5e-3)
+    assert found.viscous == pytest.approx(2e-4, rel=0.01)
+    assert found.friction.coulomb == pytest.approx(1e-4, rel=0.02)
+    assert 0.95 * 2e-4 < found.friction.delta < 2e-4
+
+
 ODD = (
     *("ideal", "constant 0.001", "cable 1", "cogging 0.002", "gap 1e-05", "lag 0.3", "eccentric 2e-05", "loss 3"),
     *(

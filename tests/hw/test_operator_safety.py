@@ -135,7 +135,7 @@ def test_sessions_stop_outside_the_known_damping(scenario):
     slow = scenario.replace(device=tuple(replace(d, credible_speed=0.5) for d in scenario.device))
     assert limits_from(_parser().parse_args(["--rehearse"]), slow)["speed"] == 0.5
     assert limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.4"]), slow)["speed"] == 0.4
-    with pytest.raises(InputError, match=r"--max-speed is 0\.6 m/s, the least credible_speed of the devices is 0\.5"):
+    with pytest.raises(InputError, match=r"--max-speed is 0\.6, the devices' least credible_speed is 0\.5 metres/s"):
         limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.6"]), slow)
 
 
