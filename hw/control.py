@@ -39,6 +39,7 @@ from haptic_loop.sim.world import START_J, scene_of
 #: part of a period by which boards' clocks may differ, and T_max of their certificate is longer: a ceramic resonator's
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # window of a speed estimate: one count of the coarsest encoder is 0.03 m/s
+_SHAKING = 10  # ticks in a row of changes of speed that no hand makes: 0.6 mm/tick each are 5 m/s at T = 1.2 ms
 _FALLBACK = ("spring-damper", "any-environment")  # a reserve coupling, where the requested one is not certified
 
 
@@ -292,6 +293,7 @@ class Drive:
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
+        self._shaking = 0  # ticks in a row
         self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
@@ -385,7 +387,12 @@ class Drive:
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
             if ticks == 1 and self._before is not None:
-                self.limits.check_jolt(x, self.x, self._before)
+                shakes = self.limits.check_jolt(x, self.x, self._before)
+                self._shaking = self._shaking + 1 if shakes else 0
+                if self._shaking > _SHAKING:
+                    raise SafetyStop(
+                        f"encoder {shakes} shakes: at every tick its speed changes as no hand can change it"
+                    )
         recent = self._recent
         if ticks == 1 or self.x is None:
             recent.append(x)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -67,6 +68,7 @@ _DEVICE = {
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
+    "cross": ("part of the force of motor 1 that motor 2 makes, too", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: kind -> the same, for one axis of it
@@ -77,6 +79,7 @@ _AXIS = {
     "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
     "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
     "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
+    "late": ("ticks by which its encoder is read late", 1.0, 50.0, 2.0),
     "reverse": ("no value: its encoder counts backwards", 0.0, 0.0, 0.0),
     "scale": ("counts that its encoder shows for one", 0.01, 100.0, 3.0),
     "noise": ("counts of noise, root mean square, that its encoder shows", 0.0, 100.0, 0.5),
@@ -289,7 +292,7 @@ class Emulator:
         self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
         self._motor: Array = np.ones(scenario.channels)  # part of a force that each makes
-        self._swapped = False
+        self._swapped, self._crossed = False, 0.0
         self._begun, self._rest, self._at_tick = 0, 0.0, False  # [us] of the tick; the share of it that is to come
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
         self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
@@ -342,6 +345,7 @@ class Emulator:
             self.armed_at = now
         self._wake_person()
         self.applied = np.array(steps) * self.force_step * self._motor
+        self.applied[1:2] += self._crossed * self.applied[0]
         return b"" if self.unplugged else data
 
     def advance(self) -> None:
@@ -369,6 +373,9 @@ class Emulator:
                 return lambda n: -n
             case "scale":
                 return lambda n: round(fault.value * n)
+            case "late":
+                earlier = deque([now], maxlen=1 + round(fault.value))
+                return lambda n: (earlier.append(n), earlier[0])[1]
             case "noise":
                 draw = np.random.default_rng(fault.axis)
                 return lambda n: round(n + draw.normal(0.0, fault.value))
@@ -398,13 +405,15 @@ class Emulator:
                     self.device = Device(self.info)
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
-                case "freeze" | "toggle" | "saturate" | "shake" | "drift" | "reverse" | "scale" | "noise":
+                case "freeze" | "toggle" | "saturate" | "shake" | "drift" | "reverse" | "scale" | "late" | "noise":
                     earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
                     self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
                 case "motor":
                     self._motor[fault.axis] = fault.value
                 case "swap":
                     self._swapped = True
+                case "cross":
+                    self._crossed = fault.value
                 case "leap":
                     self.device.k = (self.device.k + round(fault.value)) & 0xFFFF
                 case "own":

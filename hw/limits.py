@@ -161,17 +161,21 @@ class SafetyLimits:
                 allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
-    def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> None:
+    def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> int | None:
         """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass can do.
 
-        `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row.
+        `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
+        whose speed changed by more than a fifth of that, which two counts of the coarsest encoder show, or None.
         """
+        shaken = None
         for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
             if not (change := abs(now - 2 * last + first)) <= self.jump:
                 most = f"{1e3 * self.jump:g} mm in a tick"
                 raise SafetyStop(
                     f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
                 )
+            shaken = i if change > 2 * _COARSEST * self.jump else shaken
+        return shaken
 
     def check_speed(self, x: Sequence[float], before: Sequence[float], seconds: float) -> None:
         """Raise SafetyStop where an axis moved from `before` to x (m,) [m] within `seconds` faster than `speed`."""

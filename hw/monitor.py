@@ -43,6 +43,8 @@ _TEST_BEFORE = 0.012  # [s] without a force
 _TEST_RATIO = 2.0  # between a motion and the expected one
 _DEGREE = 5  # of the polynomials that contain a hand's own motion: 1 % is left of 2 Hz
 _FIT = 0.8  # of the power: a free handle moved by a hand has 0.93 or more, a held one at most 0.5
+_LATE = 0.75  # [ticks] by which an axis may answer later than agreed: amplifiers do; no certificate covers a whole one
+_CROSS = 0.25  # of the expected motion that another axis may show: less passes through a table
 _ALIVE = 0.06  # of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, a dead motor shows 0.03
 _PUSHED = 0.5  # of the strongest test force: less is no test
 _STRONG = 2  # the block with which the test at the end begins
@@ -541,7 +543,8 @@ class EncoderTest:
     a block, polynomials of degree 5 are removed from all positions: they contain what a hand does on purpose in this
     time, 50 mm at 2 Hz included, and little of the answer. What is left must have the shape of the expected motion
     (`_FIT` of its sum of squares), the sign of it, and its size within a factor of 2. A reversed motor or encoder has
-    the wrong sign, a wrong scale the wrong size; a dead encoder, a moved or a held handle has another shape.
+    the wrong sign, a wrong scale the wrong size; a dead encoder, a moved or a held handle has another shape. A motion
+    that comes later is one of a delay that nobody measures; friction and hands make it come earlier.
 
     At the end of a session (`alive`) unknown hands may hold the handles and move them. It then suffices that the axis
     swings in the rhythm of the force at any phase, which that of a dead motor does not.
@@ -603,11 +606,12 @@ class EncoderTest:
         sign = -1 if (since + half // 2) // half % 2 else 1
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
-    def _compare(self) -> tuple[Array, Array, float]:
-        """Return size and fit (m,) of the motions against the expected one, and the own size at any phase."""
+    def _compare(self) -> tuple[Array, Array, float, float]:
+        """Return size and fit (m,) of the motions against the expected one, the own size at any phase and its delay."""
         t, expected, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
-        wanted, shifted = (a - smooth @ (smooth.T @ a) for a in (expected, np.cumsum(expected)))
+        parts = expected, np.cumsum(expected), np.gradient(expected, t)
+        wanted, shifted, rate = (a - smooth @ (smooth.T @ a) for a in parts)
         moved = np.array(counts).T * self._units.encoder_step
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
@@ -616,7 +620,9 @@ class EncoderTest:
         own = np.maximum((moved**2).sum(axis=0) - rounding, rounding)
         fit = size**2 * power / own
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
-        return size, fit, float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power))
+        same, ahead = np.linalg.lstsq(np.stack([wanted, rate], axis=1), moved[:, self._axis], rcond=None)[0]
+        late = -float(ahead / same) if same else 0.0  # [ticks]
+        return size, fit, float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power)), late
 
     def _counted(self, i: int) -> float:
         """Return the range of encoder i in this block [counts]."""
@@ -624,10 +630,10 @@ class EncoderTest:
 
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
-        axis, name, (size, fit, swing) = self._axis, f"axis {self._axis + 1}", self._compare()
+        axis, name, (size, fit, swing, late) = self._axis, f"axis {self._axis + 1}", self._compare()
         moves = [self._counted(i) > self._still[i] for i in range(len(self._cap))]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
-        others = [i + 1 for i, one in enumerate(follows) if one and i != axis]
+        others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
         loose = self._alive and not self._expected.held  # an unknown hand may hold it
         if others and not moves[axis]:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
@@ -637,6 +643,12 @@ class EncoderTest:
         if follows[axis] and not (0 if loose else 1 / _TEST_RATIO) <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong")
+        if follows[axis] and others:
+            raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
+        if follows[axis] and not loose and late > _LATE + self._at_once:
+            raise SafetyStop(
+                f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
+            )
         return follows[axis] or (loose and moves[axis] and swing > _ALIVE)
 
     def _unanswered(self) -> str:

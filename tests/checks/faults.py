@@ -170,6 +170,7 @@ CASES = (
     Fault("encoder jumps by 2 mm", A, faults=at("jump=2")),
     *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
     *_signed("shaking by {} mm, encoder {}", "shake", 2, "encoder {axis} shakes", _STOP + 2 * _T_MS),
+    *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} shakes", _STOP + 12 * _T_MS),
     *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at 1", _STOP + 12 * _T_MS),
     *_signed(
         "{} mm, out of the range of encoder {}", "jump", 200, r"encoder {axis} is at {sign}\d.*its range is", None, ""
@@ -218,6 +219,22 @@ CASES = (
             ("motor", "motor=0", "did not answer"),
             ("sign", "motor=-1", "sign|speed|moves|follow|clipped|did not"),
         )
+    ),
+    *(
+        Fault(
+            f"encoder {axis} is read {n} ticks late before",
+            G.STOPPED,
+            cause,
+            (f"axis{axis}:late={n}",),
+            _AT_ONCE,
+            free=True,
+        )
+        for axis in (1, 2)
+        for n, cause in ((1, f"axis {axis} answers 1.0 ticks later"), (2, f"axis {axis} answers .* ticks later"))
+    ),
+    *(
+        Fault(f"motor 2 makes {part} of force 1, too", G.STOPPED, "moves encoder 2, too", (f"cross={part}",), _AT_ONCE)
+        for part in (1.0, 0.5, -1.0)
     ),
     Fault("axes swapped before", G.STOPPED, "force on axis 1 moves encoder 2", ("swap",), _AT_ONCE),
     Fault("axes swapped and reversed before", G.STOPPED, "encoder 2", ("swap", "reverse", "axis2:reverse"), _AT_ONCE),
