@@ -189,7 +189,9 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path):
 
 
 def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
-    done = forked.run(["python", "-m", "sim.run", "--psi", "1", "--condition", "any-environment"], tmp_path)
+    one_device = str(Path(__file__).parents[2] / "benchmarks/loops/n3-free1.toml")
+    words = ["--scenario", one_device, "--psi", "1", "--delta", "0.1", "--condition", "any-environment"]
+    done = forked.run(["python", "-m", "sim.run", *words], tmp_path)
     err = done.stderr
     assert done.returncode == 1
     assert "Theorem 4 admits no coupling" in err

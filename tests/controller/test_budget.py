@@ -57,19 +57,20 @@ class Line:
 
     def __init__(self, rng, lo, hi, hold, loss, nsim):
         self.rng, self.lo, self.hi, self.hold, self.loss = rng, np.array(lo), np.array(hi), hold, loss
-        self.packets, self.due = [], []
-        self.newest = np.full((2, nsim), -1)
+        self.ticks = 0
+        self.newest, self.force = np.full((2, nsim), -1), np.zeros((2, nsim))  # packet that arrived last
+        self.packets = []  # those that may yet arrive, the oldest first
 
     def carry(self, f):
-        k = len(self.packets)
+        k, self.ticks = self.ticks, self.ticks + 1
         took = self.rng.integers(self.lo[:, None], self.hi[:, None], size=f.shape, endpoint=True)
-        self.packets.append(f)
-        self.due.append(np.where(self.rng.random(f.shape) < self.loss, 10**9, k + took))
-        for j in range(max(0, k - int(self.hi.max())), k + 1):
-            self.newest = np.where((self.due[j] <= k) & (self.newest < j), j, self.newest)
+        due = np.where(self.rng.random(f.shape) < self.loss, 10**9, k + took)
+        self.packets = [*self.packets, (k, f, due)][-int(self.hi.max()) - 1 :]
+        for j, sent, arrives in self.packets:
+            fresh = (arrives <= k) & (self.newest < j)
+            self.newest, self.force = np.where(fresh, j, self.newest), np.where(fresh, sent, self.force)
         old = k - self.newest > self.hi[:, None] + self.hold
-        f = np.take_along_axis(np.array(self.packets), np.maximum(self.newest, 0)[None], axis=0)[0]
-        return np.where(old | (self.newest < 0), 0.0, f)
+        return np.where(old | (self.newest < 0), 0.0, self.force)
 
 
 @pytest.mark.parametrize("lossless", [True, False])

@@ -198,10 +198,10 @@ def test_one_wall_has_one_requirement(tmp_path, monkeypatch):
     assert judged.requirements["this-environment"].required == pytest.approx(expected, rel=1e-9)
 
 
-def test_switching_before_walls_needs_more_damping(tmp_path, capsys):
+def test_switching_before_walls_needs_more_damping():
     """What is certified for a constant delay is not certified for delays that switch around it."""
-    words = ["--scenario", "one-wall", "--K", "1200", "--B", "0.5", "--out", str(tmp_path)]
-
-    assert audit(words) == 0
-    assert audit([*words, "--varying-delay", "0-2"]) == 1
-    assert "Not certified" in capsys.readouterr().out
+    loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
+    assert assess(loop, coupling).holds
+    switching = assess(change(loop, varying_delay=DelayRange((0,), (2,))), coupling)
+    assert not switching.holds
+    assert "Not certified" in verdict(switching)

@@ -123,38 +123,43 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     A[:, 0, 1] = 1
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
     late = sorted(set(loop.latency[0])) if loop.latency else [0.0]
-    parts = [(expm(A * tau), expm(A * (loop.T - tau))) for tau in late]
+    parts = [(expm(A * (loop.T - tau))[:, :2], expm(A * tau)[:, :2]) for tau in late]
+    # (latencies, 2, 4, hands): the plant after a period, of the plant, the force before and the force that follows
+    step = np.stack([np.concatenate([second[..., :2] @ first, second[..., 2:]], axis=2) for second, first in parts])
+    step = np.ascontiguousarray(np.moveaxis(step, 1, -1))
     bound = {} if rho is None else {"limit": [limit], "rho": [rho]}
     lo, hi = loop.delays.lo[0], loop.delays.hi[0]
     law = loop.switching(None).delayed((0,)).law(coupling, **bound)
     tick = law.transition()
-    plant = rng.standard_normal((HANDS, 2)) * (1e-2, 0.1)
+    plant = rng.standard_normal((HANDS, 2)).T * [[1e-2], [0.1]]
     before, after = np.zeros((2, law.open.order + 1, HANDS))
     forces, applied, energy = [np.zeros(HANDS)] * (hi + 1), np.zeros(HANDS), np.zeros((2, HANDS))
+    every = np.arange(HANDS)
     for k in range(ticks):
-        before[-1] = plant[:, 0]
+        before[-1] = plant[0]
         tick(before, after)
         before[:-1] = after[1:]
         forces = [after[0].copy(), *forces[:-1]]
-        best, most, used = None, np.full(HANDS, -np.inf), applied
-        for age in range(lo, hi + 1):
-            for first, second in parts:
-                now = (first @ np.column_stack([plant, applied])[..., None])[:, :2, 0]
-                now = (second @ np.column_stack([now, forces[age]])[..., None])[:, :2, 0]
-                gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
-                better = gained > most
-                best = now if best is None else np.where(better[:, None], now, best)
-                used, most = np.where(better, forces[age], used), np.where(better, gained, most)
+        held = (step[:, :, :3] * [*plant, applied]).sum(axis=2)
+        acting = np.repeat(forces[lo:], len(late), axis=0)  # age by age, each at every latency
+        now = np.tile(held, (hi + 1 - lo, 1, 1)) + np.tile(step[:, :, 3], (hi + 1 - lo, 1, 1)) * acting[:, None]
+        gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
+        best = np.argmax(gained, axis=0), every
+        most = gained[best]
         if most.max() > 1e6:  # [J] of hands that began with less than 0.02
             return int((most > 1.0).sum())
-        plant, applied = best, used
+        plant, applied = np.stack([now[:, 0][best], now[:, 1][best]]), acting[best]
         at = 0 if 0.4 * ticks < k < 0.5 * ticks else 1 if k > 0.9 * ticks else None
         if at is not None:
             energy[at] = np.maximum(energy[at], most)
     return int((energy[1] > 1.02 * energy[0]).sum())
 
 
-@pytest.mark.parametrize("names", SETS, ids="-".join)
+@pytest.mark.parametrize(
+    "names",
+    [pytest.param(names, marks=[pytest.mark.validate] if len(names) == 3 else []) for names in SETS],
+    ids="-".join,
+)
 def test_no_hand_gains_energy_at_the_requirement(names):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 1.01 * need(loop, COUPLING, rho), rho, ticks=TICKS // 2) == 0

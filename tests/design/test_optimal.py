@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cvxpy as cp
@@ -36,6 +36,7 @@ from tests.benchmarks.hostile_loops import hostile
 
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 SHORT = Options(bases=((4, 3), (8, 6)))
+SMALLEST = Options(bases=((4, 3),))
 
 
 @cache
@@ -46,6 +47,11 @@ def loop_of(name: str) -> Loop:
 @cache
 def best(name: str):
     return design(loop_of(name), SHORT)
+
+
+@cache
+def smallest(name: str):
+    return design(loop_of(name), SMALLEST)
 
 
 def wall(K: float, theta: int, delta: float, T: float = 1e-3, channels: int = 1) -> Loop:
@@ -120,7 +126,7 @@ def test_static_stiffness_is_an_exact_share(name):
         assert (g * E1 == F1).all()
 
 
-@pytest.mark.parametrize("name", ["n0", "n3", "n4", "o12"])
+@pytest.mark.parametrize("name", [pytest.param("n0", marks=pytest.mark.validate), "n3", "n4", "o12"])
 def test_the_bound_is_below_and_close(name):
     limit = bound(loop_of(name), knots=16)
     assert limit.rms < best(name).figures.rms_mismatch
@@ -205,7 +211,7 @@ def test_sixteen_samples_beside_slow_poles_are_proved():
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
-    found = design(loop, Options(bases=((4, 3),)))
+    found = design(loop, SMALLEST)
     assert isinstance(found.coupling, ForceFilter)
     assert found.proved
     bare = this_environment(force(loop, NoCoupling()), loop.delta).ratio
@@ -232,10 +238,10 @@ def random_loop(seed: int) -> Loop:
     return Loop(float(rng.choice([0.0005, 0.001, 0.002])), *delays, lam, delta, network)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(n, marks=pytest.mark.validate) for n in range(6, 12))])
 def test_there_is_always_an_answer(seed):
     loop = random_loop(seed)
-    found = design(loop, Options(bases=((4, 3),)))
+    found = design(loop, SMALLEST)
     assert found.proved
     assert this_environment(force(loop, found.coupling), loop.delta).certified
     assert found.figures.rms_mismatch < 1.001
@@ -285,7 +291,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
 def test_switching_delays_match_a_separate_formula():
     """[[He F/(z-1) + (delta - alpha T/2)/T, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F of the mean delay."""
     loop = loop_of("n3")
-    found = design(loop.switching(DelayRange((4,), (6,))), Options(bases=((4, 3),)))
+    found = design(loop.switching(DelayRange((4,), (6,))), SMALLEST)
     assert found.proved
     assert found.certificate.facts == ("switching",)
     assert found.certificate.margin > 1
@@ -326,7 +332,7 @@ def test_the_supremum_and_the_cap_are_kept():
 def test_demands_are_kept_together(further, asked):
     """The own unknowns of each demand have their own place in the program, however many there are."""
     loop = msgspec.structs.replace(loop_of("n3"), **asked)
-    found = design(loop, Options(bases=((4, 3),), **further))
+    found = design(loop, replace(SMALLEST, **further))
     assert found.proved
     assert found.figures.high_frequency_gain <= further.get("high_gain", np.inf) + 1e-6
     assert bool(found.certificate.limiter) == further.get("limiter", False)
@@ -338,17 +344,17 @@ def test_ranges_fall_back_to_a_proved_basis():
     network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
     loop = Loop(1e-3, (2,), (0,), (2,), (1.0,), network)
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    found = design(ranged, Options(bases=((4, 3),), seconds=5.0))
+    found = design(ranged, replace(SMALLEST, seconds=5.0))
     assert found.proved
     assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
 
 
 def test_range_couplings_are_proved_at_every_vertex():
     loop = loop_of("n3")
-    nominal = best("n3")
+    nominal = smallest("n3")
     assert not robustness(loop, nominal.coupling).certified
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    found = design(ranged, SHORT)
+    found = design(ranged, SMALLEST)
     assert found.proved
     assert len(found.certificate.matrices) == len(ranged.members())
     assert found.certificate.guarantee == "these ranges"
@@ -373,7 +379,9 @@ def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
         assert robustness(loop, coupling).required_over_available == pytest.approx(worst, rel=1e-9)
 
 
-@pytest.mark.parametrize(("name", "objective"), [("n3", "rms"), ("n3", "sup"), ("n2", "rms")])
+@pytest.mark.parametrize(
+    ("name", "objective"), [("n3", "rms"), ("n3", "sup"), pytest.param("n2", "rms", marks=pytest.mark.validate)]
+)
 def test_robust_designs_are_proved_and_cost_little(name, objective):
     loop = loop_of(name)
     found = spread(loop, best(name).coupling, replace(SHORT, objective=objective))
@@ -413,7 +421,8 @@ def test_partial_delay_constraints_leave_a_bound(monkeypatch):
     assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
 
 
-def test_a_bound_says_what_it_does_not_know():
+def test_a_bound_says_what_it_does_not_know(monkeypatch):
+    monkeypatch.setattr("haptic_loop.design.bound.bound", partial(bound, knots=8))
     loop = loop_of("n3")
     T_max = msgspec.structs.replace(loop, T_max=0.0012)
     weaker = msgspec.structs.replace(loop, delta=tuple(d / 1.2 for d in loop.delta))
@@ -510,7 +519,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
     span = span_of(E, 4, 3)
-    found = design(loop, Options(bases=((4, 3),)))
+    found = design(loop, SMALLEST)
     many = 400 if m == 1 else 160
     z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
@@ -623,22 +632,25 @@ def test_a_basis_is_larger_for_few_devices():
     assert beside.used[:, :, 8].all()
 
 
-@pytest.mark.parametrize(("seconds", "ended"), [("1e-3", True), ("3600", False)])
-def test_the_report_says_that_seconds_ended_it(tmp_path, capsys, seconds, ended):
+def test_the_report_says_that_seconds_ended_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
-    options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", seconds]
+    options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "1e-3"]
     main([*options, "--out", str(tmp_path / "c.json"), "--json", str(report)])
-    assert json.loads(report.read_text())["ended_by_seconds"] == ended
-    assert ("ended by --seconds" in capsys.readouterr().out) == ended
+    assert json.loads(report.read_text())["ended_by_seconds"]
+    assert "ended by --seconds" in capsys.readouterr().out
 
 
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
-    options = ["--coupling", "optimal", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
+    options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "3600"]
+    options += ["--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
     found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
     assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]
     assert found["rendered_stiffness"] > 0.5
+    assert not found["ended_by_seconds"]
+    assert "ended by --seconds" not in text
     assert found["robustness"]["required_over_available"] > 1
     assert found["bases"][-1]["mismatch_db"] <= found["bases"][0]["mismatch_db"]
     assert "no linear coupling can be better than" in text
@@ -685,7 +697,7 @@ def test_late_walls_match_their_closed_form():
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
     assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
-    found = design(loop, Options(bases=((4, 3),)))
+    found = design(loop, SMALLEST)
     assert found.proved
     assert found.g >= 0.49
 
@@ -694,7 +706,7 @@ def test_late_walls_match_their_closed_form():
 def test_limited_forces_are_part_of_designs(name):
     """By matrices of our own: [[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] on a dense grid."""
     loop = loop_of(name)
-    found = design(loop, replace(SHORT, limiter=True))
+    found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
     assert found.proved
     proof = found.certificate.limiter
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
@@ -709,8 +721,8 @@ def test_limited_forces_are_part_of_designs(name):
         late = rho @ theta / x
         block = np.block([[theta @ G[k] / (x - 1) + D, -late], [N @ G[k] + 2 * D, D - late + rho @ M / x]])
         assert np.linalg.eigvalsh(block + block.conj().T)[0] > 0
-    assert found.figures.rms_mismatch_db < best(name).figures.rms_mismatch_db + 2.5
-    assert best(name).figures.rms_mismatch_db < found.figures.rms_mismatch_db + 0.05
+    assert found.figures.rms_mismatch_db < without.figures.rms_mismatch_db + 2.5
+    assert without.figures.rms_mismatch_db < found.figures.rms_mismatch_db + 0.05
     assert m == len(proof.multipliers["c"])
 
 
@@ -724,7 +736,7 @@ def test_limited_forces_are_not_designed_for_ranges():
 @pytest.mark.parametrize("seed", [11, 12, 14])
 def test_every_loop_gets_an_answer_and_proof(seed):
     """Drawn at the ends of what devices and objects are: 15 samples, 54 kg on .08 N/m, dampings of .04 N s/m."""
-    found = design(hostile(np.random.default_rng(seed)), Options(bases=((4, 3),)))
+    found = design(hostile(np.random.default_rng(seed)), SMALLEST)
     assert found.proved
     assert isinstance(found.coupling, ForceFilter)
     assert found.bases[0].proved

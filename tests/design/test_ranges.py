@@ -21,6 +21,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from haptic_loop.design import optimal
 from haptic_loop.design.assessment import check_ranges
+from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, sealed
 from haptic_loop.design.program import Options
@@ -40,18 +41,18 @@ stiffness = [640.0, 840.0]
 absent = true
 """
 change = msgspec.structs.replace
-SHORT = Options(bases=((4, 3), (8, 6)))
+SMALLEST = Options(bases=((4, 3),))
 
 
 @pytest.fixture(scope="module")
 def robust():
     """The optimal coupling for the small ranges."""
-    return optimal.design(LOOP, SHORT)
+    return optimal.design(LOOP, SMALLEST)
 
 
 @pytest.fixture(scope="module")
 def nominal_only():
-    return optimal.design(LOOP.at(FIGURE_4), SHORT)
+    return optimal.design(LOOP.at(FIGURE_4), SMALLEST)
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +228,7 @@ def test_an_environment_that_no_device_feels_asks_nothing():
     """Both springs lost: the forces are zero, and so is their mismatch."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
     loop = change(LOOP, ranges=both)
-    found = optimal.design(loop, SHORT)
+    found = optimal.design(loop, SMALLEST)
     check = check_ranges(loop, found.coupling, samples=4)
     assert check.proved
     nothing = check.at_members[[m.name for m in check.members].index(check.members[-1].name)]
@@ -236,7 +237,7 @@ def test_an_environment_that_no_device_feels_asks_nothing():
 
 def test_ranges_however_wide_have_an_answer():
     ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
-    found = optimal.design(change(LOOP, ranges=ranges), SHORT)
+    found = optimal.design(change(LOOP, ranges=ranges), SMALLEST)
     assert found.proved
     assert found.certificate.guarantee == "these ranges"
 
@@ -271,7 +272,7 @@ def test_wider_ranges_are_another_claim(stored):
 
 
 def test_nominal_couplings_are_not_proved_for_ranges(nominal_only):
-    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.40"):
+    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.4"):
         prove(LOOP, nominal_only.coupling, "this-environment")
     part = check_ranges(LOOP, nominal_only.coupling, samples=8).part()
     assert not part["certified"]
@@ -307,7 +308,8 @@ def test_files_without_ranges_keep_their_digest():
 # the commands
 
 
-def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys):
+def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     common = ["--scenario", str(scenario_file), "--json", str(report)]
 

@@ -229,9 +229,8 @@ def test_failed_searches_claim_no_impossibility():
     assert not isinstance(caught.value, Infeasible)
 
 
-def test_proposed_changes_hold_when_made(monkeypatch):
+def test_proposed_changes_hold_when_made():
     """Each proposal, designed with more bases, passes the sweep; best first, and never what was asked for."""
-    monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 2.0)
     loop = asked((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
     proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)
@@ -240,7 +239,7 @@ def test_proposed_changes_hold_when_made(monkeypatch):
     errors = [float(error) for _, _, error in proposed]
     assert errors == sorted(errors)
     for kind, condition, error in proposed:
-        made = design_by_kind(loop, kind, condition)
+        made = design_by_kind(loop, kind, condition, **({"bases": ((4, 3), (8, 6))} if kind == "optimal" else {}))
         assert made.requirement.certified
         assert decibels(transparency_of(loop, made).rms_mismatch) < float(error) + 0.01
 
