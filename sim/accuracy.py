@@ -47,8 +47,8 @@ def position_error(
 ) -> PositionError:
     """Return the position error of a trace against the exact engine.
 
-    `grows` says whether the loop is unstable, if its eigenvalues do not. An unstable trace is compared up to the first
-    clipped tick, because growth multiplies any difference.
+    `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace is compared up to
+    the first clipped tick, because growth multiplies any difference.
     """
     if exact is None:
         return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
@@ -91,7 +91,7 @@ class Row:
     substeps: int | None
     position_relative_rms: float | None
     growth_rate_error: float  # [1/s] the larger of the loop with and without the coupling
-    verdict_correct: bool  # of both
+    verdict_correct: bool  # with and without the coupling
     cycle_amplitude_n: float | None  # of the limit cycle without coupling
     cycle_frequency_hz: float | None
     cycle_amplitude_error: float | None  # relative
@@ -224,7 +224,7 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """The time up to which a run stays within the devices' declared limits of the model, and the largest values.
+    """The time at which a run first leaves the devices' declared limits of the model, and the largest values.
 
     Figures are per device; the transmission force of a rigid device is None.
     """
@@ -273,10 +273,10 @@ def _not_credible(credible: Credible, until: float) -> str:
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
     speeds = zip(credible.motor_speed_m_per_s, credible.credible_speed_m_per_s, strict=True)
     speed, most = max(speeds, key=lambda pair: pair[0] / pair[1])
-    what = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
+    excess = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
     if carried:
-        what = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {what}"
-    return f"from t = {until:.2f} s on the motion is the linear model's and no device's: {what}"
+        excess = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {excess}"
+    return f"from t = {until:.2f} s on the motion is the linear model's and no device's: {excess}"
 
 
 # ---- errors against the ideal environment
@@ -324,7 +324,7 @@ def response(G: Lti, x: Array) -> Array:
     rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # [state, x] of every tick
     rows[:-1, G.order :] = x
     step = np.hstack([G.A, G.B]).dot
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable run may leave the range of numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # An unstable run may overflow.
         for row, state in zip(rows, rows[1:, : G.order], strict=False):
             step(row, state)
         return rows[:-1] @ np.hstack([G.C, G.D]).T
@@ -348,8 +348,8 @@ _MOST_COMPARED = 256  # largest number of substeps of a refined reference
 _EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics in a step; one for the others
 _MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6
-_CONTRACTS = 0.7  # above it the differences do not converge; the error is then a few times the largest one
-_FEW = 4.0
+_CONTRACTS = 0.7  # ratio of successive differences above which they do not converge
+_FEW = 4.0  # the error of differences that do not converge, in units of the largest of them
 
 
 @dataclass(frozen=True)
@@ -358,9 +358,9 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # of the encoders' positions over the run, at most, as far as refining shows
-    verdict_correct: bool  # whether the loop that it simulates has the exact loop's verdict
-    cpu_s: float  # CPU time of that run, for the report only
+    position_relative_rms: float  # error of the encoders' positions over the run, with that of a refined reference
+    verdict_correct: bool  # whether the simulated loop has the verdict of the exact loop
+    cpu_s: float  # CPU time of the run, for the report only
 
     @property
     def name(self) -> str:
@@ -378,7 +378,7 @@ def compare_engines(
     """Return the settings that are stable on the scene's plant, the cheapest first, over `ticks` of the scenario.
 
     Runs have the scenario's walls, limits, encoder steps, varying delays and net; verdicts are for constant delays
-    without a net. With friction the reference is refined until RK4 keeps `error`. `progress` is that of each run.
+    without a net. With friction the reference is refined until RK4 keeps `error`. Every run calls `progress`.
 
     Raises InputError if 60 million evaluations of the dynamics do not suffice, or if nothing moves.
     """
@@ -392,7 +392,8 @@ def compare_engines(
         truth, missed = _positions(simulation, ticks, "exact", progress=progress)[0], 0.0
     else:
         truth, missed = _refined(simulation, error, ticks, runs, progress)
-        rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)  # it cannot step such a scene
+        # The exponential integrator cannot step a scene with both friction and an impedance.
+        rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)
         settings = [*runs, *(one for one in _CANDIDATES if one[0] not in rest)]
     _require_motion(truth)
     choices = []
@@ -416,11 +417,11 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """Difference of the run from that of another integrator."""
+    """Difference of a run from the same run by another integrator."""
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # null in JSON where one left the range of numbers
+    position_relative_rms: float  # null in JSON where a run overflowed
     growth_rate_per_s: float
     growth_rate_difference_per_s: float
     agrees: bool
@@ -429,7 +430,7 @@ class CrossCheck:
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
     """Repeat the run by RK4, which shares no matrix with the other engines, or by the exponential one if RK4 ran.
 
-    `simulation` is the one that ran, with its net. Positions are compared up to the earlier end of both runs.
+    `simulation` is the loop that ran, with its net. Positions are compared up to the earlier end of both runs.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
@@ -452,7 +453,7 @@ def _refined(
     runs: dict[tuple[str, int], tuple[Array, float]],
     progress: Progress,
 ) -> tuple[Array, float]:
-    """Return (positions of a refined run by RK4, bound of its error); all runs are kept."""
+    """Return (positions of a refined run by RK4, bound of its error), and store every run in `runs`."""
     finest, best, gaps = 1, math.inf, list[float]()
     runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
     _require_motion(runs["RK4", 1][0])
@@ -464,8 +465,8 @@ def _refined(
         best = min(best, gaps[-1] + missed)
         if gaps[-1] + missed <= error:
             return fine, missed
-        needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # for a method of first order
-        count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # with n + n/2 + ... substeps
+        needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # The error is of first order in a step.
+        count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # n + n/2 + ... substeps are 2 n
         if count > _MOST_EVALUATIONS:
             raise InputError(
                 f"--error {error:g}: where devices rub it asks for RK4 with about {needed:.0f} substeps, "
@@ -497,7 +498,7 @@ def _positions(
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.process_time()
     trace = run(simulation, stepped, ticks=ticks, progress=progress)
-    if trace.interrupted:  # a part of a run is no measurement
+    if trace.interrupted:  # an incomplete run cannot be measured
         raise KeyboardInterrupt
     return trace.s[:, : simulation.process.channels], time.process_time() - begin
 
@@ -526,16 +527,15 @@ def _apart(own: Array, truth: Array) -> float:
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
 _NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
-#: basis states and inputs are this long: the plant is linear, and no actuator limit is so small
-_UNIT = 1e-6
+_UNIT = 1e-6  # length of basis states and inputs: the plant is linear, and every actuator limit is larger
 
 
 def settle(
     simulation: Simulation, engine: AnyEngine, integrator: str | None = None, substeps: int | None = None
 ) -> tuple[str | None, int | None, list[str]]:
-    """Return (integrator, substeps, remarks) of a run, with defaults where they are None; only MuJoCo has any.
+    """Return (integrator, substeps, remarks) of a run, with defaults in place of None.
 
-    Raises InputError for impossible settings.
+    Engines other than MuJoCo have neither integrator nor substeps. Raises InputError for impossible settings.
     """
     if engine != "mujoco":
         for name, value in (("integrator", integrator), ("substeps", substeps)):
@@ -554,13 +554,14 @@ def settle(
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
-    """Return 1 for the exponential integrator on a smooth scene, else at least 4, by the rule and the verdict above.
+    """Return 1 for the exponential integrator on a smooth scene, else the least number that follows the plant.
 
-    Raises InputError if no number up to 10000 suffices.
+    The number is at least 4; the comment at the head of this section has the rule. Raises InputError if no number up
+    to 10000 suffices.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return 1
-    if integrator == "discrete":  # It has more state than position and velocity, so their map does not describe it.
+    if integrator == "discrete":  # This integrator has more state than position and velocity, which `_agrees` maps.
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
@@ -583,11 +584,11 @@ def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> l
     simulation = simulation.smooth.even
     speed, h = pace(simulation.scene.plant.A), simulation.scenario.T / substeps
     radius = _step_radius(simulation, integrator, substeps)
-    what = f"{integrator} x {substeps}: {speed.hardest(h)}"
+    setting = f"{integrator} x {substeps}: {speed.hardest(h)}"
     if not radius <= 1 + _NEUTRAL:
         instead = _instead(simulation, integrator)
-        raise InputError(f"--substeps {substeps}: {what}, outside the stable region of {integrator}; {instead}")
-    remarks = [] if speed.within(h) else [f"{what}: stable but coarse; {_instead(simulation, integrator)}."]
+        raise InputError(f"--substeps {substeps}: {setting}, outside the stable region of {integrator}; {instead}")
+    remarks = [] if speed.within(h) else [f"{setting}: stable but coarse; {_instead(simulation, integrator)}."]
     if integrator == "discrete":
         remarks.append(f"discrete gives no verdict to rely on: {_MODE_LOST}.")
     elif not _agrees(simulation, integrator, substeps):
@@ -625,8 +626,8 @@ def _measured_hold(
 ) -> HeldPlant:
     """Return the map s[k+1] = A s[k] + B [w; f][k] of an engine, by stepping every basis state and input once.
 
-    Closed with the force map it has the growth rate that the engine simulates. The default of `T` [s] is the scenario's
-    period.
+    Together with the force map this map has the growth rate that the engine simulates. The default of `T` [s] is the
+    scenario's period.
     """
     period, simulation = simulation.scenario.T if T is None else T, simulation.even
     stepped = make_engine(simulation, engine, integrator, substeps, period)
@@ -646,7 +647,7 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """Return the growth rate [1/s] of the loop that an engine simulates; with walls that of the worst contact state."""
+    """Return the growth rate [1/s] of the loop that an engine simulates; with walls, the worst contact state's."""
     held = _measured_hold(simulation, engine, integrator, substeps)
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
         raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")

@@ -4,10 +4,10 @@ A lossless chain of masses and springs can present any reactance at the frequenc
 no energy out. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above that, errors of the matrix
 exponential would decide.
 
-The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
-between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
-too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (where loops
-with long delays bind). Closer than that no search has succeeded, and just outside it most do.
+The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is larger unless v is constant
+between samples. For a sinusoid, |dx|^2 / T is (sin x / x)^2 of the integral, with x = pi f T. The condition therefore
+requires too much damping by about this factor at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 %
+at 8 Hz (loops with long delays). No search has found an unstable human within this gap; outside most searches do.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; roundin
 
 
 class _Pass(NamedTuple):
-    """One search. Slow modes of a lossless hand barely decay and would hide the one that grows."""
+    """One search over modes above a frequency: slower modes of a lossless hand barely decay and hide a growing one."""
 
     links: int  # of each arm; a single mass and spring present every reactance at one frequency
-    min_frequency_hz: float  # of the modes looked at
-    held: bool = False  # by one person, whose body and cross spring present every reactance matrix at one frequency
+    min_frequency_hz: float  # modes below it are ignored
+    held: bool = False  # one person holds all devices; body and cross spring present every reactance matrix
 
 
 _PASSES = (_Pass(1, 2.0), _Pass(2, 2.0), _Pass(1, 0.0), _Pass(1, 2.0, held=True))
@@ -57,7 +57,7 @@ class Worst:
     growth: float  # [1/s]
     frequency_hz: float
     evaluated: int  # sets of humans
-    mechanics: Sequence[Mechanics] = ()  # of devices with guaranteed bounds, within which they are searched, too
+    mechanics: Sequence[Mechanics] = ()  # of devices with guaranteed bounds, which the search varies within them
 
     @property
     def destabilises(self) -> bool:
@@ -76,7 +76,7 @@ def search(
 
     `progress` is called after every generation.
     """
-    from scipy.optimize import differential_evolution  # slow to load, seldom needed
+    from scipy.optimize import differential_evolution  # slow to load
 
     m, done = len(scenario.device), 0
     passes = [p for p in _PASSES if m > 1 or not p.held]
@@ -126,8 +126,8 @@ def search_population(
 ) -> Worst:
     """Search for the worst sets of hands that the scenario's population can draw.
 
-    Every generation half of the sets are new draws; the others take each device's hand from one of the worst sets so
-    far, or from a new draw. So the population has drawn each hand, and nothing is assumed about its kind.
+    In every generation half of the sets are new draws. The others take each device's hand from one of the worst sets
+    so far, or from a new draw. Each hand is therefore one that the population drew, whatever its class.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []
@@ -143,7 +143,7 @@ def search_population(
 
 
 def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
-    """Rank sets by growth [1/s], of modes above 2 Hz while none grows, because slow modes barely decay."""
+    """Return each set with its growth [1/s]; if no mode grows, the growth of the modes above 2 Hz."""
     layouts: dict[object, list[tuple[Hand, ...]]] = {}
     for hands in sets:
         layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)
@@ -156,10 +156,10 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
-    """Turn logarithms of masses and stiffnesses, (2 devices links, nsim), into lossless humans.
+    """Convert logarithms of masses and stiffnesses, (2 devices links, nsim), to lossless humans.
 
-    Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. The
-    last rows, _WITHIN for each device where all have guaranteed bounds, place their mechanics within them.
+    If one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. If all
+    devices have guaranteed bounds, the last _WITHIN rows of each device place its mechanics within them.
     """
     arms = 2 * len(devices) * kind.links
     x, within = np.split(x, [arms + 3 * kind.held])

@@ -24,7 +24,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth, unstable
 from haptic_loop.sim.trace import Trace
 
-#: (kind, condition) in the order of a table, and the samples of delay in all beyond which a design takes long
+#: (kind, condition) in the order of the table -> largest total delay [samples] for which a design is quick
 _ROWS: dict[tuple[str, str | None], float] = {
     ("none", None): math.inf,
     ("published", None): math.inf,
@@ -50,7 +50,7 @@ class Alternative:
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)
     trace: Trace | None = off_table("left out", None)  # of the exact engine
-    ideal: Array | None = off_table("left out", None)  # (N, m) forces of the ideal environment at its displacements [N]
+    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of the ideal environment for that motion
     until_s: float | None = off_table("left out", None)  # time from which the trace is not credible
 
     @property
@@ -77,8 +77,8 @@ def alternatives(
 ) -> list[Alternative]:
     """Run the scenario with each coupling that is possible in its loop.
 
-    Scenarios with ranges get couplings for any environment only; before walls there is no optimal coupling, which
-    contains a linear model. `also` is a user's own condition, by which all are judged, too.
+    Scenarios with ranges get couplings for any environment only. Scenarios with walls get no optimal coupling, because
+    it contains a linear model. `also` is a user's own condition, by which all couplings are judged, too.
 
     Raises:
         InputError: the delays switch.

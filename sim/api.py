@@ -1,4 +1,4 @@
-"""`from sim import simulate, validate`: what the commands sim.run and sim.validate do, for scripts. SI units."""
+"""`simulate` and `validate` for scripts, as in the commands sim.run and sim.validate. SI units."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """A scenario's run, with what it was run by."""
+    """The run of a scenario, with its settings."""
 
-    simulation: Simulation
-    ran: Simulation  # the same, with the net that was asked for
-    period: Period | None  # of the worst switching found, where the delays switch
-    choices: tuple[EngineChoice, ...]  # what was compared for the error that was asked, the cheapest first
-    settings: EngineSettings  # as they were settled
-    remarks: list[str]  # on a number of substeps that was asked for
+    simulation: Simulation  # the loop without a net
+    ran: Simulation  # the loop with its net, as it ran
+    period: Period | None  # of the worst switching of the delays; None for constant delays
+    choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
+    settings: EngineSettings  # with defaults filled in
+    remarks: list[str]  # on a requested number of substeps
     trace: Trace
     wall_s: float
     seed: int
@@ -60,7 +60,7 @@ class ScenarioRun:
 
     @cached_property
     def exact(self) -> Trace | None:
-        """The exact engine's trace of the same loop; None where friction makes it another one than the linear."""
+        """The exact engine's trace of the same loop; None for a loop with friction, which is not linear."""
         if self.settings.engine == "exact":
             return self.trace
         return None if self.simulation.friction else run(self.ran, "exact", ticks=self.trace.t.size)
@@ -75,10 +75,10 @@ def run_scenario(
     net: Wanted | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> ScenarioRun:
-    """Close the loop for the scenario's duration: what `sim.run` and `simulate` have in common.
+    """Close the loop for the scenario's duration, for `sim.run` and `simulate`.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter; `net` stands between the forces and the devices. Raises
-    InputError for settings that cannot be.
+    InputError for impossible settings.
     """
     simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
@@ -119,26 +119,33 @@ def simulate(
 ) -> Trace:
     """Run the scenario from rest for `scenario.duration` seconds.
 
-    `coupling` None is the loop without one, "design.json" the file of a design; `engine` is "mujoco", "exact" (the
-    linear loop, no Coulomb friction) or of your own (sim.engines.Engine), as it is or as what makes it of a
-    sim.run.Simulation; `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction;
-    `substeps` steps per period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
-    Forces leave through the limiter that the coupling's guarantee covers, where there is one; elsewhere, and with
-    `limiter` False, they are clipped (`meta["assessment"]["force_limits"]`).
+    Args:
+        scenario: The loop.
+        coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
+        engine: "mujoco", "exact" (the linear loop, without Coulomb friction), your own engine (sim.engines.Engine), or
+            a function that makes one from a sim.run.Simulation.
+        integrator: An integrator of MuJoCo. None is "exponential", or "RK4" if a device has Coulomb friction.
+        substeps: Steps per period. None is the default of the plant.
+        seed: Seed of varying delays, periods and latencies.
+        environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
+            [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes it
+            passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for any
+            environment, with psi = 0.
+        energy_budget: W0 [J] of the shell (default 0), or, without `environment`, the energy budget of the devices.
+        limiter: False to clip forces. By default forces leave through the limiter that the coupling's guarantee
+            covers, if there is one (`meta["assessment"]["force_limits"]`).
 
-    `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
-    gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
-    [J] (default 0) in all; the loop is safe then behind a coupling that is certified for any environment, with
-    psi = 0. Without `environment`, `energy_budget` is that of the devices. `meta["energy_budget"]` says how often
-    forces were limited, and `meta["assessment"]` what is guaranteed of this run, or why nothing is.
+    Returns:
+        A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
+        f (N, m) [N] (the devices feel -f), and `meta`. `meta["stability"]` has the growth rates [1/s] of the trace and
+        of the exact loop, the verdict, and the ticks at the force limit (None under varying delays).
+        `meta["assessment"]` states the guarantee of this run, or why there is none, and `meta["energy_budget"]` how
+        often forces were limited.
 
-    Returns a Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
-    f (N, m) [N] (the devices feel -f) and `meta`, with the scenario's digest and `meta["stability"]`: growth rates
-    [1/s] of the trace and of the exact loop, the verdict, ticks at the force limit (None under delays that vary).
-
-    Raises ValueError (InputError where the scenario is at fault) for an engine, integrator or number of substeps that
-    is not possible, TypeError for an argument of another type, SingularLoop where the algebraic loop of environment and
-    coupling has no solution.
+    Raises:
+        ValueError: An engine, integrator or number of substeps is impossible (InputError if the scenario is at fault).
+        TypeError: An argument has the wrong type.
+        SingularLoop: The algebraic loop of environment and coupling has no solution.
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen, seed = _chosen(scenario, coupling), whole("seed", seed, 0)
@@ -206,22 +213,30 @@ def validate(
 ) -> crowds.Findings:
     """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
 
-    They are drawn from `scenario.population`; number i depends on `seed` and i alone. `engine` is "exact", "mujoco" or
-    "both", or a class of your own (sim.engines.Engine), of which one is made for each set of humans and compared with
-    the exact one; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone);
-    `shards` local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
-    called with the parts done and all of them; `limiter` as of `simulate`; `traces` of the other engine than the exact
-    one: "sampled" (the hands nearest to the limit, the lossless ones and 64 at random), or "all".
+    Args:
+        scenario: The loop. The verdict of a loop with walls is that of its worst frozen contact state.
+        coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
+        humans: Number of draws from `scenario.population`; draw i depends on `seed` and i alone.
+        seed: Seed of the draws.
+        engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
+            engine and makes one engine for each set of humans.
+        duration: Length [s] of the traces. 0 is no trace, so that growth rates are those of the period maps alone.
+        shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
+        progress: Called with (parts done, number of parts).
+        limiter: False to clip forces.
+        traces: Which hands the other engine than the exact one simulates, too: "sampled" (those nearest to the limit,
+            the lossless ones and 64 at random), or "all".
 
-    Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
-    unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
+    Returns:
+        Findings with n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
+        unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
 
-    Walls: a verdict is that of the worst frozen contact state, and the traces make and break contact.
-
-    Raises InputError for Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
-    TypeError for an argument of another type.
+    Raises:
+        InputError: A device has Coulomb friction; verdicts are of linear loops.
+        ValueError: A number is out of range.
+        TypeError: An argument has the wrong type.
     """
-    from haptic_loop.sim import crowds  # its workers are loaded where they are used
+    from haptic_loop.sim import crowds  # loads multiprocessing
     from haptic_loop.sim.crowds import validate as validate_all
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
@@ -236,7 +251,7 @@ def validate(
     duration = number("duration", duration, "a number of seconds")
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
-    links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
+    links = getattr(scenario.population, "links", 1)  # A user's own population has no `links`.
     alone = scenario.replace(ranges=None) if scenario.ranges else scenario
     lag = assessed(alone, "I", chosen, limiter=None if limiter else False).force_limits.rho
     work = (humans, links, engine, duration)

@@ -1,4 +1,4 @@
-"""What a comparison of couplings over frequency says: for each what it asks, costs and lets be felt, and its curves."""
+"""Comparison of couplings over frequency: required damping, robustness and felt impedance of each, with curves."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """Return what a coupling needs within ten percent and, for an optimal one, what a design for that costs."""
+    """Return the damping that a coupling needs within ten percent; for an optimal one, also the cost of a redesign."""
     filters_forces = coupling.in_series(loop.T) is not None
     return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
 
 
 @dataclass(frozen=True, eq=False)
 class ConditionCurve:
-    """What one condition asks of a coupling, over frequency."""
+    """The damping that one condition requires of a coupling, over frequency."""
 
     requirement: Requirement = off_table("inlined")
     ratio: float = off_table()
@@ -37,7 +37,7 @@ class ConditionCurve:
 
 @dataclass(frozen=True, eq=False)
 class ComparedCoupling:
-    """One coupling, with all that the pictures show of it."""
+    """One coupling, with its curves for the pictures."""
 
     name: str
     kind: str
@@ -71,7 +71,7 @@ class ComparedCoupling:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Couplings over frequency; SI units, null where a figure is infinite or does not exist."""
+    """Several couplings over frequency; SI units, null where a figure is infinite or does not exist."""
 
     case: str
     scenario: str
@@ -89,17 +89,17 @@ class Comparison:
 
     @property
     def conditions(self) -> list[str]:
-        """By which every coupling is judged."""
+        """Names of the conditions by which every coupling is judged."""
         return [*self.couplings[0].conditions]
 
     @classmethod
     def of(
         cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str], seed: int
     ) -> Comparison:
-        """Of the couplings chosen, by name; `failed` says what could not be designed."""
+        """Compare the couplings `chosen`, by name; `failed` has a sentence for each coupling that was not designed."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
-        alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # the nominal environment is drawn
+        alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # curves show the nominal environment
         assessments = {name: assessed(alone, case, c) for name, c in chosen.items()}
         judged = {
             name: compare.judge(loop, c.coupling, [*own.values()], assessments[name].requirements)

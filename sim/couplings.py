@@ -68,7 +68,7 @@ def _choose(
     limiter: bool | None,
     progress: Callable[[str, int, int], None],
 ) -> Chosen:
-    """Choose by the name of the condition, and the user's own condition of that name."""
+    """Return the coupling for the condition of a name, or for the user's own condition `own` of that name."""
     if case == "none":
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
@@ -104,7 +104,7 @@ def own_of(name: str, loop: Loop) -> Chosen:
 
 
 def given(coupling: Any, kind: str = "given") -> Chosen:
-    """Return the choice of a coupling, or of a design with its proofs; None is the loop without a coupling."""
+    """Return the record of a coupling, or of a design with its proofs; None is the loop without a coupling."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, limiter=proof)

@@ -1,9 +1,9 @@
 """Validate a loop with many random passive humans, by both engines, in batches over processes.
 
 Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result is
-that of a single run, bit for bit. MuJoCo decides by the map of its Runge-Kutta integrator, which shares only the model
-with the exact engine. Its traces use the exponential integrator, at a fifth of the cost. The exact step simulates all
-humans, MuJoCo those whose traces say most (`_witnessed`). Workers end with the process that started them.
+that of a single run, bit for bit. MuJoCo's verdict is by the map of its Runge-Kutta integrator, which shares only the
+model with the exact engine. Traces in MuJoCo use the exponential integrator, at a fifth of the cost. The exact engine
+simulates all humans, MuJoCo a sample (`_witnessed`). Workers end with the process that started them.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
         yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person, mechanics)
 
 
-# ---- what is asked, and what is found
+# ---- the question and the result
 
 
 @dataclass(frozen=True)
 class Validation:
-    """A loop, the humans that hold it, and how they are judged."""
+    """A loop, the number of humans that hold it, and the settings of their judgement."""
 
     scenario: Scenario
     coupling: Coupling
@@ -89,7 +89,7 @@ class Validation:
     threads: int = 0  # of MuJoCo; 0 for all
     environments: tuple[Member, ...] = ()  # humans meet these in turn; empty: all meet the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
-    all_traces: bool = False  # of MuJoCo, or of a user's own engine: not only of the humans that say most
+    all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 
     @property
     def ticks(self) -> int:
@@ -101,7 +101,7 @@ class Validation:
         return assemble(self.scenario, self.coupling, self.lag)
 
     def batches(self) -> list[range]:
-        """Yield all indices in batches of _BATCH; each batch meets one environment."""
+        """Return all indices in batches of at most _BATCH; each batch meets one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
         return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
@@ -113,7 +113,7 @@ class Validation:
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
         """Draw the humans of these indices, joined as the scenario's persons join its devices.
 
-        A user's own population draws from the same seeds, with the persons as they stand in the scenario.
+        A user's own population draws from the same seeds; its persons are those of the scenario, unchanged.
         """
         scenario = self.scenario
         if not isinstance(scenario.population, Population):
@@ -149,11 +149,11 @@ class Findings:
         contacts: (n,) how often a wall was touched on the exact trace.
         mass: (n,) geometric mean over channels of all mass of a hand [kg].
         damping: (n,) geometric mean over channels of the least damping of a hand [N s/m].
-        switching: (n,) growth rate [1/s] of the linear loop under delays or ticks that vary; nan where they do not.
-        switching_mujoco: (n,) the same on MuJoCo's trace [1/s]; nan also where that was clipped.
+        switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
+        switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace under these; nan also if the trace was clipped.
         simulated: The duration of all traces together [s].
         interrupted: Whether the keyboard interrupted the validation.
-        lost: Why batches are missing that nobody interrupted.
+        lost: The reason why batches are missing although nobody interrupted, or "".
     """
 
     index: NDArray[np.intp]
@@ -190,7 +190,7 @@ class Findings:
 
     @property
     def trace_decides(self) -> NDArray[np.bool_]:
-        """(n,) whether the growth rate of the trace is larger than its error: only then its sign is a verdict."""
+        """(n,) whether the growth rate of the trace is larger than its error, so that its sign is a verdict."""
         return np.abs(self.trace) > self.trace_error
 
 
@@ -212,7 +212,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 # ---- one batch
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # the same bits in every process, wherever it runs
+@threadpool_limits.wrap(limits=1, user_api="blas")  # One thread gives the same bits in every process.
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
@@ -311,8 +311,8 @@ def _witnessed(
 ) -> NDArray[np.intp]:
     """Return the numbers of the humans of one group that the other engine simulates, too.
 
-    These are all lossless ones, the _NEAREST whose `growth` [1/s] is nearest to zero, and whoever is among the
-    _AT_RANDOM of all humans. They follow from the question and the group alone, whoever works on it.
+    These are all lossless ones, the _NEAREST whose `growth` [1/s] is nearest to zero, and those of the _AT_RANDOM draws
+    of all humans. They depend on the question and the group alone, not on the number of processes.
     """
     if validation.all_traces:
         return np.arange(len(index))
@@ -332,9 +332,9 @@ def _traced(
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
 ) -> ImpulseTest:
-    """Return the exact engine's impulse test, with growth and clipped ticks of the other engine's for `witnesses`.
+    """Return the exact engine's impulse test, with growth and clipped ticks of the other engine for `witnesses`.
 
-    In even periods, with forces that latch in the middle of their range: what their spread does is `switched_crowd`'s.
+    Periods are even and forces latch in the middle of their range; `switched_crowd` tests their spread.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks
@@ -415,7 +415,7 @@ def _in_processes(question: Validation, shards: int, parts: dict[int, Findings],
 
 
 def _as_worker() -> None:
-    """Ignore Ctrl-C, which reaches every process of a terminal and is the parent's; end with the parent."""
+    """Ignore Ctrl-C, which reaches every process of a terminal and which the parent handles; end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -1,20 +1,20 @@
-"""Engines: what moves the plant between two samples, for one simulation or for many at once.
+"""Engines, which move the plant between two samples, for one simulation or for many at once.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
     exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
                   J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
     RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.accuracy decides
 
-The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
-there is RK4.
+The exponential engine shares J with the exact one, so it checks forces and assembly, but not the stepping in time. RK4
+checks the stepping.
 
-An impedance (A, B, C, D) that a hand has is no body. Its state and its force are part of the exponential step, which
-stays exact. Around each step of MuJoCo's own integrators lie two half steps, exact too, of what the impedance and the
-masses do to each other while positions rest (Strang's splitting): of second order in the step, and never active.
+A hand's impedance (A, B, C, D) is no body of MuJoCo. Its state and force are part of the exponential step, which stays
+exact. For MuJoCo's own integrators each step lies between two exact half steps, in which impedance and masses interact
+while positions rest (Strang splitting). The splitting is of second order in the step and never active.
 
-All of them read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
-timing (controller.delay) every tick has a length of its own, and forces that latch late act from within it; then the
-forces that the actuators hold are the last entries of the plant's state.
+All engines read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
+timing (controller.delay) every tick has its own length, and late forces latch within the tick. The forces that the
+actuators hold are then the last entries of the plant's state.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = 256  # of ticks that differ, kept by an engine
+_MOST_MAPS = 256  # maps of different ticks in an engine's cache
 
 
 class Engine(Protocol):
@@ -58,22 +58,22 @@ class Engine(Protocol):
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """k: hold the plant input of row k, forces within their limits, for T; write the plant state of row k + 1."""
+        """A function of k: hold the plant input of row k for T, and write the plant state of row k + 1."""
         ...
 
     def troubled(self) -> bool:
-        """Return whether the engine itself has reported numbers that it cannot go on with."""
+        """Return whether the engine has reported numerical trouble after which it cannot go on."""
         ...
 
 
 @runtime_checkable
 class RunsBlocks(Protocol):
-    """What an engine may have beside: many ticks of a linear law in fewer calls than one by one."""
+    """Optional methods of an engine that runs many ticks of a linear law in one call."""
 
-    run_block: RunBlock | None  # from `start` on: law and `advance` for so many ticks from row 0 on, where it can
+    run_block: RunBlock | None  # set by `start`: runs law and `advance` for a number of ticks from row 0 on
 
     def back(self, k: int) -> None:
-        """After a `run_block`, take the plant back to the state of row k."""
+        """Restore the plant state of row k after a `run_block`."""
         ...
 
 
@@ -88,12 +88,12 @@ class _Exact:
 
 
 class ExactEngine(_Exact):
-    """One matrix product per period: of one plant, or simulation j of the buffer moves as plant j of many."""
+    """One matrix product per period, for one plant, or for a stack whose plant j moves simulation j of the buffer."""
 
     def __init__(self, plant: HeldPlant) -> None:
         self._plant = np.concatenate([plant.A, plant.B], axis=-1)
         self._product = product_of(self._plant)
-        self.advance: Callable[[int], None]  # from `start` on
+        self.advance: Callable[[int], None]  # set by `start`
 
     def start(self, buffer: StepBuffer) -> None:
         product, rows, states = self._product, buffer.plant_row, buffer.plant_state
@@ -117,13 +117,13 @@ class ExactEngine(_Exact):
 
 
 class OneByOne:
-    """An engine for each simulation of a buffer, as one engine of all."""
+    """One engine for all simulations of a buffer, made of an engine for each."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
         self._engines = engines
 
     def start(self, buffer: StepBuffer) -> None:
-        process = replace(buffer.process, delays=None, net=None)  # which stand before the forces of a row
+        process = replace(buffer.process, delays=None, net=None)  # The forces of a row are already delayed and limited.
         shape = buffer.ticks, buffer.s.shape[1], buffer.w.shape[1]
         self._all, self._each = buffer, [StepBuffer(process, *shape) for _ in self._engines]
         for j, (engine, own) in enumerate(zip(self._engines, self._each, strict=True)):
@@ -144,7 +144,7 @@ class OneByOne:
 
 
 class ExactTimedEngine(_Exact):
-    """A tick of a timing moves the plant, or simulation j plant j of many, exactly."""
+    """An exact engine for ticks of a timing; plant j of a stack moves simulation j of the buffer."""
 
     def __init__(self, plant: Plant, timing: Timing) -> None:
         held, kinds = lru_cache(_MOST_MAPS)(partial(hold, plant)), timing.kinds
@@ -168,10 +168,9 @@ class ExactTimedEngine(_Exact):
 # ----------------------------------------------------------------------------------------------------
 # MuJoCo's engines.
 
-#: the integrator of ours, which reads MuJoCo's accelerations
-EXPONENTIAL = "exponential"
+EXPONENTIAL = "exponential"  # our own integrator, which reads MuJoCo's accelerations
 
-#: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
+#: name -> integrator of MuJoCo's model; "exponential" never calls MuJoCo's integrator
 INTEGRATORS = {
     EXPONENTIAL: "mjINT_RK4",
     "RK4": "mjINT_RK4",
@@ -181,8 +180,7 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-_RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
-_WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # limits of mode h [rad] and rate h for a step h that follows the plant
 
 
 def least_substeps(integrator: str) -> int:
@@ -205,23 +203,23 @@ def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDA
 
 @dataclass(frozen=True, eq=False)
 class _Access:
-    """What is written to MuJoCo and read from it: of one simulation arrays (n,), of many (n, nsim).
+    """Arrays and functions of MuJoCo that a tick reads, writes and calls: (n,) for one simulation, (n, nsim) for many.
 
-    Its ticks are closures: looking things up would take longer than moving them, and a bound method would be a cycle
-    that keeps a batch's memory.
+    Ticks are closures, because attribute lookups would take longer than the step. A bound method would be a reference
+    cycle that keeps a batch's memory.
     """
 
     T: float  # [s]
     substeps: int
     ctrl: Array
     state: Array  # [q; v], (2, n) of one simulation
-    size: int  # of a state of the plant: q, v and what the impedances of hands have
+    size: int  # length of a plant state: q, v and the states of the hands' impedances
     qacc: Array
     forward: Callable[[], object]
-    step: Callable[[int], object]  # so many steps
-    pace: Callable[[float], object]  # sets their length [s]
-    move: Callable[[float], Product] | None  # seconds -> [state; qacc] to the state then, where steps are exponential
-    kick: Callable[[float], Product] | None  # seconds -> a state to that after impedances alone have acted
+    step: Callable[[int], object]  # makes a number of steps
+    pace: Callable[[float], object]  # sets the length of a step [s]
+    move: Callable[[float], Product] | None  # seconds -> exponential step from [state; qacc] to the next state
+    kick: Callable[[float], Product] | None  # seconds -> step of the impedances alone, from state to state
 
     def put(self, buffer: StepBuffer, k: int) -> None:
         """Put the plant into the state of row k."""
@@ -286,7 +284,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """Move from latch to latch; the next row also holds the acting forces, behind the state."""
+        """Move from latch to latch; the next row also holds the acting forces after the state."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -305,7 +303,7 @@ class _Access:
         return advance
 
     def _move_by(self, seconds: float, row: Array) -> None:
-        """Move MuJoCo and the state `row`, which is where it stands."""
+        """Move MuJoCo, whose present state is `row`, for some seconds, and update `row`."""
         (view,) = self._shaped(row[None])
         if self.move:
             for _ in range(self.substeps):
@@ -313,7 +311,7 @@ class _Access:
                 self.move(seconds / self.substeps)(np.concatenate([row, self.qacc]), row)
                 self.state[...] = view
             return
-        count = max(1, math.ceil(self.substeps * seconds / self.T - _WHOLE))
+        count = max(1, math.ceil(self.substeps * seconds / self.T - 1e-9))  # Rounding must not add a step.
         self.pace(seconds / count)
         if not self.kick:
             self.step(count)
@@ -344,13 +342,13 @@ class MujocoEngine:
         stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
         # MuJoCo solves friction from the solution before, which `back` cannot restore.
         self._smooth = default_integrator(scene) == EXPONENTIAL
-        self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
+        self._one_step = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
             T,
             substeps,
             ctrl=self.data.ctrl,
-            # one view of both, wherever MuJoCo has put them: one copy reads them
+            # one view of q and v, wherever MuJoCo has put them, so that one copy reads both
             state=as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
             size=len(scene.plant.A),
             qacc=self.data.qacc,
@@ -367,14 +365,14 @@ class MujocoEngine:
         self._warnings[:] = 0
         self._advance: Callable[[int], None] | None = None
         if buffer.calm and self._smooth and not self._timing:
-            if self._whole:
-                self.run_block = self._fused(buffer, self._whole(access.T))
+            if self._one_step:
+                self.run_block = self._fused(buffer, self._one_step(access.T))
             elif not (access.move or access.kick):
                 self.run_block = self._stepped(buffer)
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """From `start` on; prepared when a tick is asked for alone."""
+        """The function that moves one tick, made at its first use after `start`."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 
@@ -415,7 +413,7 @@ class MujocoEngine:
         return run_block
 
     def back(self, k: int) -> None:
-        """Put the plant into the state of row k; what was warned of since does not count."""
+        """Put the plant into the state of row k, and forget the warnings since then."""
         self._access.put(self._buffer, k)
         self._warnings[:] = 0
 
@@ -424,10 +422,10 @@ class MujocoEngine:
 
 
 class MujocoBatchEngine:
-    """All simulations of a buffer in one mujoco.batch.Batch: one for every set of humans.
+    """All simulations of a buffer in one mujoco.batch.Batch, one for every set of humans.
 
-    Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
-    another order, so they differ by rounding.
+    Each simulation steps as in MujocoEngine, bit for bit. Only the exponential integrator sums its products in another
+    order and differs by rounding.
     """
 
     def __init__(
@@ -451,14 +449,14 @@ class MujocoBatchEngine:
         moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
-        # Runge-Kutta asks for no matrix of bodies alone
+        # A Runge-Kutta step of a scene without impedances needs no plant of each hand.
         exact_step = integrator == EXPONENTIAL or held_by.impedances
         plants = held_by.plants() if exact_step else _stacked(held_by.scene.plant)
 
         def move(h: float) -> Product:
             return _product_of_each(exponential_step(plants.A, h, model.nv, plants.felt))
 
-        self.advance: Callable[[int], None]  # from `start` on
+        self.advance: Callable[[int], None]  # set by `start`
         self._timing = timing
         self._access = _Access(
             T,
@@ -497,7 +495,7 @@ def _stacked(plant: Plant) -> Plant:
 
 
 def _kicks(plants: Plant) -> Callable[[float], Product] | None:
-    """Return a function from seconds to the product for impedances alone; None if there are none."""
+    """Return a function from seconds to the step of the impedances alone; None without impedances."""
     felt = plants.felt
     if felt is None:
         return None
@@ -535,7 +533,7 @@ def profiler_off() -> Iterator[bool]:
     """Run without the clock that MuJoCo's Python binding reads several times per step.
 
     The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether
-    the pointer was found; where it is not, everything just runs with the clock. It is put back at the end.
+    the pointer was found; without it everything runs with the clock. The pointer is restored at the end.
     """
     pointer = _profiler_clock()
     if pointer is None:
@@ -564,30 +562,30 @@ def _profiler_clock() -> ctypes.c_void_p | None:
 
 @dataclass(frozen=True)
 class _PlantSpeed:
-    """How fast a plant moves."""
+    """The fastest motions of a plant, which the step of an integrator has to follow."""
 
-    mode: float  # [rad/s] its fastest weakly damped mode, 0 where there is none
-    rate: float  # [1/s] its strongest damping
+    mode: float  # [rad/s] of the fastest weakly damped mode, 0 without any
+    rate: float  # [1/s] of the strongest damping
 
     def within(self, h: float) -> bool:
         """Return whether a step of h seconds follows the plant."""
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """Return the least number of RK4 steps in T seconds that follows it."""
+        """Return the least number of RK4 steps in T seconds that follows the plant."""
         return max(
             least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
         )
 
     def hardest(self, h: float) -> str:
-        """Return in words what a step of h seconds has most trouble with."""
+        """Return in words the motion that a step of h seconds follows worst."""
         if self.mode / _RESOLVED >= self.rate / _FOLLOWED:
             return f"the mode at {self.mode / (2 * math.pi):.4g} Hz advances {self.mode * h:.3g} rad in a step"
         return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
 
 
 def pace(A: Array) -> _PlantSpeed:
-    """Return the pace of x' = A x, or of the fastest of many; weakly damped modes turn faster than they decay."""
+    """Return the fastest motions of x' = A x, or of a stack; a weakly damped mode turns faster than it decays."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

@@ -1,4 +1,4 @@
-"""Which loops go on oscillating in human hands, by eigenvalues for every human and in MuJoCo for the worst.
+"""Limit cycles of loops in human hands: eigenvalues for every human, and MuJoCo for the worst human.
 
 A cell is a force map F and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
 human and gives the growth of the dominant mode. `simulate_cells` runs many cells as one MuJoCo batch, with encoder
@@ -32,9 +32,8 @@ Cells = NDArray[np.intp]
 # The exact loop's eigenvalues, with every human.
 
 
-#: slower modes [Hz] decay so little that they would hide an oscillation that is about to grow
-_MIN_FREQUENCY_HZ = 2.0
-_LEADING = 0.1  # share of the humans that meet every cell; the rest meet those that are stable with them
+_MIN_FREQUENCY_HZ = 2.0  # slower modes decay so little that they would hide an oscillation that is about to grow
+_LEADING = 0.1  # share of the humans that meet every cell; the others meet the cells that are stable with this share
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +42,9 @@ class HeldDevices:
 
     devices: tuple[Device, ...]  # (m,)
     T: float  # [s]
-    #: (index of each human, who, plant, positions of motors and handles in its state)
+    #: (index of each human, humans, plant, positions of motors and handles in the plant's state)
     groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
-    late: tuple[float, ...] | None = None  # (m,) [s] when forces latch after the tick; None where at it
+    late: tuple[float, ...] | None = None  # (m,) [s] from the tick to the latch of the forces; None if they coincide
 
     @classmethod
     def drawn(
@@ -61,8 +60,8 @@ class HeldDevices:
         """Draw random humans for the devices.
 
         Args:
-            links: Links of each human; None: as the population says.
-            latency: (m,) earliest and latest latching of forces [s]; they latch at the latest.
+            links: Number of links of each human; None for that of the population.
+            latency: (m,) earliest and latest latching of forces [s]; the latest is used.
         """
         late = None if latency is None else tuple(most for _, most in latency)
         groups = []
@@ -112,7 +111,7 @@ class HeldDevices:
         return (vector / positions[np.argmax(np.abs(positions))]).real
 
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
-        """Return the tenth of the humans (at least 8) that are unstable or nearest to it with most of these maps."""
+        """Return the tenth of the humans (at least 8) that are unstable, or nearly so, with most of these maps."""
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
         first = np.zeros(len(self), dtype=bool)
@@ -144,8 +143,8 @@ _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
 _START = 1e-3  # [m] displacement of the motor or handle that moves most, at the start
 _BLOCK = 64  # ticks between two looks at the keyboard
-DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show within a trace
-UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
+DECIDED = 0.2  # [1/s] a linear growth nearer to zero does not show within a trace
+UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear growth is nearer to zero than DECIDED
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
@@ -164,7 +163,7 @@ class Plan:
 
     @property
     def runaway_growth(self) -> float:
-        """Return the growth [1/s] above which a mode has diverged by the end of the trace, whether it swings or not."""
+        """The growth [1/s] above which a mode, oscillating or not, has diverged by the end of the trace."""
         return 1.2 * np.log(RUNAWAY / _START) / self.duration
 
 
@@ -187,22 +186,22 @@ class Points:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """Return where the linear loop grows or decays too slowly to be told from a limit cycle."""
+        """(k,) whether the linear loop grows or decays too slowly to be told from a limit cycle."""
         return np.abs(self.growth) <= DECIDED
 
     @property
     def differ(self) -> NDArray[np.bool_]:
-        """Return where MuJoCo contradicts a linear loop that clearly grows or decays."""
+        """(k,) whether MuJoCo contradicts a linear loop that clearly grows or decays."""
         return ~self.near & ((self.growth > 0) != self.oscillates)
 
     @property
     def verdicts(self) -> list[str]:
-        """Return "rests", "oscillates" or UNDECIDED for each cell."""
+        """The verdict "rests", "oscillates" or UNDECIDED for each cell."""
         words = np.where(self.oscillates, np.where(self.near, UNDECIDED, "oscillates"), "rests")
         return [str(word) for word in words]
 
 
-#: flat indices of cells -> their linear force maps, a stack, and what the computer does in each
+#: flat indices of cells -> stack of their linear force maps, and the computer's process of each cell
 _Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 
 
@@ -233,7 +232,7 @@ def simulate_cells(
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """One simulation: a process, who holds the devices, and where it starts."""
+    """One simulation: the computer's process, the human that holds the devices, and the initial state."""
 
     process: Process
     links: Array  # (m, links, 3) as in Crowd
@@ -245,7 +244,7 @@ def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan)
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)
-        runs_away = fastest > plan.runaway_growth  # without an oscillation: what pushes outwards at rest
+        runs_away = fastest > plan.runaway_growth  # even without an oscillation
         shown = np.where(runs_away, fastest, swinging)
         human = int(np.argmax(shown))
         mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
@@ -309,7 +308,7 @@ def _simulate(
 
 
 def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:
-    """Return the outside forces (ticks, outside) [N]: `press` (m,) on the ends of the humans."""
+    """Return the external forces (ticks, outside) [N]: `press` (m,) on the ends of the humans, with a smooth start."""
     t = (first + np.arange(ticks)) * T
     eased = np.where(t < _EASE, (1 - np.cos(np.pi * t / _EASE)) / 2, 1.0)
     w = np.zeros((ticks, scene.outside))

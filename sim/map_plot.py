@@ -1,4 +1,4 @@
-"""The picture of the K-B plane: what is certified, what random humans allow, and what was simulated."""
+"""The picture of the K-B plane: edges of certificates, cells that random humans decide, and simulated points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 
-#: in the order of drawing: the broken line lies on the other, so that both are seen where they are the same
+#: in the order of drawing: a broken line lies on a solid one, so that both are seen where they coincide
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
@@ -31,7 +31,7 @@ _LINES: dict[str, dict[str, Any]] = {
     "known-device-any": plots.STYLES[4] | {"linestyle": "--", "linewidth": 1.8},
     MODEL_KEPT: plots.STYLES[3] | {"linewidth": 1.8},
 }
-_OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # of a condition of the user's
+_OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # for a user's own condition
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
@@ -77,7 +77,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
-        # the edge is where required damping is what is available; far from it the figure is only kept finite
+        # On the edge the required damping is the available one; far from the edge values are only kept finite.
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:
@@ -129,11 +129,11 @@ def _points(axes: Axes, report: MapReport) -> list[Line2D]:
 
 
 def _title(report: MapReport) -> str:
-    what = report.scenario or "rigid wall"
+    subject = report.scenario or "rigid wall"
     if report.fixed:
-        what += f", {report.fixed.kind} coupling"
+        subject += f", {report.fixed.kind} coupling"
     if report.walls:
-        what += ", with walls"
+        subject += ", with walls"
     parts = [
         f"theta {_list(report.theta)}",
         f"T {1e3 * report.T:g} ms",
@@ -146,7 +146,7 @@ def _title(report: MapReport) -> str:
         parts.append(f"encoder step {1e6 * max(effects.encoder_step_m):g} um")
     if any(effects.friction_n):
         parts.append(f"friction {max(effects.friction_n):g} N")
-    head = f"{what}: {', '.join(parts[:3])}"
+    head = f"{subject}: {', '.join(parts[:3])}"
     return head if len(parts) == 3 else f"{head}\n{', '.join(parts[3:])}"
 
 

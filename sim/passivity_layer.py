@@ -2,9 +2,9 @@
 
     traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-With a net, Theta is no part of a tick's block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
-through a line that holds them, constant delays or not. The budget stands before the line and sees forces that the
-actuators can apply.
+With a net, a tick's block does not contain Theta. The forces of G = (I + Psi E V)^-1 Psi E go through the net, then
+through a delay line, for constant and for varying delays. The budget stands before the line and sees forces within the
+actuators' limits.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import InputError
 
-_HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
+_HELD = 4  # ticks beyond the largest delay for which a device holds a force when packets are lost
 
 
 @dataclass(frozen=True)
 class EnergyNet:
-    """The energy budget as a run is asked for it."""
+    """The settings of an energy budget for a run."""
 
     start: float  # W0 [J]
-    cap: float = np.inf  # the most that it may save [J]
+    cap: float = np.inf  # largest stored energy [J]
     guarantee: str | None = None  # what an assessment of this run guarantees
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """A fresh one."""
+        """Return a fresh budget for `nsim` runs. Raises InputError for impossible numbers."""
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
@@ -67,14 +67,14 @@ class EnergyNet:
 
 @dataclass(frozen=True, eq=False)
 class Plugged:
-    """Anything in place of the environment, behind the coupling and a shell that makes it passive."""
+    """A user's function in place of the environment, behind the coupling and a shell that makes it passive."""
 
-    force: Callable[[Array], Array]  # where the port would be, (m,) [m], once a tick -> force fed back (m,) [N]
+    force: Callable[[Array], Array]  # positions that the port would have without a force, (m,) [m] -> force (m,) [N]
     start: float = 0.0  # W0 [J]
     guarantee: str | None = None  # what an assessment of this run guarantees, or why it guarantees nothing
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """A fresh one."""
+        """Return a fresh shell for `nsim` runs. Raises ValueError for a loop in which no shell is known."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("an environment of your own needs a coupling with a compliance V before it")
@@ -84,7 +84,7 @@ class Plugged:
 
 
 def claim(assessment: Assessment) -> str:
-    """State in one line what is guaranteed of a run with an energy account, or why nothing is."""
+    """Return one line with the guarantee of a run with an energy account, or the reason why there is none."""
     if assessment.guarantee is None:
         return f"no guarantee: {assessment.reason}"
     behind = "behind a coupling certified for any environment, " if callable(assessment.environment) else ""
@@ -92,7 +92,7 @@ def claim(assessment: Assessment) -> str:
 
 
 class Wanted(Protocol):
-    """A net that is asked for: EnergyNet, Plugged, or one of your own."""
+    """The settings of a net: EnergyNet, Plugged, or a class of your own."""
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a fresh net for one record of `nsim` runs."""
@@ -102,8 +102,8 @@ class Wanted(Protocol):
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """Return the same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
-    What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
-    that it has. Raises InputError for numbers that no budget can have.
+    For linear analyses, such as certificates and modes, use the simulation without a net. Varying delays stay those of
+    the simulation. Raises InputError for numbers that no budget can have.
     """
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:
@@ -113,12 +113,12 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
         process = replace(process, delays=constant)
     make = partial(wanted.net, simulation, process)
-    make(1)  # raises for numbers that cannot be
+    make(1)  # raises for impossible numbers before anything runs
     return replace(simulation, process=replace(process, net=make))
 
 
 def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: BudgetFigures) -> str | None:
-    """Return why the budget never acts in this run from rest, or None where it may act."""
+    """Return the reason why the budget never acts in this run from rest, or None if it may act."""
     scenario = simulation.scenario
     if (
         budget.cap_J is not None
@@ -137,7 +137,7 @@ def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: Bu
 
 
 class _InLoop:
-    """What the nets have in common: forces within the actuators' limits, and how far the devices went meanwhile."""
+    """Base of the nets: it limits forces as the actuators do, and measures how far the devices moved in a tick."""
 
     def __init__(self, process: Process) -> None:
         self._within = process.applied
@@ -150,7 +150,7 @@ class _InLoop:
 
 
 class _Budgeted(_InLoop):
-    """The budget; behind it devices that let go of a force that is too old."""
+    """An energy budget, and devices behind it that drop a force that is too old."""
 
     def __init__(
         self, budget: EnergyBudget, guarantee: str | None, process: Process, late: Ticks | None, oldest: Array
@@ -193,15 +193,15 @@ class _Shelled(_InLoop):
 
     def __init__(self, shell: Shell, plugged: Plugged, process: Process) -> None:
         super().__init__(process)
-        self._shell, self._asked = shell, plugged
+        self._shell, self._plugged = shell, plugged
 
     def send(self, x: Array, force: Array, /) -> None:
         free = self._shell.free(x)
-        wanted = np.stack([_answer(self._asked.force(u), len(free)) for u in free.T], axis=1)
+        wanted = np.stack([_answer(self._plugged.force(u), len(free)) for u in free.T], axis=1)
         force[...], _ = self._shell.limit(self._within(wanted))
 
     def apply(self, k: int, force: Array, /) -> None:
         pass
 
     def figures(self) -> ShellFigures:
-        return self._shell.figures(self._asked.guarantee)
+        return self._shell.figures(self._plugged.guarantee)

@@ -1,7 +1,7 @@
 """Pictures that commands write, in one style: readable in black and white and by the colour-blind.
 
-Each function takes what its command reports (a Trace, a Map, or the report as it stands in JSON), writes one picture
-and returns its path.
+Each plot function takes the result of its command (a Trace, a Map or a report), writes one picture and returns its
+path.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
 
-Row = Comparison = Any  # sim.accuracy.Row, sim.compare_report.Comparison: they import traces, which import this file
+Row = Comparison = Any  # sim.accuracy.Row and sim.compare_report.Comparison, whose imports would be a circle
 
 
 class Run(Protocol):
-    """What a picture needs of a sim.trace.Trace; N samples, m channels."""
+    """The part of a sim.trace.Trace that a picture shows; N samples, m channels."""
 
     @property
     def t(self) -> Array: ...  # (N,) [s]
@@ -58,7 +58,7 @@ STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#56B4E9", "linestyle": (0, (5, 1, 1, 1, 1, 1))},
     {"color": "#E69F00", "linestyle": (0, (1, 2))},
 )
-#: what is ideal: broad, grey and behind the rest
+#: style of ideal curves: broad and grey
 _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
 
 
@@ -87,7 +87,7 @@ _FORMATS = (".png", ".pdf", ".svg")
 
 
 def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
-    """Write the texts of a figure in `unit`, by default that of this command."""
+    """Rewrite the texts of a figure in `unit`; the default is the unit of the running command."""
     for text in figure.findobj(Text):
         text.set_text(in_unit(text.get_text(), unit))
 
@@ -95,8 +95,8 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     """Write the figure in the format of the suffix, with its texts taken literally; the file is complete or absent.
 
-    A .png is for the screen. A .pdf or .svg is for a paper: as wide as a page of two columns, with letters to be read
-    there.
+    A .png is for the screen. A .pdf or .svg is for a paper: as wide as a page of two columns, with letters that are
+    readable at that width.
 
     Raises:
         InputError: The suffix is none of .png, .pdf and .svg.
@@ -114,9 +114,9 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
 
 
-_PAGE = 7.16  # [inch] both columns of an IEEE page, which other two-column papers hardly miss
-_LEGEND = 0.8  # columns of a legend: this share of those on the screen
-_LETTERS = (6.5, 9.0)  # [pt] least and most size of letters in a figure of such a paper
+_PAGE = 7.16  # [inch] both columns of an IEEE page, and nearly those of other two-column papers
+_LEGEND = 0.8  # columns of a legend in a paper, relative to the screen and to the figure's width
+_LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a figure of a paper
 
 
 def _fit_paper(figure: Figure) -> None:
@@ -128,7 +128,7 @@ def _fit_paper(figure: Figure) -> None:
         text.set_fontsize(min(max(share * float(text.get_fontsize()), _LETTERS[0]), _LETTERS[1]))
     for line in figure.findobj(Line2D):
         line.set_linewidth(max(share * line.get_linewidth(), 0.4))
-    for old in tuple(figure.legends):  # its letters shrink less than the page, so that fewer columns fit
+    for old in tuple(figure.legends):  # Letters shrink less than the page, so that fewer columns fit.
         entries = dict(zip([text.get_text() for text in old.get_texts()], old.legend_handles, strict=True))
         columns = max(1, int(_LEGEND * share * len(entries)))
         old.remove()
@@ -136,9 +136,9 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Escape names of users: dollars start no mathematics, and characters that the font lacks become a mark."""
+    """Show texts literally: dollars start no mathematics, and characters that the font lacks become a mark."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
-    texts = list(figure.texts)  # findobj would make all ticks, which the layout makes again
+    texts = list(figure.texts)  # findobj would create all ticks, which the layout creates again
     for axis in figure.axes:
         texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
     for legend in (*figure.legends, *filter(None, (axis.get_legend() for axis in figure.axes))):
@@ -150,7 +150,7 @@ def _literal(figure: Figure) -> None:
 
 
 def _plain_numbers(axes: Any) -> None:
-    """Label an axis 0.1, 1, 10, which is read and drawn faster than powers of ten."""
+    """Label axes 0.1, 1, 10, which are read and drawn faster than powers of ten."""
     for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
@@ -159,16 +159,16 @@ def _plain_numbers(axes: Any) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Runs, as in Figures 5 and 6.
 
-_SAME = 1e-6  # [%] what rounding leaves between two forces that are one
+_SAME = 1e-6  # [%] bound of the rounding between two equal forces
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """The contacts as a picture shows them: their names, where walls stand and when they were touched."""
+    """The contacts in a picture: names, places of walls, and the ticks at which a wall is touched."""
 
-    names: Sequence[str] = ()  # (m,) of the channels; "device 1", .. where there are none
+    names: Sequence[str] = ()  # (m,) of the channels; empty for "device 1", ..
     walls: Sequence[tuple[int, float, str]] = ()  # channel from 0, place [m] and name of each wall on ground
-    touching: NDArray[np.bool_] | None = None  # (N,) whether any wall is
+    touching: NDArray[np.bool_] | None = None  # (N,) whether any wall is touched
 
     def name(self, i: int) -> str:
         return self.names[i] if self.names else f"device {i + 1}"
@@ -176,11 +176,11 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Onset:
-    """How an oscillation begins: what is predicted, and up to when the run says something about a device."""
+    """The onset of an oscillation: its predicted growth, and the time up to which the run is credible."""
 
     growth: float | None  # [1/s] predicted by the eigenvalues; None where nothing grows
     steady: int  # ticks before the first clipped one
-    until: float | None = None  # [s] from here on the motion leaves what the devices declare credible
+    until: float | None = None  # [s] at which the motion leaves the devices' credible limits; None if it never does
 
 
 def draw_run(
@@ -191,13 +191,18 @@ def draw_run(
     onset: Onset | None = None,
     around: Contacts | None = None,
 ) -> Figure:
-    """Draw displacements and forces of a run, and six periods of `frequency_hz` where forces turn most sharply.
+    """Draw displacements and forces of a run, with a zoom where the forces turn most sharply.
 
-    The zoom is left out of a run whose forces turn as sharply everywhere. `around` names the curves and shows walls.
+    Handles are thick and encoders thin where the two differ.
 
-    Handles are thick, encoders thin where the two differ. `ideal`: forces (N, m) [N] of the ideal environment, drawn
-    behind the others, and how far they are from it [%]. `onset`: what is not credible is greyed, and of a loop that
-    grows the oscillation's amplitude is drawn over time beside its prediction, in place of the displacements' zoom.
+    Args:
+        result: The run.
+        title: The title of the figure.
+        frequency_hz: The zoom shows six periods of this frequency. It is left out if forces turn as sharply everywhere.
+        ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
+        onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
+            its prediction replace the zoom of the displacements.
+        around: Names of the curves, and walls.
     """
     last, growth = result.t.size, onset.growth if onset else None
     around = around or Contacts(result.names)
@@ -215,7 +220,7 @@ def draw_run(
     _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts, around)
     _draw_walls(axes[:, 0], result, around)
     two, alike = _two_points(result), _coinciding(result.f, around)
-    # a calm curve stays visible on an agitated one
+    # Calm curves are drawn last, so that agitated ones do not hide them.
     for axis, part, width in zip(axes[1], parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.f):
             style = STYLES[i % len(STYLES)]
@@ -241,7 +246,7 @@ def draw_run(
 
 
 def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
-    """Order curves channel by channel, for each channel first what the hand holds."""
+    """Order curves channel by channel, the handle first."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
     def place(label: str) -> tuple[int, bool, str]:
@@ -260,11 +265,11 @@ def _calmest_last(values: Array) -> list[int]:
     return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
 
 
-_ALIKE = 0.005  # of the largest value: curves that differ by less cannot be told apart
+_ALIKE = 0.005  # curves that differ by less, relative to the largest value, look the same
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return for each curve of (N, m) which earlier one it lies on, as the end of its label."""
+    """Return the end of each curve's label, (N, m) -> m texts: the name of an earlier curve that looks the same."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -273,26 +278,26 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
     return ends
 
 
-_SHARPER = 4.0  # times the run's mean: what is to be seen in a zoom
+_SHARPER = 4.0  # a zoom shows a part whose forces turn this many times more sharply than the mean of the run
 
 
 def _stands_out(result: Run, near: slice, ticks: int) -> bool:
-    """Return whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
+    """Return whether the forces turn more sharply in the part `near` than in the first `ticks` on average."""
     if 10 * (near.stop - near.start) > result.t.size:
-        return False  # nearly the whole is no zoom
+        return False  # The part is too long for a zoom.
     bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
 
 
 def _one_point(result: Run) -> str:
-    """Return the label of the axis of displacements if one curve stands for the handle and for the encoder."""
+    """Return the label of the displacement axis if one curve shows both the handle and the encoder."""
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
 
 
 def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
-    """Draw where walls stand, in the panel of displacements, and when they were touched, in both panels."""
+    """Draw the places of walls in the panel of displacements, and the time in contact in both panels."""
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
         axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
@@ -307,7 +312,7 @@ def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
 
 
 def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
-    """Draw handles over encoders, in millimetres; only handles where both are one point in the picture."""
+    """Draw handles over encoders, in millimetres; only handles if both look the same in the picture."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
@@ -344,7 +349,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     for i, column in enumerate(1e3 * sizes.T):
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
-    # the last third: by then the slower modes have died away
+    # The prediction is fitted to the last third, because slower modes have decayed by then.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
@@ -363,7 +368,7 @@ def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
     if ticks < 2 * width:
         return np.empty(0), np.empty((0, result.x.shape[1]))
     window, starts = np.hanning(width), np.arange(0, ticks - width, max(1, width // 4))
-    # the second difference takes a hand's slow motion away, and a sinusoid's only by a known factor
+    # The second difference removes a hand's slow motion, and scales a sinusoid by a known factor.
     fast = np.diff(result.x[:ticks], n=2, axis=0, prepend=result.x[:1], append=result.x[ticks - 1 : ticks])
     turning = window * np.exp(-2j * np.pi * hertz * T * np.arange(width))
     sums = np.array([turning @ fast[k : k + width] for k in starts])
@@ -372,10 +377,10 @@ def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
 
 
 def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
-    """Draw the ideal forces, broad and pale in each device's colour, cut at three times the others."""
+    """Draw the ideal forces, broad and pale in each device's colour; the axis ends at three times the other forces."""
     forces, percent = ideal
     label = "pale: what the object itself gives for this motion"
-    if percent is not None:  # of the force before the motors' limit, as in the report
+    if percent is not None:  # The report compares forces before the motors' limits.
         label += " (the motors were asked for the same)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
@@ -387,7 +392,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Return six periods in which the forces of the first `ticks` turn most sharply, more if they turn less often."""
+    """Return six periods in which the forces of the first `ticks` turn most sharply; more if they turn less often."""
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
     width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
@@ -402,7 +407,7 @@ def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> sli
 
 
 def _turns(f: Array) -> int:
-    """Return how often the force that turns most often does so, (k, m)."""
+    """Return the largest number of turning points of a force, of forces (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
 
@@ -414,13 +419,13 @@ class Panel:
     title: str
     trace: Run
     ideal: Array  # (N, m) forces of the ideal environment [N]
-    until: float | None = None  # [s] as of an onset
+    until: float | None = None  # [s] at which the run stops being credible; None if it never does
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
     """Plot the forces of several couplings on equal axes, each over the object's forces for that motion (pale).
 
-    The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
+    The range of the axes is that of the credible ideal forces, so that oscillating forces may leave the panels.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
@@ -504,8 +509,8 @@ _PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_F", "F, what the devices see", STYLES[0]),
     ("sigma_M", "M, the mismatch", STYLES[1]),
 )
-_HIGHEST = 20.0  # of the available damping: what a picture of the required one still shows
-_FLOOR = 1e-4  # of the largest value: what a logarithmic axis still shows
+_HIGHEST = 20.0  # largest required damping in a picture, relative to the available one
+_FLOOR = 1e-4  # smallest value on a logarithmic axis, relative to the largest
 
 
 def plot_singular_values(report: Comparison, path: Path) -> Path:
@@ -536,7 +541,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping
-    alike = len(set(available)) == 1  # devices that are not are drawn as ratios
+    alike = len(set(available)) == 1  # Unlike devices are drawn as ratios.
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
     for axis, condition in zip(axes[0], names, strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
@@ -574,7 +579,7 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
                 axis.plot(hz, getattr(values, key)[:, i], label=name, **style)
             axis.axhline(0.0, color="black", linewidth=0.7)
             axis.set_xscale("log")
-            # logarithmic both ways, linear around zero up to the power of ten below the median size
+            # A symmetric logarithm, which is linear around zero up to the power of ten below the median size.
             sizes = np.abs([getattr(values, key)[:, i] for _, values, _ in curves])
             typical = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
             axis.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(typical)))

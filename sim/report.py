@@ -53,7 +53,7 @@ def _shared(scenario: Scenario) -> list[float]:
 
 
 def friction_left_out(devices: Sequence[Device]) -> list[str]:
-    """Return a remark on the friction of each device of which only an upper bound is published."""
+    """Return a remark for each device whose friction has a published upper bound only."""
     return [
         f"Friction of device #{i}: at most {device.friction_max:g} N (published), not simulated and not relied upon."
         for i, device in enumerate(devices, start=1)
@@ -65,7 +65,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 # The paper's figures compared with ours.
 
 
-#: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
+#: The transparency indices (25) [dB] that the paper prints; none of our readings of Figure 4 reproduces them.
 _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
@@ -194,12 +194,12 @@ class _DelaysMet:
 
     @property
     def worst(self) -> _DelaysMet | _PeriodGrowth:
-        """The record with the growth: that of the worst switching found, else that of the run's delays."""
+        """The record of the growth: of the worst switching if it was searched, else of the run's delays."""
         return self.period or self
 
     @property
     def how(self) -> str:
-        """The source of that growth, in words."""
+        """The method behind the growth of `worst`, in words."""
         if self.period:
             return f"growth by the eigenvalues of the product over the {self.period.ticks} ticks of a period"
         return f"growth of the linear loop after an impulse, over {self.judged_s:.3g} s under the run's delays"
@@ -258,7 +258,7 @@ class UnevenTicks:
 
 
 def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
-    """Return `stability_of` for switching delays, which have eigenvalues only over a period of the switching."""
+    """Return the verdict on a run with switching delays, whose eigenvalues exist only over a period of switching."""
     met = delays.met
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))

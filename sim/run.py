@@ -58,7 +58,7 @@ Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 
 _COPIES = 4  # largest number of copies of a trace from the run to its report
 _SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
-_COLUMNS = 50  # numbers per tick that the report of a trace on disk needs in memory
+_COLUMNS = 50  # numbers per tick that a report needs in memory even if the trace is on disk
 _BLOCK = 2048  # ticks between two checks of the clock, the keyboard and the numbers
 _AHEAD = 8  # number of blocks for which outside forces are sampled together
 
@@ -70,7 +70,7 @@ class EngineSettings:
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # of MuJoCo
     substeps: int | None = None  # per period
-    error: float | None = None  # relative rms of the positions that the cheapest setting must keep, instead of both
+    error: float | None = None  # relative rms error of positions; the cheapest setting that keeps it is then chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ class Simulation:
     coupling: Coupling
     process: Process
     scene: Scene
-    plant: HeldPlant  # for periods T, and forces that latch in the middle of their range
-    timing: Timing | None = None  # of the ticks of a run, where they are not all alike
+    plant: HeldPlant  # for periods T and forces that latch in the middle of their range
+    timing: Timing | None = None  # of uneven ticks; None if all ticks are alike
 
     @cached_property
     def loop(self) -> Loop:
@@ -106,7 +106,7 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """Return the simulation without Coulomb friction in the scene, for linear verdicts."""
+        """The simulation without Coulomb friction in the scene, for linear verdicts."""
         if not self.friction:
             return self
         devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
@@ -116,7 +116,7 @@ class Simulation:
     def held_by(
         self, humans: tuple[Hand, ...], persons: tuple[Person, ...], mechanics: Sequence[Mechanics] = ()
     ) -> Simulation:
-        """Return the simulation with other hands, which do not move by themselves; `mechanics` are drawn devices."""
+        """Return the simulation with other hands and without voluntary motion; `mechanics` replaces the devices'."""
         devices = self.scenario.device
         if mechanics:
             devices = tuple(map(Mechanics.of, mechanics, devices))
@@ -128,7 +128,7 @@ class Simulation:
 
     @property
     def even(self) -> Simulation:
-        """Return the simulation with even periods T and forces that latch at ticks, for comparing integrators."""
+        """The simulation with even periods T and forces that latch at ticks, for comparing integrators."""
         if self.timing is None:
             return self
         return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
@@ -171,9 +171,17 @@ def run(
 ) -> Trace:
     """Run the loop and return the trace.
 
-    `engine` is an engine, its class, or the name of one, with its default step; `outside`, `ticks` and the plant state
-    `start`, (states, 1), are those of the scenario and rest where they are not given. The trace ends early where
-    numbers stop being finite, the engine reports trouble, or the keyboard interrupts.
+    Args:
+        simulation: The loop.
+        engine: An engine, its class, or its name, for its default step.
+        outside: External forces on the hands; default: those of the scenario.
+        ticks: Number of ticks; default: the scenario's.
+        start: Initial plant state (states, 1); default: rest.
+        progress: Called with (ticks done, number of ticks).
+
+    Returns:
+        The trace. It ends early when a number stops being finite, the engine reports trouble, or the keyboard
+        interrupts.
     """
     process, scenario = simulation.process, simulation.scenario
     engine = make_engine(simulation, engine)
@@ -189,7 +197,7 @@ def run(
         nonlocal diverged, net, done
         net, rows = buffer.net, buffer.rows[:count]
         diverged = engine.troubled()
-        if not np.isfinite(rows.sum()):  # rare; then the rows are checked one by one
+        if not np.isfinite(rows.sum()):  # Only then the rows are checked one by one.
             finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
             diverged |= not finite.all()
             count = count if finite.all() else int(np.argmin(finite))
@@ -231,7 +239,7 @@ def _columns(rows: Array, which: tuple[int, ...]) -> Array:
 def _room(width: int, ticks: int, T: float) -> Array:
     """Return an array (ticks, width) in memory, or in a temporary file if the memory is too small.
 
-    Raises InputError if the report of such a trace does not fit into memory, or the trace not on the disk.
+    Raises InputError if the report of such a trace does not fit into memory, or if the trace does not fit on the disk.
     """
     shape, each = (ticks, width), 8 * width
     free = _free_memory() if each * ticks > _SMALL else np.inf
@@ -348,10 +356,9 @@ def make_engine(
 ) -> Engine:
     """Return the engine of a name for one simulation; MuJoCo advances it by T seconds (default: the scenario's).
 
-    The default integrator is that of the scene, the default number of substeps that of `least_substeps`. An engine of
-    the user's own is used as it is, or made from the simulation.
-    Raises ValueError for an unknown name or an object that is no engine, for the exact engine with Coulomb friction,
-    and for an engine of the user's own with uneven ticks.
+    The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
+    as it is, or made by calling it with the simulation. Raises ValueError for an unknown name, an object that is no
+    engine, the exact engine with Coulomb friction, and a user's own engine with uneven ticks.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)
@@ -379,11 +386,11 @@ def engine_name(engine: AnyEngine) -> str:
 
 
 def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], Engine]) -> Engine:
-    name, is_made = f"engine {engine_name(engine)}", hasattr(engine, "start") and not isinstance(engine, type)
-    own_engine: Any = engine if is_made or not callable(engine) else called(name, engine, simulation)
+    name, is_engine = f"engine {engine_name(engine)}", hasattr(engine, "start") and not isinstance(engine, type)
+    own_engine: Any = engine if is_engine or not callable(engine) else called(name, engine, simulation)
     if lacking := [part for part in ("start", "troubled") if not callable(getattr(own_engine, part, None))]:
-        has = "expected what has start(buffer), advance(k) and troubled() (sim.engines.Engine)"
-        raise InputError(f"{name} has no {' and no '.join(lacking)}: {has}")
+        expected = "expected an object with start(buffer), advance(k) and troubled() (sim.engines.Engine)"
+        raise InputError(f"{name} has no {' and no '.join(lacking)}: {expected}")
     if simulation.timing and not type(own_engine).__module__.startswith("haptic_loop."):
         raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
     return own_engine

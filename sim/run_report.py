@@ -30,7 +30,7 @@ from haptic_loop.sim.stability import Ringing, Stability, ringing, stability_of
 
 @dataclass(frozen=True, kw_only=True)
 class Ran:
-    """How the loop was run."""
+    """The settings of a run, and its cost."""
 
     engine: str
     integrator: str | None
@@ -57,7 +57,7 @@ class Ran:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """The result of a run; parts that it does not have are null."""
+    """The result of a run; absent parts are null."""
 
     case: str
     scenario: str
@@ -79,7 +79,7 @@ class RunReport:
 
     @property
     def switched(self) -> bool:
-        """Whether the delays switch, so that no eigenvalue says whether the loop grows."""
+        """Whether the delays switch, so that no eigenvalue decides stability."""
         return bool(self.varying_delay and self.varying_delay.met)
 
     def notes(self) -> list[str]:
@@ -90,9 +90,9 @@ class RunReport:
         if not part.certified and not part.reason:
             source = named(self.chosen.asked).source
             condition = f"the {part.condition} condition" + (f" ({source})" if source else "")
-            what = "The loop without" if self.kind == "none" else "This"
+            subject = "The loop without" if self.kind == "none" else "This"
             needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"
-            lines.append(f"{what} coupling fails {condition}: {needs}.")
+            lines.append(f"{subject} coupling fails {condition}: {needs}.")
         if self.stability.contact:
             making = [r.condition for r in certificates.values() if r.certified and r.guarantee == where]
             covered = making[0] if making and where in (ANY, MAKING) else "no certificate"
@@ -123,7 +123,7 @@ def run_report(
     environment: str,
     check: bool,
 ) -> RunReport:
-    """Report a run in the environment of this name; `check` runs another integrator beside it."""
+    """Report a run in the environment of this name; `check` repeats the run with another integrator."""
     simulation, trace, loop, requirements = run.simulation, run.trace, scenario.loop(case), assessment.requirements
     delays, grows = None, None
     if simulation.scenario.varying_delay:

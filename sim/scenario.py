@@ -1,7 +1,7 @@
-"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
+"""Scenarios: devices, humans, environment, delays and timing of one loop, read strictly from TOML.
 
-A scenario holds devices, humans, environment, delays and timing of one loop. Humans may come from a file of their own,
-one [[human]] per channel: how a human that was found is kept and replayed.
+Unknown keys and impossible numbers are refused. Humans may stand in a file of their own, one [[human]] per device, so
+that the humans of a search can be stored and replayed.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ DEFAULT = "omega-pair"
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
 _MOST_CHANNELS = 32  # a run of 16 channels without a coupling takes 13 s of a core; of 50 it takes minutes
-_LONGEST_NAME = 200  # characters, that a table and a picture can show
+_LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
-_UNSAID: Any = None  # until the number of channels is known; no file can say it
+_UNSAID: Any = None  # default that is replaced once the number of channels is known
 
 
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,24 +76,24 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     name: str
     unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
-    radius: float | None = None  # [m] from the axis of rotary devices to the hand; whose limits a session has
+    radius: float | None = None  # [m] from the axis of rotary devices to the hand, for the limits of a session
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples] (4)
     psi: _Delays = _UNSAID  # environment delays [samples] (5); none unless given
     device: tuple[Device, ...]
-    human: tuple[Human, ...] = _UNSAID  # who holds the devices in a run; hands that move apart unless given
+    human: tuple[Human, ...] = _UNSAID  # the hands that hold the devices in a run; default: `_usual_hand`
     environment: Network
-    ranges: Ranges | None = None  # what else the environment may be
-    lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
-    person: tuple[Person, ...] = ()  # those who hold several devices
+    ranges: Ranges | None = None  # environments beside the nominal one that guarantees must cover
+    lam: _Delays | None = None  # reference delays [samples] (7); without it the case decides
+    person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
-    population: Population = Population()  # who `validate` draws
+    population: Population = Population()  # distribution of the humans that `validate` draws
     varying_delay: VaryingDelay | None = None  # of the forces, around theta; None where delays are constant
     T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
-    T_min: float | None = None  # [s] the shortest period, where T_max is given; only known-device asks for it
-    period: Periods | None = None  # the periods that are simulated; T is what the computer's filters are made for
-    latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
+    T_min: float | None = None  # [s] the shortest period, where T_max is given; only known-device needs it
+    period: Periods | None = None  # the periods that are simulated; the computer's filters are designed for T
+    latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the force's latch
 
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
@@ -151,7 +151,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
     def _per_channel(self) -> None:
-        """Repeat what is given per device for each of its axes. Raises ValueError where axes of a device differ."""
+        """Repeat values that are given per device for each axis. Raises ValueError where axes of a device differ."""
         counts = [len(device.free) for device in self.device]
         if max(counts, default=1) == 1:
             return
@@ -195,9 +195,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def limiter_limits(self) -> tuple[tuple[float, ...], tuple[slice, ...]]:
-        """Limits (m,) [N] of a limiter, and the channels of each vector that it limits as a whole.
+        """Limits (m,) [N] of a limiter, and the channels of each force vector whose length it limits.
 
-        Vectors are not solved together with walls, where each axis has the limit of the box inside.
+        The limiter cannot combine vectors with walls. With walls each axis gets the limit of the box inside the ball.
         """
         limits = [device.force_limit for device in self.axis_devices]
         if not self.environment.walls:
@@ -267,7 +267,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def _axes(self) -> dict[str, Any]:
-        """The fields of a loop on devices with several axes; none where all have one: such a loop keeps its digest."""
+        """The fields of a loop on devices with several axes; empty for one axis, to keep the loop's digest."""
         counts = tuple(len(device.free) for device in self.device)
         if max(counts) == 1:
             return {}
@@ -307,7 +307,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def uneven(self) -> bool:
-        """Whether ticks differ: in length, or in when forces latch."""
+        """Whether ticks differ in length or in the time at which forces latch."""
         return self.period is not None or any(least < most for least, most in self.latency or ())
 
     def timing(self, seed: int, ticks: int) -> Timing | None:
@@ -321,18 +321,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        newer = {
-            "T_max",
-            "T_min",
-            "latency",
-            "period",
-        }  # left out where they are not given: scenarios keep their digest
+        newer = {"T_max", "T_min", "latency", "period"}  # left out where not given, so that old digests stay valid
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
         if self.unit == "m":
             del contents["unit"], contents["radius"]
         contents["device"] = [_given_fields(device) for device in self.device]
-        if self.environment.world:  # the contents of its files count, not where they are
-            contents["environment"] = _nowhere(self.environment)
+        if self.environment.world:  # The contents of the world's files count, not their folder.
+            contents["environment"] = _without_folder(self.environment)
         content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
         return hashlib.sha256(content).hexdigest()
 
@@ -354,25 +349,25 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lever(self) -> float:
-        """Return the radius [m] at which a hand holds a rotary device, 1 without one: N to N m, and m to rad."""
+        """The radius [m] at which a hand holds a rotary device, 1 without one; it converts N to N m and m to rad."""
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:
-        """Return all that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
+        """Return the loop that designs and proofs see: of a device its damping and guaranteed bounds, no human.
 
-        Raises InputError for another case.
+        `case` is "none", "I" or "II"; raises InputError for another case.
         """
         span = self.delay_range
         varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        rest = (self.delta, _nowhere(self.environment), self.ranges, varying)
+        rest = (self.delta, _without_folder(self.environment), self.ranges, varying)
         more = {**self._known(), **self._axes, "unit": self.unit}
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
         """Return the fields of a loop on known devices for its first channels; none if a device is not known.
 
-        The shortest period belongs to them, so that other loops keep their digest.
+        The shortest period is one of these fields, so that loops on unknown devices keep their digest.
         """
         known = self.known_devices
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
@@ -380,7 +375,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
         """Return the loop of the first device alone before a rigid wall. Raises ValueError.
 
-        Of a device with several axes the wall may face any direction, so that the least damping of all counts.
+        The wall of a device with several axes may face any direction, so that the least damping of all directions
+        counts.
         """
         theta, late, delta = self.theta[:1], self.latency and self.latency[:1], self.delta[:1]
         if self.device[0].axes > 1:
@@ -392,10 +388,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """Return the scenario with some fields changed; `delta` is another guaranteed damping [N s/m].
 
-        As strict as a file, and what comes out is what a file would have given: lists become tuples. Humans may also
-        be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans, and an
-        environment with `contacts` and `E(T)` or `parts()`, which becomes a network.
-        Raises InputError naming the field, what came and what is allowed.
+        Values are checked and normalised as those of a file: lists become tuples. Humans may also be of a user's own
+        class (models.human.Hand). So may a population with `draw(rng, n)`, which returns n humans, and an environment
+        with `contacts` and `E(T)` or `parts()`, which becomes a network.
+        Raises InputError with the field, its value and the allowed values.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
@@ -410,7 +406,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if "human" in own:
                 fields["human"] = [_NOBODY] * len(own["human"])
             scenario = _strictly(fields, type(self))
-            return msgspec.structs.replace(scenario, **{name: _kept(value) for name, value in own.items()})
+            return msgspec.structs.replace(scenario, **{name: _checked_own(value) for name, value in own.items()})
         except InputError:
             raise
         except ValueError as error:
@@ -442,7 +438,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
 def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenario:
     """Parse TOML text as a scenario. Raises InputError with the path of the field and its value.
 
-    The file of a world is looked for in `folder`.
+    The path of a world's file is relative to `folder`.
     """
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
@@ -460,7 +456,7 @@ def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenari
 
 
 def built_in() -> list[str]:
-    """Return the names of the scenarios that come with the program."""
+    """Return the names of the built-in scenarios."""
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
@@ -507,12 +503,12 @@ def require_even_ticks(scenario: Scenario, what: str) -> None:
 
 
 class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
+    """The contents of a file of humans."""
 
-    human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
+    human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own class
     person: tuple[Person, ...] = ()
-    population: Any = None  # of a user's own: it has draw(rng, n)
-    device: tuple[Mechanics, ...] = ()  # which sim.validate drew within the guaranteed bounds, or none
+    population: Any = None  # a user's own population with draw(rng, n)
+    device: tuple[Mechanics, ...] = ()  # mechanics that sim.validate drew within the guaranteed bounds, or none
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
@@ -576,17 +572,15 @@ def _own_humans(text: str) -> _HumanFile:
     """Return the people of FILE.py:NAME: hands and persons, a population with draw(rng, n), or a function of them."""
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
-        people_made: Any = called(f"--human {text}", people)
-    else:
-        people_made = people
-    if callable(getattr(people_made, "draw", None)):
-        if len(_kept(tuple(people_made.draw(np.random.default_rng(0), 2)))) != 2:
+        people = called(f"--human {text}", people)
+    if callable(getattr(people, "draw", None)):
+        if len(_checked_own(tuple(people.draw(np.random.default_rng(0), 2)))) != 2:
             raise ValueError("draw(rng, 2) gives not two humans")
-        return _HumanFile((), (), people_made)
-    if not isinstance(people_made, list | tuple):
-        raise ValueError(f"it is {people_made!r}, expected a list of hands, or a population with draw(rng, n)")
-    persons = tuple(person for person in people_made if isinstance(person, Person))
-    return _HumanFile(_kept(tuple(hand for hand in people_made if not isinstance(hand, Person))), persons)
+        return _HumanFile((), (), people)
+    if not isinstance(people, list | tuple):
+        raise ValueError(f"it is {people!r}, expected a list of hands, or a population with draw(rng, n)")
+    persons = tuple(person for person in people if isinstance(person, Person))
+    return _HumanFile(_checked_own(tuple(hand for hand in people if not isinstance(hand, Person))), persons)
 
 
 def _toml(value: Any) -> str:
@@ -603,7 +597,7 @@ def save_humans(
 ) -> Path:
     """Write humans and persons without voluntary motion so that reading gives the same numbers.
 
-    `remark` becomes a comment. `mechanics` are those of the devices, where they were drawn.
+    `remark` becomes a comment. `mechanics` are the drawn mechanics of the devices, if there are any.
     """
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
@@ -621,11 +615,11 @@ def save_humans(
     return write(path, "\n".join(lines) + "\n")
 
 
-# ---- strictness: what a file may hold, and how its errors are worded
+# ---- conversion of files, and the words of their errors
 
 
 def _is_rotary(text: str) -> bool:
-    """Return whether a file, even one that is refused, is about rotary devices."""
+    """Return whether a file has unit = "rad", even if the file is refused for something else."""
     try:
         return toml(text, "").get("unit") == "rad"
     except InputError:
@@ -639,7 +633,8 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     """Convert TOML text to `kind`. Raises InputError with the path of the field and its value."""
     raw = toml(text, source)
     try:
-        raw = _whole(raw) if kind is Scenario else raw
+        if kind is Scenario:
+            _require_keys(raw)
         return msgspec.convert(_with_world(_in_space(_with_catalogue(raw)), folder), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
@@ -649,12 +644,11 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
         raise InputError(f"{source}: {error}") from None
 
 
-def _whole(raw: dict[str, Any]) -> dict[str, Any]:
-    """Return the file if it has every key that a scenario needs. Raises ValueError; unknown keys are reported first."""
+def _require_keys(raw: dict[str, Any]) -> None:
+    """Raise ValueError if a key that every scenario needs is missing; unknown keys are reported first, elsewhere."""
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
-    return raw
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
@@ -683,7 +677,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
-        return raw  # one axis, or what the fields' own checks refuse
+        return raw  # one axis, or a number of axes that the checks of the fields refuse
     if not isinstance(table, dict) or table.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
@@ -736,7 +730,7 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
         diagonal = (matrix == np.diag(np.diag(matrix))).all()
         amounts, directions = (np.diag(matrix), np.eye(axes)) if diagonal else np.linalg.eigh(matrix)
         most = float(np.abs(amounts).max())
-        if amounts.min() < -1e-12 * most:  # what rounding of eigh may add
+        if amounts.min() < -1e-12 * most:  # beyond the rounding of eigh
             raise ValueError(f"{field} is {value!r} with the eigenvalue {amounts.min():g}, expected none below 0")
         for amount, direction in zip(amounts.tolist(), directions.T.tolist(), strict=True):
             if amount > 1e-12 * most:
@@ -746,15 +740,16 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     return [*plain, *({"between": spring.get("between")} | one for one in directed)]
 
 
-_ALONG = [1.0, 0.0, 0.0]  # x, unless a scenario says otherwise
+_DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact."""
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
-        return _without_along(raw, table)
-    from haptic_loop.models.world import check_contacts, digest_of  # MuJoCo, which other scenarios do without
+        _require_no_along(table)
+        return raw
+    from haptic_loop.models.world import check_contacts, digest_of  # loads MuJoCo, which other scenarios do not need
 
     name, contacts = table["world"], table.get("contacts", [])
     if not isinstance(name, str) or not isinstance(contacts, list) or not all(isinstance(c, str) for c in contacts):
@@ -763,10 +758,8 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     if points and "along" in table:
         allowed = "contacts of devices with several axes slide along x, y and z; leave it out and clamp axes"
         raise ValueError(f"environment.along is {table['along']!r}: {allowed}")
-    given_along = table.get("along", [_ALONG] * len(contacts))
-    along = [_free_axes(nodes) for nodes in points.values()] or [
-        [_direction(*row)] for row in enumerate(given_along, 1)
-    ]
+    rows = table.get("along", [_DEFAULT_DIRECTION] * len(contacts))
+    along = [_free_axes(nodes) for nodes in points.values()] or [[_direction(*row)] for row in enumerate(rows, 1)]
     path = (folder / name).resolve()
     try:
         world = {"file": str(path), "digest": digest_of(path), "along": along, "every": table.get("every", 1)}
@@ -783,19 +776,18 @@ def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
 
 
 def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
-    """Return the environment of a table with `world` as it stands in a file. Raises InputError."""
+    """Return the environment of an [environment] table with the key `world`. Raises InputError."""
     try:
         return msgspec.convert(_with_world({"environment": table}, folder)["environment"], Network)
     except ValueError as error:
         raise InputError(str(error)) from None
 
 
-def _without_along(raw: dict[str, Any], environment: Any) -> dict[str, Any]:
-    """Return the file unless it gives steps or directions of a world. Raises ValueError."""
-    beside = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
-    if beside:
-        raise ValueError(f"environment.{beside[0]} is only with environment.world")
-    return raw
+def _require_no_along(environment: Any) -> None:
+    """Raise ValueError if an environment without a world has a key that belongs to worlds."""
+    extra = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
+    if extra:
+        raise ValueError(f"environment.{extra[0]} is only with environment.world")
 
 
 def _direction(number: int, row: Any) -> list[float]:
@@ -808,7 +800,7 @@ def _direction(number: int, row: Any) -> list[float]:
     return [c / length for c in row]
 
 
-def _nowhere(environment: Network) -> Network:
+def _without_folder(environment: Network) -> Network:
     """Return the environment with the name of a world's file in place of its path."""
     if not environment.world:
         return environment
@@ -818,20 +810,20 @@ def _nowhere(environment: Network) -> Network:
 
 def _network(own: Any, T: Any) -> Network:
     """Return a user's own environment, which has `contacts` and `E(T)` or `parts()`, at a period. Raises InputError."""
-    what = f"environment {type(own).__name__}"
+    label = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
-    known = getattr(type(own), "E", Environment.E) is not Environment.E
-    if not isinstance(contacts, list | tuple) or not (known or hasattr(own, "parts")):
-        raise InputError(f"{what}: expected a class with contacts, and E(T) or parts()")
-    if known:
-        E = called(f"{what}.E(T)", own.E, T)
+    has_E = getattr(type(own), "E", Environment.E) is not Environment.E
+    if not isinstance(contacts, list | tuple) or not (has_E or hasattr(own, "parts")):
+        raise InputError(f"{label}: expected a class with contacts, and E(T) or parts()")
+    if has_E:
+        E = called(f"{label}.E(T)", own.E, T)
         if not isinstance(E, Lti):
             m, text = len(contacts), " ".join(repr(E).split())
             expected = f"a haptic_loop.controller.lti.Lti with {m} inputs and {m} outputs"
-            raise InputError(f"{what}.E(T) is {text[:60]}, expected {expected}")
-        block = called(what, Block.of, E)
+            raise InputError(f"{label}.E(T) is {text[:60]}, expected {expected}")
+        block = called(label, Block.of, E)
     elements = (own,) if hasattr(own, "parts") else ()
-    return called(what, Network, tuple(contacts), block=block, elements=elements)
+    return called(label, Network, tuple(contacts), block=block, elements=elements)
 
 
 class _Damping(msgspec.Struct, frozen=True):
@@ -852,7 +844,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Convert structs, tuples, and NumPy's numbers and arrays to what a file holds. Raises InputError."""
+    """Convert structs, tuples, and NumPy's numbers and arrays to the types of a file. Raises InputError."""
 
     def of_numpy(part: Any) -> Any:
         if isinstance(part, np.ndarray | np.generic):
@@ -864,28 +856,26 @@ def _plain(name: str, value: Any) -> Any:
     return msgspec.to_builtins(value, enc_hook=of_numpy)
 
 
-_NOBODY = Human((Link(0.0, 0.0, 0.0),))
-
-
-_TIMES = np.array([0.0, 0.1])  # [s] at which a hand's own force is tried
+_NOBODY = Human((Link(0.0, 0.0, 0.0),))  # stands for a human of a user's own class while other fields are checked
+_TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's own hand is tried
 
 
 def _is_own(name: str, value: Any) -> bool:
-    """Return whether a human, or the population, is of a user's own class, which no file can hold."""
+    """Return whether humans or a population are of a user's own class, which no file can hold."""
     if name == "population":
         return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
     parts = value if isinstance(value, list | tuple) else ()
     return any(hasattr(part, "port") and not isinstance(part, Human) for part in parts)
 
 
-def _kept(value: Any) -> Any:
-    """Return a user's own population, or humans each of which can hold a device. Raises ValueError."""
+def _checked_own(value: Any) -> Any:
+    """Return a user's own population as it is, or a user's own humans after a check. Raises ValueError."""
     if not isinstance(value, list | tuple):
         return value
     for i, human in enumerate(value, start=1):
         if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
-            raise ValueError(f"human #{i} is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
-        if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
+            raise ValueError(f"human #{i} is {human!r}, expected a Human, or a class with port(), voluntary_force(t)")
+        if not isinstance(port := human.port(), Port):  # A Port that is not passive raises ValueError.
             raise ValueError(f"human #{i}.port() is {port!r}, expected a models.human.Port")
         with np.errstate(all="ignore"):
             force = np.asarray(human.voluntary_force(_TIMES))
@@ -895,7 +885,7 @@ def _kept(value: Any) -> Any:
 
 
 def _given_fields(device: Device) -> dict[str, Any]:
-    """Return the fields of a device without newer ones that are not given: such devices keep their digest."""
+    """Return the fields of a device without newer fields at their default, so that old digests stay valid."""
     fields = msgspec.to_builtins(device)
     for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
         if fields.get(name) == default:
@@ -904,7 +894,7 @@ def _given_fields(device: Device) -> dict[str, Any]:
 
 
 def _contents(part: Any) -> Any:
-    """Return the contents of a user's own human or population."""
+    """Return the contents of an array, or of a user's own human or population, for the digest."""
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
@@ -912,8 +902,8 @@ def _located(message: str, raw: dict[str, Any]) -> str:
     """Rewrite 'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
     assert match
-    what, path = match[1], match[2] or ""
-    what += _hint(what)
+    problem, path = match[1], match[2] or ""
+    problem += _hint(problem)
     value: Any = raw
     for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
         try:
@@ -922,19 +912,19 @@ def _located(message: str, raw: dict[str, Any]) -> str:
             value = None
             break
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
-    if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
-        what = what[0].lower() + what[1:]
-    return f"{counted(path)}{shown}: {what}" if path else what
+    if problem[1:2].islower():  # a word of msgspec, not one of our symbols
+        problem = problem[0].lower() + problem[1:]
+    return f"{counted(path)}{shown}: {problem}" if path else problem
 
 
-def _hint(what: str) -> str:
-    """Return the allowed values where the message does not give them."""
-    unknown = re.search(r"unknown field `(.*)`", what)
+def _hint(problem: str) -> str:
+    """Return the allowed values, or a similar name, for messages of msgspec that lack them."""
+    unknown = re.search(r"unknown field `(.*)`", problem)
     if unknown:
         known = {name for struct in _STRUCTS for name in struct.__struct_fields__}
         close = difflib.get_close_matches(unknown[1], sorted(known - {unknown[1]}), n=1)
         return f" (did you mean `{close[0]}`?)" if close else ""
-    if what.startswith("Invalid value"):
+    if problem.startswith("Invalid value"):
         return f", allowed are {' and '.join(repr(d.__struct_config__.tag) for d in get_args(Device))}"
     return ""
 

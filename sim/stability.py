@@ -1,4 +1,4 @@
-"""Decide stability: by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
+"""Stability by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
 
 Functions take one loop or a stack of loops, one for each set of humans. Arrays of a stack have a leading axis.
 """
@@ -27,12 +27,12 @@ from haptic_loop.sim.trace import Trace
 
 #: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
-_CLEAR = 1e-3  # [1/s] engines may differ in sign below this growth rate, because of their own errors
-_JUDGED = 4.0, 20.0, 100.0  # [s] simulated in turn of a loop that varies, until the sign of its growth counts
+_CLEAR = 1e-3  # [1/s] below this growth rate the errors of engines may change its sign
+_JUDGED = 4.0, 20.0, 100.0  # [s] durations that are tried until the sign of a varying loop's growth counts
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
 _SHORTEST_TRACE = 200  # ticks that a growth rate needs
-SETTLED = 10.0  # time constants: after fewer of them, fast modes that decay may still hide a slow one that grows
-_DECAY_TIMES = 4.0  # time constants that a trace must last for the sign of its rate to count
+SETTLED = 10.0  # time constants before which fast decaying modes may still hide a slow growing one
+_DECAY_TIMES = 4.0  # least duration of a trace, in time constants, for the sign of its rate to count
 
 
 def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
@@ -122,7 +122,7 @@ def dominant_mode(loop: ClosedLoop) -> Mode:
 
 
 def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
-    """Return the dominant mode's unit left eigenvector (..., n). No other mode contributes to left* xi."""
+    """Return the dominant mode's unit left eigenvector (..., n); left* xi contains that mode alone."""
     values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
     largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
     return np.take_along_axis(vectors, largest, axis=-1)[..., 0].conj()
@@ -143,8 +143,8 @@ def mujoco_loops(
 ) -> ClosedLoop:
     """Return the closed loops that MuJoCo simulates: its map over one period, joined with the process.
 
-    The plant is linear. So one period from each basis state and with each force alone gives its map: 2n + m simulations
-    for every set of humans in one batch, and m more with `late` (m,) [s].
+    The plant is linear, so one period from each basis state and with each force alone gives its map. One batch holds
+    2n + m simulations for every set of humans, and m more with `late` (m,) [s].
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     n = variants.states + (m if late else 0)
@@ -165,31 +165,31 @@ def mujoco_loops(
     return close(held, process.F)
 
 
-# ---- one simulation: what its eigenvalues and its trace say
+# ---- one simulation: verdicts of its eigenvalues and of its trace
 
 
 def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
-    """Return the dominant mode for every set of touching walls; one entry where there is no wall."""
+    """Return the dominant mode for every set of touching walls; one entry without walls."""
     return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.law.frozen().items()}
 
 
 def worst_mode(simulation: Simulation) -> Mode:
-    """Return the dominant mode of the exact loop, or of its worst frozen contact state where there are walls."""
+    """Return the dominant mode of the exact loop; with walls, of its worst frozen contact state."""
     return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
 @dataclass(frozen=True)
 class Ringing:
-    """How a knock dies away in the exact loop with the scenario's own hands, at constant delays and without friction.
+    """Decay of a knock in the exact loop with the scenario's own hands, at constant delays and without friction.
 
     A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 where it does not oscillate.
 
     Attributes:
-        decay_per_s: How fast the slowest mode decays [1/s]; negative where it grows.
-        frequency_hz: The frequency of that mode [Hz].
-        damping_ratio: The damping ratio of that mode.
-        least_damping_ratio: The least damping ratio of all modes.
-        least_frequency_hz: The frequency of the mode that has it [Hz].
+        decay_per_s: Decay rate of the slowest mode [1/s]; negative if it grows.
+        frequency_hz: Frequency of the slowest mode [Hz].
+        damping_ratio: Damping ratio of the slowest mode.
+        least_damping_ratio: Least damping ratio of all modes.
+        least_frequency_hz: Frequency of the mode with the least damping ratio [Hz].
     """
 
     decay_per_s: float
@@ -208,20 +208,20 @@ class Ringing:
         return f"{slowest}; least ratio {self.least_damping_ratio:.4f} at {self.least_frequency_hz:.2f} Hz"
 
 
-_FADED = 1e-6  # of modulus: a delay line's poles at zero, as rounding spreads them, are gone after a tick
+_FADED = 1e-6  # modulus up to which eigenvalues are a delay line's poles at zero, which rounding spreads
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return how a knock dies away, in the worst set of walls that touch; None in a world, which has no eigenvalues."""
+    """Return the decay of a knock over all sets of touching walls; None in a world, which has no eigenvalues."""
     if simulation.scenario.environment.world:
         return None
     loops = [close(simulation.plant, F) for F in simulation.process.law.frozen().values()]
     values = np.concatenate([np.linalg.eigvals(loop.A) for loop in loops]).astype(complex)
     modes = np.log(values[np.abs(values) > _FADED]) / simulation.plant.T
-    modes = modes[np.abs(modes) > _CLEAR]  # what drifts freely neither rings nor decays
+    modes = modes[np.abs(modes) > _CLEAR]  # A free drift neither rings nor decays.
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
-    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # the two of a pair
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # They are a conjugate pair.
         least = slowest
     shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
     return Ringing(*map(float, shown))
@@ -235,7 +235,7 @@ def exact_growth(simulation: Simulation) -> float:
 _NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
 _VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest
 _UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
-_AT_ONCE = 1 << 16  # ticks that are projected at a time, because the states of a long trace may exceed the memory
+_AT_ONCE = 1 << 16  # ticks that are projected at a time, because a long trace may exceed the memory
 
 
 def _measured_growth(
@@ -244,8 +244,8 @@ def _measured_growth(
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
     The projection y = left* xi contains the dominant mode alone. With the known outside force subtracted,
-    y[k+1] - left* B w[k] = lambda y[k], and lambda is the least-squares fit over the ticks before the first clipped
-    one, less `ahead` ticks, by which a limiter acts before its force arrives.
+    y[k+1] - left* B w[k] = lambda y[k]. lambda is the least-squares fit over the ticks before the first clipped one,
+    less `ahead` ticks: a limiter acts that long before its force arrives.
     """
     clipped = trace.clipped(force_limit, balls)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
@@ -254,7 +254,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # rounding is relative to the parts that cancel in y, and to the errors of the eigenvector
+    # Rounding is relative to the terms that cancel in y, and to the errors of the eigenvector.
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -295,7 +295,7 @@ class _Frozen(ExactVerdict):
 
 @dataclass(frozen=True)
 class _Contact:
-    """How often walls were touched in a run, and the linear loops between which they switch."""
+    """Contacts with walls in a run, and the linear loops between which contacts switch."""
 
     made: int
     ticks: int
@@ -316,7 +316,7 @@ class Stability(Eigenvalues):
 
 
 def eigenvalues(mode: Mode) -> Eigenvalues:
-    """Return the figures of a mode as a report has them."""
+    """Return the figures of a mode for a report."""
     return Eigenvalues(**_exact(mode), spectral_radius=float(mode.spectral_radius))
 
 
@@ -393,8 +393,8 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 # so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
-_TO_THE_WALL = 20.0  # [N] a hand of 0.3 kg then swings over a few centimetres
-_NOISE_FLOOR = 1e-8  # a mode below this share of the state is noise of the engine
+_TO_THE_WALL = 20.0  # [N] impulse in loops with walls; a hand of 0.3 kg then swings over a few centimetres
+_NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the engine
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,10 +413,10 @@ class ImpulseTest:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """The energy of each tick where forces act at ticks: the work of the forces and the least dissipation."""
+    """The energy of each tick if forces latch at ticks: the work of the forces and the least dissipation."""
 
     damping: Array  # (m, 1) [N/m] delta/T
-    Delta: Array | None  # (m, m) [N s/m] where a device has a matrix, whose diagonal is delta
+    Delta: Array | None  # (m, m) [N s/m], with the diagonal delta, if a device has a matrix
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
@@ -443,7 +443,7 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class _LateBalance(Balance):
-    """The energy of each tick where forces latch within the tick, so that each period has two parts."""
+    """The energy of each tick if forces latch within the tick, so that each period has two parts."""
 
     before: Array  # (m, 1) [N/m] delta/t2, for the part before the latch; `damping` is delta/(T_max - t1)
     seen: Array  # (nsim, m, entries) of models.hold.at_the_latch: positions at the latch
@@ -476,7 +476,7 @@ def impulse_test(
 ) -> ImpulseTest:
     """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact closed loops.
 
-    Where there are walls the impulse is large enough to reach them, and no growth is read from the trace.
+    With walls the impulse is large enough to reach them, and the growth of the trace is not measured.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, balance, ticks)
@@ -493,7 +493,7 @@ def impulse_test(
 def impulse_growth(
     process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int = 1
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return growth and clipping, (nsim,) each, after an impulse on every handle, also where the timing varies.
+    """Return growth and clipping, (nsim,) each, after an impulse on every handle, for even or varying timing.
 
     `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
     the second: inf where numbers overflow, -inf at exact rest. Without force limits it does not depend on the size of
@@ -516,15 +516,15 @@ UNDECIDED = "not decidable: the rate is too small for its sign to count in this 
 
 
 def verdict_within(growth: float, seconds: float) -> str | None:
-    """Return the verdict of a growth rate [1/s] that a trace of `seconds` shows; None where it is too slow for it."""
+    """Return the verdict of a growth rate [1/s] that a trace of `seconds` shows; None if the rate is too small."""
     return verdict(growth) if abs(growth) * seconds >= _DECAY_TIMES else None
 
 
 def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[float, float]:
     """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers.
 
-    Modes that beat or decay one after the other hide a slow rate. So the time is extended until it has several time
-    constants, or `most` ticks.
+    Modes that beat or decay one after the other hide a slow rate. Therefore the time is extended until it has SETTLED
+    time constants, or `most` ticks.
     """
     free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
@@ -554,7 +554,7 @@ class _Speeds:
 
 
 class _Audit:
-    """The sums of an impulse test over the ticks so far."""
+    """The running sums of an impulse test."""
 
     def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, balance: Balance, ticks: int) -> None:
         nsim, self._balance = loops.A.shape[0], balance
@@ -566,11 +566,11 @@ class _Audit:
         self._linear = np.ones(nsim, dtype=bool)
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)
         self._energy, self._least, self._size = np.zeros(nsim), np.zeros(nsim), np.zeros(nsim)
-        self._across, self._weight, self._whole = np.zeros(nsim, dtype=complex), np.zeros(nsim), np.zeros(nsim)
-        self._half, self._first = ticks // 2, (self._across, self._weight)  # of the first half of the trace
+        self._across, self._weight, self._squares = np.zeros(nsim, dtype=complex), np.zeros(nsim), np.zeros(nsim)
+        self._half, self._first = ticks // 2, (self._across, self._weight)  # sums over the first half of the trace
 
     def see(self, buffer: StepBuffer, first: int, count: int) -> None:
-        """Take in the first `count` rows of the buffer; row 0 is tick `first`."""
+        """Add the first `count` rows of the buffer to the sums; row 0 is tick `first`."""
         z, s, w, f = (rows[: count + 1] for rows in (buffer.z, buffer.s, buffer.w, buffer.f))
         law = self._law
         limit, balls = self._process.force_limit, self._process.balls
@@ -606,10 +606,10 @@ class _Audit:
             self._first = self._across + across[:until].sum(axis=0), self._weight + weight[:until].sum(axis=0)
         self._across = self._across + across.sum(axis=0)
         self._weight = self._weight + weight.sum(axis=0)
-        self._whole += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
+        self._squares += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
 
     def result(self, simulated: float) -> ImpulseTest:
-        above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._whole)
+        above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._squares)
         with np.errstate(divide="ignore", invalid="ignore"):
             growth = np.where(above_noise, np.log(np.abs(self._across / self._weight)) / self._T, np.nan)
             settling = np.sqrt(self._speeds.late / self._speeds.early)

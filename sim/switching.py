@@ -1,7 +1,7 @@
-"""Delays that vary: the loop as a switched system, its worst switching, and the certificates that cover it.
+"""Varying delays: the loop as a switched system, its worst switching, and the certificates that cover it.
 
 The loop is linear, with one matrix for each set of ages of the forces in use. Its state is
-xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), forces on their way.
+xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), and forces under way.
 
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick each device
 receives the force, among those that a delay in [lo, hi] allows, that gives it the most power -f v. Ages grow by at most
@@ -38,8 +38,8 @@ from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, u
 _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
 _LONGEST_PERIOD = 250  # [ticks]
 _STARTS = 6  # number of ticks of the greedy sequence at which windows begin
-_MOST_ENDS = 256  # most combinations of constant delays, each at an end of its range, that are compared
-_SHORTEST = 4  # least number of ticks, since a growth compares quarters
+_MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
+_SHORTEST = 4  # least number of ticks, because a growth compares quarters
 _STREAM = 5  # separates these draws from those of the humans with the same seed and index
 
 
@@ -48,7 +48,7 @@ class Period:
     """Periodic switching with the exact growth of the loop."""
 
     ages: Ticks  # (period, m)
-    delays: Ticks  # (period, m) of the packets that make these ages
+    delays: Ticks  # (period, m) of packets that produce these ages
     growth: float  # [1/s]
     spectral_radius: float  # of the product over one period
 
@@ -153,7 +153,7 @@ def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) 
         radius = np.abs(np.linalg.eigvals(products)).max(axis=1)
         periods = np.arange(1, len(window) + 1)
         growth = (np.log(np.maximum(radius, 1e-300)) + scale) / (periods * G.T)
-        growth[(window[0] > window + 1).any(axis=1)] = -np.inf  # a device does not return to an older force
+        growth[(window[0] > window + 1).any(axis=1)] = -np.inf  # An age grows by at most one per tick.
         at = int(np.argmax(growth))
         if growth[at] > best:
             best, chosen = float(growth[at]), window[: at + 1]
@@ -175,10 +175,10 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
     return np.stack(products), np.array(scales)
 
 
-# ---- many humans under delays that vary: each meets delays of its own, drawn or found worst, in one batch
+# ---- many humans in one batch, each under its own varying delays, drawn or adversarial
 
-_SHORTEST_CROWD = 2.0  # [s] of every trace; a growth of 1 1/s then exceeds the spreading of the impulse
-_LONGER = 5  # hands whose rate is not SETTLED are judged again on traces this many times as long
+_SHORTEST_CROWD = 2.0  # [s] of every trace, in which a growth of 1 1/s exceeds the spreading of the impulse
+_LONGER = 5  # factor of the duration of a second trace, for hands whose rate is too slow for the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class Switched:
     """The growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
     exact: Array  # of the linear loop
-    mujoco: Array  # of the other engine's trace; nan without that engine, or where a force reached its limit
+    mujoco: Array  # of the other engine's trace; nan without that engine, or if a force reached its limit
 
 
 def switched_crowd(
@@ -200,8 +200,8 @@ def switched_crowd(
     """Run the impulse test for every set of humans, each under the delays of its index.
 
     Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other` makes the engine that is compared with the exact one, of the sets of these numbers. Sets whose
-    rate is too slow for the time run longer; where the sign changes, both engines' longer traces count.
+    for all sets. `other` makes the second engine for the sets of these numbers. Sets whose rate is too slow for the
+    time run longer; if the sign changes, the longer traces of both engines count.
     """
     scenario, scene = simulation.scenario, held_by.scene
 
@@ -252,7 +252,7 @@ def _crowd_delays(
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
 
 
-# ---- what is certified: by the coupling's file, or judged anew
+# ---- certificates for varying delays: from the coupling's file, or judged anew
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class DelaysCovered:
     """Whether a certificate covers the delays of a scenario, and the damping that switching requires."""
 
     covered: bool
-    covers: str  # which delays, in words
+    covers: str  # the covered delays, in words
     switching: Switching | None = off_table(default=None)
     on_file: DelayRange | None = None
 
@@ -282,9 +282,9 @@ class DelaysCovered:
         figures = Switching.of(loop, assessment.coupling, assessment.requirements.get(SWITCHING.name))
         lossy = scenario.loses_packets
         if proof := _how_proved(figures, on_file):
-            what = "any switching of the delays within their range is covered"
+            cover = "any switching of the delays within their range is covered"
             losses = ", but a lost packet makes a force older than hi, which is not" if lossy else ""
-            words = f"certified for switching delays in this environment ({proof}): {what}{losses}"
+            words = f"certified for switching delays in this environment ({proof}): {cover}{losses}"
             return cls(not lossy, words, figures, on_file)
         buffered = figures.playout is not None and figures.playout.certified
         verdict = "for which it is certified" if buffered else "for which it is not certified either"

@@ -1,22 +1,20 @@
-"""What a run returns, as files, and what its displacements show: does something oscillate, and does it grow?
+"""The trace of a run, its files, and oscillations in its displacements.
 
-Displacements alone are looked at, for where nobody knows the states of the loop: the trace of a bridge, a stored one,
-a loop that is not linear. An oscillation is what is left of a part of a trace without its slow motion, split into
-octaves. Two questions are asked of it:
+Oscillations are judged by displacements alone, because the states of a bridge, of a stored trace and of a nonlinear
+loop are unknown. The slow motion is subtracted, and the rest is split into octaves.
 
-oscillation   does it go on in the second half of a trace? The half is cut into two windows; it does if in some octave
-              the amplitude in the last window exceeds a threshold and is at least SUSTAINED of that in the window
-              before. A decaying oscillation is not one however large it still is, and one below the threshold is not
-              one however long it lasts. Octaves are looked at apart, so that a slow mode that decays does not hide a
-              fast one that grows.
-growth        how fast does it grow? An oscillation that grows like exp(g t) is exp(g hop) times larger in each
-              window than in the one before: g is the slope of a line through logarithms. It is a figure about motion,
-              not a verdict about a loop: a person who shakes the handle harder and harder grows too.
+oscillation   Does an oscillation last in the second half of a trace? The half is cut into two windows. The oscillation
+              lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
+              times that in the first. Octaves are judged apart, so that a slow mode that decays does not hide a fast
+              one that grows.
+growth        How fast does an oscillation grow? If it grows like exp(g t), each window is exp(g hop) times larger than
+              the one before, and g is the slope of a line through the logarithms. The slope is a figure about motion,
+              not a verdict about a loop: the motion of a person who shakes the handle harder and harder grows, too.
 """
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("trace")
@@ -35,7 +33,7 @@ from haptic_loop.controller.tick import Net, at_limit
 from haptic_loop.controller.units import in_unit, with_unit
 from haptic_loop.design.files import InputError, read_arrays, write
 
-_MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
+_MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # number of axes of the arrays in a file
 _STATES = {"z": 2, "s": 2}
 _UNITS = {"x": "m", "f": "N", "x_handle": "m", "v_handle": "m/s"}
 
@@ -55,9 +53,9 @@ def _is_frozen(value: Any, ndim: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Trace(ReadOnly):
-    """What every tick saw, and under which settings: N samples of m channels. Arrays are read-only.
+    """The signals of a run, N samples of m channels, with its settings. Arrays are read-only.
 
-    The states z and s have no columns where nobody recorded them, as in a file or on a real device.
+    The states z and s have no columns in a trace that was read from a file or recorded on a real device.
 
     Attributes:
         t: (N,) times [s]; sample k is taken at k T.
@@ -71,8 +69,8 @@ class Trace(ReadOnly):
         s: (N, 2 n) states of the plant: positions [m], then velocities [m/s].
         diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
         interrupted: Whether the run was stopped from the keyboard.
-        net: The passivity layer that stood under the controller, as the run left it; None without one.
-        names: (m,) names of the channels where devices have several axes; empty where they are called by numbers.
+        net: The passivity layer under the controller in its final state; None without one.
+        names: (m,) names of the channels if devices have several axes; empty if channels are numbered.
     """
 
     t: Array
@@ -111,7 +109,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether any force was at its limit, (m,) [N], at each tick; `balls` as in Process."""
+        """Return (N,) whether any force was at its limit, (m,) [N]; `balls` are channels with a limit on the length."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -131,10 +129,10 @@ class Trace(ReadOnly):
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
     def to_frame(self) -> Any:
-        """Return a pandas data frame: samples at index "t [s]", columns "x1 [m]", "f1 [N]", "x_handle1 [m]", ..
+        """Return a pandas data frame with the index "t [s]" and the columns "x1 [m]", "f1 [N]", "x_handle1 [m]", ..
 
         Raises:
-            ImportError: pandas is not installed; the program itself does not need it.
+            ImportError: pandas is not installed.
         """
         try:
             import pandas  # pyright: ignore[reportMissingImports]
@@ -148,11 +146,12 @@ class Trace(ReadOnly):
         return pandas.DataFrame(columns, index=pandas.Index(self.t, name="t [s]"))
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Any:
-        """Draw displacements and forces over time, and write the picture where a path is given.
+        """Draw displacements and forces over time.
 
         Args:
-            path: A file ending in .png, .pdf or .svg; .pdf and .svg are as wide as the page of a two-column paper.
-            title: The title, else the name of the scenario with the verdict.
+            path: The file of the picture, ending in .png, .pdf or .svg, or None to write none. A .pdf or .svg is as
+                wide as the page of a two-column paper.
+            title: The title; default: the name of the scenario with the verdict.
 
         Returns:
             The matplotlib figure, which a notebook shows.
@@ -175,9 +174,10 @@ class Trace(ReadOnly):
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of its file: what was measured, the metadata as JSON text, and the channels' names if any."""
-        found = {name: getattr(self, name) for name in _MEASURED} | {"meta": np.array(json.dumps(with_unit(self.meta)))}
-        return found | ({"names": np.array(self.names)} if self.names else {})
+        """The arrays of the trace's file: signals, the metadata as JSON text, and the channels' names if any."""
+        signals = {name: getattr(self, name) for name in _MEASURED}
+        names = {"names": np.array(self.names)} if self.names else {}
+        return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
 
     def save_npz(self, path: Path) -> Path:
         """Write the measured arrays and the metadata (as JSON text), compressed, without pickle."""
@@ -194,7 +194,7 @@ class Trace(ReadOnly):
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Build a trace from the arrays of its file. Raises InputError where they are not those of a trace."""
+        """Build a trace from the arrays of its file. Raises InputError if they are no trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             names = tuple(str(name) for name in arrays.get("names", np.zeros(0)))
@@ -204,7 +204,7 @@ class Trace(ReadOnly):
 
     @property
     def _channels(self) -> list[str]:
-        """What follows a quantity in a header: the channel's number, or its name."""
+        """The suffix of a quantity in a header, for each channel: its name, or its number."""
         return [f" {name}" for name in self.names] or [str(i) for i in range(1, self.x.shape[1] + 1)]
 
     def save_csv(self, path: Path) -> Path:
@@ -223,20 +223,20 @@ class Trace(ReadOnly):
         return write(path, content)
 
 
-# ---- octaves, and whether something goes on oscillating
+# ---- octaves, and lasting oscillations
 
 _PERIODS = 4  # periods of the slowest octave in a window; with fewer the window function mixes octaves
-_TREND = 7  # degree of the polynomial that is subtracted; of 15 mm at 0.6 Hz it leaves less than a micrometre
+_TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of 15 mm at 0.6 Hz
 SUSTAINED = 0.95
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillation:
-    """Whether positions go on oscillating, with one entry per simulation."""
+    """The strongest oscillation of positions, with one entry per simulation."""
 
-    sustained: NDArray[np.bool_]  # (nsim,) the verdict
-    amplitude: Array  # (nsim,) [m] of the strongest octave that is sustained, else of the strongest one; inf: diverged
+    sustained: NDArray[np.bool_]  # (nsim,) whether it lasts
+    amplitude: Array  # (nsim,) [m] of the strongest octave, among those that last if any does; inf: diverged
     frequency_hz: Array  # (nsim,) [Hz] the strongest line in that octave; nan: diverged
 
 
@@ -275,7 +275,7 @@ def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
     basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), _TREND + 1))
     flat = x.reshape(ticks, -1)
     fast = flat - basis @ (basis.T @ flat)
-    # a sinusoid of amplitude a has power a^2/2; a window w keeps sum w^2 of ticks
+    # A sinusoid of amplitude a has the power a^2/2, of which a window w keeps the share sum w^2 / ticks.
     power = 4 * np.abs(np.fft.rfft(window[:, None] * fast, axis=0)) ** 2 / (ticks * (window**2).sum())
     frequency = np.fft.rfftfreq(ticks, T)
     lowest = _PERIODS / (ticks * T) * (1 - 1e-9)
@@ -299,22 +299,22 @@ _WINDOWS = 7  # least number of windows, each of which overlaps the next by half
 _NEEDED = 4  # consecutive windows in which an oscillation must be seen
 _SHORTEST = 200  # ticks that a growth rate needs
 _FLOOR = 3.0  # an oscillation exceeds this multiple of the encoders' rounding in its octave
-_CLEAR = 4.0  # standard errors by which a slope differs from zero; a line may have four points only
-_FARTHEST = 1e100  # [m] larger numbers have no square
+_CLEAR = 4.0  # standard errors by which a slope must differ from zero, because a line may have only four points
+_FARTHEST = 1e100  # [m] the square of a larger number may overflow
 _EVEN = 1e-3  # periods may differ by this share; rounding of long times is smaller
 _FINEST = 1e-9  # [m] step assumed for an ideal encoder, above floating-point noise
 
 
 @dataclass(frozen=True)
 class Growth:
-    """The strongest oscillation in a part of a trace, or why no rate can be given."""
+    """The strongest oscillation in a part of a trace, or the reason why it has no rate."""
 
-    first: int  # ticks [first, stop) that were looked at
+    first: int  # the part has the ticks [first, stop)
     stop: int
     growth_rate_per_s: float | None = None
     error_per_s: float | None = None  # standard error of the line
     frequency_hz: float | None = None
-    amplitude_m: float | None = None  # of its octave, where it was seen last
+    amplitude_m: float | None = None  # of its octave in the last window in which it is seen
     slowest_hz: float | None = None  # slower oscillations are not seen
     trend: str | None = None  # grows | decays | neither: by more than _CLEAR standard errors
     reason: str | None = None
@@ -332,9 +332,9 @@ class Growth:
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     """Measure how fast displacements x (N, m) [m] grow, sampled every T [s] by encoders of steps (m,) [m].
 
-    The second half of x is examined first. If nothing is seen there for long enough, because a mode grows fast, the
-    last quarter is, and so on. The strongest growing octave is reported, or the strongest one if none grows. `first`
-    is the number of the first tick.
+    The second half of x is examined first. If a fast growing mode is seen there too briefly, the last quarter is
+    examined, and so on. The strongest growing octave is reported, or the strongest one if none grows. `first` is the
+    number of the first tick.
     """
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:
@@ -344,9 +344,9 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
             first, stop, reason=f"ticks of {T:g} s; a growth rate needs {_WINDOW / _LEAST_SAMPLES:g} s or less"
         )
     begin = n // 2
-    while not (lines := _lines(x[begin:], T, encoder_step)).found and n - begin >= 2 * _SHORTEST:
+    while not (lines := _lines(x[begin:], T, encoder_step)).octaves and n - begin >= 2 * _SHORTEST:
         begin = (begin + n) // 2
-    if not lines.found:
+    if not lines.octaves:
         begin = begin if lines.brief else n // 2
         lines = lines if lines.brief else _lines(x[begin:], T, encoder_step)
         floor = f"above {1e6 * lines.floor:.2g} um"
@@ -354,8 +354,8 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
         brief = f"an oscillation {floor} was seen too briefly for a rate, {gone}"
         reason = brief if lines.brief else f"nothing oscillates {floor}"
         return Growth(first + begin, stop, slowest_hz=lines.slowest, reason=reason)
-    growing = [one for one in lines.found if one[0] > _CLEAR * one[1]]
-    rate, error, frequency, size = max(growing or lines.found, key=lambda one: one[3])
+    growing = [one for one in lines.octaves if one[0] > _CLEAR * one[1]]
+    rate, error, frequency, size = max(growing or lines.octaves, key=lambda one: one[3])
     trend = "grows" if growing else "decays" if rate < -_CLEAR * error else "neither"
     return Growth(first + begin, stop, rate, error, frequency, size, lines.slowest, trend)
 
@@ -363,9 +363,9 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
 class _Lines(NamedTuple):
     """The oscillations in a part of a trace."""
 
-    found: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m], by octave
-    brief: bool  # an oscillation is seen in too few windows
-    gone: bool  # none is seen in the last window
+    octaves: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m] of each
+    brief: bool  # an oscillation is seen, but in too few windows
+    gone: bool  # no oscillation is seen in the last window
     floor: float  # [m]
     slowest: float  # [Hz]
 
@@ -375,7 +375,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
     windows = [x[start : start + 2 * hop] for start in range(0, len(x) - 2 * hop + 1, hop)]
     amplitude, line, part = map(np.array, zip(*(_octaves(w[:, :, None], T) for w in windows), strict=True))
     seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves): a mode moves all channels
-    # rounding is white with a variance of step^2/12, and a sinusoid's amplitude is the root of twice its power
+    # Rounding is white noise of variance step^2/12, and a sinusoid's amplitude is the root of twice its power.
     floor = _FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)
     lines = []
     for k in range(seen.shape[1]):
@@ -384,7 +384,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
             rate, error = _slope(np.log(seen[at, k]), hop * T)
             strongest = np.argmax(amplitude[at[-1], k, :, 0])
             lines.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
-    on = (seen > floor.max()).any(axis=1)  # the size that a reason names
+    on = (seen > floor.max()).any(axis=1)  # (windows,)
     return _Lines(lines, bool(on.any()), not on[-1], float(floor.max()), _PERIODS / (2 * hop * T))
 
 
@@ -406,7 +406,7 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 def growths(trace: Trace) -> list[Growth]:
     """Measure the growth in each part of a trace in which the loop was linear (`run.steady_ticks` of its metadata).
 
-    A trace that names no parts is one part. Raises InputError where the named parts are not ticks of the trace.
+    Without this entry the trace is one part. Raises InputError if the parts are not ticks of the trace.
     """
     n, m = trace.x.shape
     run = trace.meta.get("run") if isinstance(trace.meta, dict) else None
