@@ -1,4 +1,4 @@
-"""Parts of the report of a validation: figures, and the texts of their rows."""
+"""Parts of the report of a validation: figures, and the text of their rows."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def disagreement_words(findings: Findings, engine: str, most: int = 3) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """A channel's human: its links, or the port of a class of the user's own."""
+    """A human that holds a device: its links, or the port of a user's own class."""
 
     links: tuple[Link, ...] | None = off_table("if given", None)
     class_: str | None = off_table("if given", None)
@@ -149,8 +149,8 @@ class Traces:
     clipped_runs: int
     contacts: int
     measured: int
-    witnessed: int  # traces that MuJoCo, or a user's own engine, made besides the exact step
-    undecided: int  # traces that are too short for the sign of their rate, which do not vote
+    witnessed: int  # traces that MuJoCo, or a user's own engine, also made
+    undecided: int  # traces that are too short for the sign of their rate; eigenvalues decide there
     largest_difference_per_s: float | None
     stable_and_settling: int
     stable: int
@@ -197,7 +197,7 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Traces with a test of W >= 0. Clipped forces are not covered, forces of a limiter are."""
+    """Test of W >= 0 on traces; traces with clipped forces are left out, those with a limiter are tested."""
 
     audited: int
     clipped: int
@@ -254,7 +254,7 @@ class Growing(Generic[_Met]):
 class Attacked:
     """The result of a search, and the loop's distance from its required damping."""
 
-    found: bool
+    found: bool  # whether the human destabilises
     spectral_radius: float
     growth_rate_per_s: float
     frequency_hz: float

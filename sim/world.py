@@ -2,8 +2,8 @@
 
     trace = simulate(scenario, design).meta["world"]
 
-The scene is solved together with the coupling (models.world). Behind it stands the energy shell (controller.budget):
-whatever the scene does, it lets no more energy out of the port than W0 and what gravity and springs released.
+The scene is solved together with the coupling (models.world). The energy shell (controller.budget) limits the energy
+that leaves the port to W0 plus the energy that gravity and springs released, whatever the scene does.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from haptic_loop.sim.passivity_layer import netted
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario
 
-if TYPE_CHECKING:  # MuJoCo, for which no other scenario and no help has to wait
+if TYPE_CHECKING:  # loads MuJoCo, which other scenarios and --help do not need
     from haptic_loop.models.world import Contact, Port, World
 
-_ROUNDING = 1e-9  # of differences of 1e-6 m
-_APART = 1e-12  # of D_V relatively: a smaller entry between two devices is rounding
+_ROUNDING = 1e-9  # relative size of an entry of A that differences of 1e-6 m leave by rounding
+_APART = 1e-12  # relative size of an entry of D_V up to which it is rounding
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldFigures(ShellFigures):
-    """What happened at the port of a world."""
+    """Energies and other figures at the port of a world."""
 
-    given_J: float  # the most that hands and devices were given, beyond what the devices' damping dissipates
-    port_least_J: float  # the least sum of f'(u - u_-) at the contacts
-    released_J: float  # the most that gravity and springs of the scene have given up
-    created_J: float  # by contacts, as the lemma counts it
-    unsettled_ticks: int  # in which the limited channels still changed after the last repetition of the step
-    warnings: list[str]  # of MuJoCo, in its words
+    given_J: float  # largest energy given to hands and devices, beyond the dissipation of the devices' damping
+    port_least_J: float  # least sum of f'(u - u_-) at the contacts
+    released_J: float  # largest energy that gravity and springs of the scene have released
+    created_J: float  # energy that contacts created, as the lemma counts it
+    unsettled_ticks: int  # ticks in which the limited channels still changed after the last repetition of the step
+    warnings: list[str]  # the texts of MuJoCo's warnings
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class SceneRecord:
     """The entry `scene` of a report."""
 
     file: str
-    settings: str  # that the program forces on it
-    parts: list[dict[str, object]]  # of which kinds, how many, and what is known of each at the port
+    settings: str  # options that the program sets in the scene
+    parts: list[dict[str, object]]  # kinds of parts, their number, and what is known of each at the port
     active: list[str]  # actuators, plugins, callbacks
 
     @classmethod
@@ -90,7 +90,7 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class Claim:
-    """What is proved of a run in a world, or why nothing is."""
+    """The guarantee of a run in a world, or the reason why there is none."""
 
     guaranteed: bool
     words: str
@@ -99,7 +99,7 @@ class Claim:
     def of(cls, assessment: Assessment, certified_for: str = "") -> Claim:
         """Return the claim of a run in a world, from the assessment of exactly this run.
 
-        Without a guarantee it names the linear network that the coupling is `certified_for`, if it is for one.
+        Without a guarantee the claim names the linear network that the coupling is `certified_for`, if there is one.
         """
         guarantee = assessment.guarantee
         if guarantee is None or guarantee.energy_J is None:
@@ -124,7 +124,7 @@ def _energy(joules: float) -> str:
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError for a coupling whose direct part D_V is not positive definite, or couples devices.
+    Raises InputError for a coupling whose direct part D_V is not positive definite or couples devices.
     """
     world = scenario.environment.world
     assert world is not None
@@ -143,7 +143,7 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
 
 
 def _no_spring(coupling: Coupling) -> str:
-    """Say why a coupling without a direct part of V gives no spring between scene and devices."""
+    """Return the reason why a coupling without a direct part of V gives no spring between scene and devices."""
     if coupling.holds_model:
         return (
             "an optimal coupling filters the forces of its linear model and has no V; take a spring-damper or another V"
@@ -174,8 +174,8 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
     for contact, D in zip(contacts, within, strict=True):
         asymmetric = np.abs(D - D.T).max() > _APART * np.abs(D).max()
         if asymmetric or not np.linalg.eigvalsh((D + D.T) / 2).min() > 0:
-            what = f"the coupling's direct part {D.tolist()} at {contact.body!r}"
-            raise ValueError(f"{what} is not symmetric and positive definite; a world needs a spring there")
+            label = f"the coupling's direct part {D.tolist()} at {contact.body!r}"
+            raise ValueError(f"{label} is not symmetric and positive definite; a world needs a spring there")
     return [np.linalg.inv((D + D.T) / 2) for D in within]
 
 
@@ -207,13 +207,13 @@ class Touched:
 
 
 def live(simulation: Simulation, start: float = START_J) -> Simulation:
-    """Return the same loop with its world in it, for any number of ticks: the scene's net delays the forces itself."""
+    """Return the loop with its world for any number of ticks, because the net itself delays the forces."""
     touched, process = Touched(start), simulation.process
 
     def late(nsim: int) -> Net:
         return Late(touched.net(simulation, process, nsim), simulation.scenario.theta)
 
-    late(1)  # raises for a coupling that no world can use
+    late(1)  # raises InputError for a coupling that no world can use
     return replace(simulation, process=replace(process, net=late))
 
 
@@ -238,7 +238,7 @@ class Late:
 
 
 class InWorld:
-    """A world, its shell, and what hands and devices were given."""
+    """A world, its shell, and the energy that hands and devices were given."""
 
     def __init__(self, shell: Shell, ports: list[Port], damping: Array) -> None:
         """`damping` (m, m) [N/m]: Delta/T, so that devices dissipate dx' Delta dx/T in a period."""
@@ -285,14 +285,14 @@ class InWorld:
 # Hands and adversaries
 
 RANDOM, LOSSLESS = "random hands", "lossless hands"
-_THROWN = 0.3  # [m/s] rms of the speeds with which hands begin
-_NEVER = 1e3  # [J] W0 of a shell that does not act, for measurements
+_THROWN = 0.3  # [m/s] rms of the hands' initial speeds
+_NEVER = 1e3  # [J] W0 with which a shell never acts, for measurements
 _STREAM = 11  # keeps these draws apart from those of the hands with the same seed
 
 
 @dataclass(frozen=True)
 class HandsInWorld:
-    """What one set of hands, thrown at a world and left alone, was given."""
+    """The energy that one set of hands received after it was thrown at a world."""
 
     kind: str
     number: int
@@ -300,7 +300,7 @@ class HandsInWorld:
 
     @property
     def excess_J(self) -> float:
-        """What it was given beyond the account; the guarantee says that this is at most 0."""
+        """The energy given beyond the account; the guarantee bounds it by 0."""
         return self.figures.given_J - self.figures.start_J - self.figures.released_J
 
 
@@ -315,7 +315,7 @@ def thrown(
 ) -> list[HandsInWorld]:
     """Let hands of the scenario's population, thrown at random, move in the world for `duration` seconds.
 
-    Every second set is lossless: its dampers are taken out. `start` is W0 [J].
+    Every second set is lossless, without dampers. `start` is W0 [J].
     """
     from haptic_loop.sim.crowds import Validation
 
@@ -343,21 +343,21 @@ def thrown(
 
 
 def _lossless(hand: Any) -> Any:
-    """Return the hand without its dampers if it is a chain; another one unchanged."""
+    """Return a chain without its dampers, and any other hand unchanged."""
     if not isinstance(hand, Human):
         return hand
     links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
     return msgspec.structs.replace(hand, links=links, voluntary=None)
 
 
-def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int = 10, seconds: float = 1.0) -> float:
-    """Return the least sum of f'(u - u_-) [J] that the springs' ends reached when they run, stop and turn at random."""
+def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
+    """Return the least sum of f'(u - u_-) [J] in ten runs of 1 s, with springs whose ends stop and turn at random."""
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
-        for _ in range(runs):
+        for _ in range(10):
             port, at_port = scene.port(), 0.0
             goal, speed, left, before = np.zeros(scene.channels), np.zeros(scene.channels), 0, port.u
-            for _ in range(round(seconds / scenario.T)):
+            for _ in range(round(1.0 / scenario.T)):
                 if left == 0:
                     left = int(rng.integers(2, 60))
                     speed = rng.normal(size=scene.channels) * rng.choice([0.0, 0.1, 0.5]) - goal / (100 * scenario.T)
@@ -369,8 +369,8 @@ def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int =
 
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
-    """Return the least energy at the port [J] by each adversary while no shell acts: 0 if the scene gave nothing."""
-    least = {"hit and brake": hit_and_brake(scenario, coupling, seed)}
+    """Return the least energy at the port [J] by each adversary without a shell; 0 if the scene gave no energy."""
+    least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
         least[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
@@ -382,19 +382,22 @@ def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int
 
 
 def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence[str] = (), T: float = 1e-3) -> Network:
-    """Return the network that a scene is near a pose, for designs that need an environment.
+    """Return the linear network of a scene near a pose, for designs that need an environment.
 
-    It neglects all that is not linear: contacts are open or closed as in the pose, and joints turn little. A coupling
-    that is designed for it is certified for this network, not for the scene.
+    Contacts stay open or closed as in the pose, and rotations are small. A coupling that is designed for the network
+    is certified for it, not for the scene.
 
     Args:
-        world: a scenario with a world, whose contacts and T are then taken, or an MJCF file.
-        pose: positions (nq,) of the scene with its slides, the name of a keyframe, or None for the initial pose.
-        contacts: names of the bodies, of an MJCF file; they slide along x.
-        T: period [s], of an MJCF file.
+        world: A scenario with a world, or an MJCF file.
+        pose: Positions (nq,) of the scene with its slides, the name of a keyframe, or None for the initial pose.
+        contacts: Names of the bodies in an MJCF file, which slide along x; a scenario has its own.
+        T: Period [s] for an MJCF file; a scenario has its own.
+
+    Returns:
+        The network, whose `block` is the linear model.
 
     Raises:
-        InputError: for a scene or pose that cannot be, or a model that is not a passive environment.
+        InputError: The scene or the pose is impossible, or the model is not a passive environment.
     """
     from haptic_loop.models.world import Contact, World
 
@@ -421,7 +424,7 @@ def _pose_words(pose: Any) -> str:
 
 
 def _joined(G: Lti) -> Lti:
-    """Return the system without the states of bodies that touch no contact, directly or through others."""
+    """Return the system without the states of bodies that are connected to no contact."""
     size = np.abs(G.A).max(initial=1.0)
     linked = np.abs(G.A) > _ROUNDING * size
     driven, seen = (np.abs(G.B) > 0).any(axis=1), (np.abs(G.C) > 0).any(axis=0)

@@ -1,9 +1,9 @@
 """Z-width maps: safe K and B by certificates, with random humans, and in simulations.
 
 With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
-against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact. A
-map evaluates for each cell the conditions (for a row of cells at once) and the eigenvalues of the exact loop with every
-human of a population; for a few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
+against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact.
+For each cell a map evaluates the conditions and the eigenvalues of the exact loop with every human of a population. For
+a few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from haptic_loop.sim.stability import MARGINAL
 # Sweeps over K and B.
 
 
-MODEL_KEPT = "model kept"
+MODEL_KEPT = "model kept"  # pseudo-condition of `EnvironmentSweep`
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +59,14 @@ class _Sweep(ABC):
     devices: tuple[Device, ...]  # (m,)
     population: Population
     loop: Loop  # without ranges and with constant delays
-    own: Condition | None = field(kw_only=True, default=None)  # a condition of the user's own
+    own: Condition | None = field(kw_only=True, default=None)  # a user's own condition
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """Return the requirement of a condition at one point, by a separate sweep, to check maps."""
 
     @cached_property
-    def asked(self) -> dict[str, Condition]:
+    def judges(self) -> dict[str, Condition]:
         """The conditions by their names."""
         names = CONDITIONS if self.loop.known_devices else PLAIN_CONDITIONS
         return {each.name: each for each in (*map(named, names), *([self.own] if self.own else []))}
@@ -78,12 +78,12 @@ class _Sweep(ABC):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions that every cell is judged by."""
-        return tuple(self.asked)
+        """Names of the conditions by which every cell is judged."""
+        return tuple(self.judges)
 
     @property
     def decisive(self) -> str:
-        """The condition that judges the couplings of --mark."""
+        """The name of the condition that judges the couplings of --mark."""
         return (self.own or THIS_ENVIRONMENT).name
 
     def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
@@ -97,19 +97,19 @@ class _Sweep(ABC):
 
 @dataclass(frozen=True, eq=False)
 class CouplingSweep(_Sweep):
-    """K and B are those of the coupling, on every channel. Raises ValueError naming the field that is wrong."""
+    """A sweep over K and B of the coupling, on every channel. Raises ValueError with the name of a wrong field."""
 
     def __post_init__(self) -> None:
         check_loop(self.loop)
 
     @property
     def usual_scale(self) -> str:
-        """Linear against a rigid wall; logarithmic in environments, where far stiffer couplings can be safe."""
+        """Linear against a rigid wall; logarithmic in environments, in which far stiffer couplings can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
     def stiffness_scale(self) -> float:
-        """[N/m] 2 delta/((theta + 1) T): the stiffest that a linear law may be against every passive environment."""
+        """The largest stiffness of a linear law against every passive environment, 2 delta/((theta + 1) T) [N/m]."""
         return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
@@ -119,14 +119,14 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """By condition the multiplier (m,) for every coupling, or the reason why the loop is not covered."""
-        return {name: each.least_multiplier(self.loop) for name, each in self.asked.items()}
+        """The multiplier (m,) of each condition for every coupling, or the reason why the loop is not covered."""
+        return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """Return F of every coupling, a stack for each frozen contact state, with all walls touching first.
 
-        Away from a rigid wall the device is free and safe. Random hands meet these states; certificates cover walls
-        that make and break contact.
+        A device without contact to a rigid wall is safe, so that only states with contact are tested. Random hands meet
+        the frozen states; certificates cover walls that make and break contact.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
@@ -138,7 +138,7 @@ class CouplingSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Return required over available damping (n,), or inf, for walls that make and break contact."""
-        judge, (multiplier_of, reason) = self.asked[condition], self._multipliers[condition]
+        judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
         couplings, loops = self._couplings(K, B), [(self.loop, None)]
@@ -154,7 +154,7 @@ class CouplingSweep(_Sweep):
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """Return the requirement of one coupling by a separate sweep, to check maps."""
-        judge, coupling = self.asked[condition], self._coupling(K, B)
+        judge, coupling = self.judges[condition], self._coupling(K, B)
         multipliers, reason = self._multipliers[condition]
         if reason:
             return refusal(condition, self.loop.delta, reason)
@@ -171,15 +171,15 @@ class CouplingSweep(_Sweep):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentSweep(_Sweep):
-    """K and B of every spring at a contact, for a fixed coupling that was designed for the loop.
+    """A sweep over K and B of every spring at a contact, for a fixed coupling that was designed for the loop.
 
     An optimal coupling is a fixed Q and a model of the environment. In another environment there are two cases:
 
-        this-environment   the model follows: F = Theta (Psi E - Psi E Q Psi E), as with ranges
-        model kept    the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
+        this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
+        model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
-    A coupling designed for each cell would be certified everywhere, since Q near E^-1 turns the force off. Raises
-    ValueError if the network has walls, or no spring at a contact.
+    Couplings are not designed anew for each cell: all of them would be certified, because Q near E^-1 turns the force
+    off. Raises ValueError if the network has walls, or no spring at a contact.
     """
 
     coupling: Coupling
@@ -204,8 +204,8 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions that every cell is judged by."""
-        return (*self.asked, MODEL_KEPT) if self._kept else tuple(self.asked)
+        """Names of the conditions by which every cell is judged."""
+        return (*self.judges, MODEL_KEPT) if self._model_kept else tuple(self.judges)
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -213,7 +213,7 @@ class EnvironmentSweep(_Sweep):
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """Return F in every environment, with the coupling's model following it, as one stack."""
+        """Return F in every environment as one stack; the coupling's model is that of the cell."""
         return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array) -> list[Process]:
@@ -241,7 +241,7 @@ class EnvironmentSweep(_Sweep):
     def _everywhere(self) -> dict[str, Requirement]:
         """Requirements that do not depend on the springs, by condition, and refusals of those that do not apply."""
         requirements: dict[str, Requirement] = {}
-        for name, each in self.asked.items():
+        for name, each in self.judges.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
             if reason or each.guarantee(self.loop) == ANY:
                 loop = self.loop
@@ -249,18 +249,18 @@ class EnvironmentSweep(_Sweep):
         return requirements
 
     def _judge(self, condition: str) -> Condition:
-        return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.asked[condition]
+        return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.judges[condition]
 
     def _facing(self, condition: str) -> Coupling:
         """Return the coupling; for MODEL_KEPT the V whose model stays that of the scenario's environment."""
-        return (self._kept if condition == MODEL_KEPT else None) or self.coupling
+        return (self._model_kept if condition == MODEL_KEPT else None) or self.coupling
 
     @cached_property
-    def _kept(self) -> Coupling | None:
+    def _model_kept(self) -> Coupling | None:
         return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
     def _at(self, K: Array, B: Array) -> Loop:
-        """Return the loop around all these environments (n,), as a stack."""
+        """Return the loop around a stack of environments, for K and B (n,)."""
         network = self.loop.network
         M, D, S = network.matrices()
         varied = contact_springs(network)
@@ -295,14 +295,14 @@ def _press_directions(loop: Loop) -> Array:
 # The plane of a map.
 
 
-#: what K and B may be, as in design.audit: within these, all arithmetic is far from overflow
+#: allowed K [N/m] and B [N s/m], as in design.audit; within these bounds all arithmetic is far from overflow
 _STIFFNESSES, _DAMPINGS = (1e-3, 1e9), (0.0, 1e6)
 _Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Every K with every B."""
+    """The grid of a map, every K with every B."""
 
     K: Array  # (n,) [N/m]
     B: Array  # (n,) [N s/m]
@@ -325,10 +325,10 @@ class Grid:
 
 
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
-    """Make n x n cells. Ranges that are not given follow from the loop and leave room for the marks.
+    """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
-    K is about the loop's stiffness_scale, B about delta, the most that a linear law may damp. A linear map goes up to
-    2.5 times these, a logarithmic one from far below to far above. Raises InputError.
+    The scale of K is the loop's stiffness_scale; the scale of B is delta, the largest damping of a linear law. A linear
+    map goes up to 2.5 times these scales, a logarithmic one from far below to far above. Raises InputError.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":
@@ -351,7 +351,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
-    """Widen a range so that marks lie well inside; a mark at 0 stays on the edge of a logarithmic map."""
+    """Widen a range so that positive marks lie well inside; a logarithmic map cannot contain a mark at 0."""
     low, high = usual
     return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
@@ -370,18 +370,18 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
 # The map: both certificates and the population over the whole grid, MuJoCo at a sparse part of it.
 
 
-_SLICE = 60  # cells in one pass of a condition; before walls one
-_SAMPLE = 25  # cells that tell which humans are the leading ones
+_SLICE = 60  # cells in one pass of a condition; with walls one
+_SAMPLE = 25  # cells that decide which humans are the leading ones
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Over the grid, (cells,) each, B running fastest; nan where the keyboard came first."""
+    """Results over the grid, (cells,) each, B running fastest; nan for cells that an interruption left out."""
 
     grid: Grid
     ratio: dict[str, Array]  # condition -> required over available damping
-    growth: Array  # [1/s] worst over the humans that were tried: all of them where none is unstable
-    unstable: Array  # humans that make the cell unstable, at least
+    growth: Array  # [1/s] worst over the tried humans; all humans are tried if no leading one is unstable
+    unstable: Array  # number of tried humans that make the cell unstable
     points: limit_cycles.Points
     seconds: dict[str, float]  # of each stage
     interrupted: bool
@@ -394,7 +394,7 @@ def draw_map(
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],
 ) -> Map:
-    """Draw all stages of the map, reported as (stage, done, total) to `progress`; Ctrl-C keeps what is done."""
+    """Compute all stages of the map; `progress` is called with (stage, done, total). Ctrl-C keeps finished cells."""
     K, B = grid.flat
     seconds, n = {}, K.size
     ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.conditions}
@@ -411,7 +411,7 @@ def draw_map(
         return sweep.force_maps(K[some], B[some])[0], sweep.processes(K[some], B[some])
 
     begin = time.perf_counter()
-    _ = sweep.refusals  # once, before threads ask for it
+    _ = sweep.refusals  # fills the cache before threads read it
     parts, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
     for part, values in parts:
         for name, value in zip(sweep.conditions, values, strict=True):
@@ -440,7 +440,7 @@ def draw_map(
 def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
     """Return the worst growth and the number of unstable humans among the leading ones, or else among all.
 
-    `states` are the force maps of one cell; a human is unstable if it is with any of them.
+    `states` are the force maps of one cell; a human is unstable if it is unstable with any of them.
     """
     growth = np.max([held.growth(F, leading)[0] for F in states], axis=0)
     if not (growth > MARGINAL).any() and not leading.all():
@@ -457,7 +457,7 @@ def _in_slices(
 ) -> tuple[list[tuple[slice, _Part]], bool]:
     """Return task(slice) for slices of `size` that cover range(count), and whether the keyboard interrupted.
 
-    On all cores, since NumPy's kernels leave Python to other threads; what was finished is returned.
+    Threads use all cores, because NumPy's kernels release Python's lock. Finished slices are returned in any case.
     """
     finished_parts: list[tuple[slice, _Part]] = []
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -480,17 +480,17 @@ def _in_slices(
 
 
 # ----------------------------------------------------------------------------------------------------
-# Single points of the plane, looked at closely: those that were asked about, and how true the map is.
+# Single points of the plane: marks of the user, and the error of the map.
 
 
-_COLUMNS = 4  # of the map, at which its edge is compared with a bisection on single sweeps
-_STEPS = 48  # stiffnesses tried between the softest of the map and the stiffest, to find where safety ends
-_HALVINGS = 20  # an edge of the population is found to a relative 1e-6
+_COLUMNS = 4  # columns at which the map's edge is compared with a bisection on single sweeps
+_STEPS = 48  # stiffnesses between the softest and the stiffest of the map that are tried to find the edge
+_HALVINGS = 20  # bisections, which give an edge of the population to a relative 1e-6
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One point, and the stiffest at the same B; None where none is safe, inf where all that were tried are."""
+    """One point, and the largest safe stiffness at the same B: None if none is safe, inf if all tried ones are."""
 
     K: float
     B: float
@@ -502,7 +502,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class MapError:
-    """How far the map is from single sweeps, over the columns that were compared."""
+    """Errors of the map against single sweeps, over the compared columns."""
 
     figure_relative: float  # largest relative error of the figure beside the edge
     edge_relative_in_K: float  # largest relative error in K of the edge, interpolated between two rows
@@ -572,7 +572,7 @@ def _bisected(calm: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float], float]) -> float | None:
-    """Return the largest safe value: inf if all are safe, None if none is."""
+    """Return the largest safe value, refined by `between`; inf if the last tried value is safe, None if none is."""
     if not safe.any():
         return None
     last = int(np.flatnonzero(safe)[-1])

@@ -1,4 +1,4 @@
-"""What a Z-width map says: the figures of its report, and a line for every cell."""
+"""The report of a Z-width map, and its CSV file with a line for every cell."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _NOT_REACHED = "not reached before the interruption"
 
 @dataclass(frozen=True, eq=False)
 class _Ratio:
-    """What one condition says of the cells."""
+    """The figures of one condition over the cells."""
 
     required_over_available: Array  # (rows, columns)
     certified_cells: int
-    contradicted_cells: int | None = off_table("if given")  # by the population, where it meets this condition's loop
+    contradicted_cells: int | None = off_table("if given")  # certified, but unstable with a human of the population
     reason: str | None = off_table("if given")
 
 
 @dataclass(frozen=True, eq=False)
 class _Population:
-    """What the random humans say of the cells."""
+    """The figures of the random humans over the cells."""
 
     humans: int
     seed: int
@@ -51,7 +51,7 @@ class _Population:
 
 @dataclass(frozen=True)
 class Shown:
-    """What the simulated points have beside the linear loop."""
+    """The nonlinear effects of the simulated points."""
 
     encoder_step_m: list[float]
     friction_n: list[float]
@@ -73,7 +73,7 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Marked:
-    """What is asked about a single coupling."""
+    """The report of a --mark."""
 
     K: float
     B: float
@@ -126,7 +126,7 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Simulated:
-    """What MuJoCo shows at some of the cells."""
+    """The figures of MuJoCo at some of the cells."""
 
     effects: Shown
     nonlinear: bool
@@ -141,7 +141,7 @@ class _Simulated:
 
     @classmethod
     def of(cls, sweep: Sweep, drawn: Map, plan: Plan) -> _Simulated:
-        """The points that were reached, and what they have beside the linear loop."""
+        """Return the simulated points and their nonlinear effects."""
         points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
         figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
         steps = [float(np.max(device.encoder_step)) for device in sweep.devices]
@@ -161,13 +161,13 @@ class _Simulated:
 
     @property
     def contradicts(self) -> bool:
-        """Whether MuJoCo and the eigenvalues tell different things of the same linear loop."""
+        """Whether MuJoCo contradicts the eigenvalues of a loop without nonlinear effects."""
         return bool(self.differ_from_linear) and not self.nonlinear
 
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
+    """The report of a map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
 
     rigid: bool
     scenario: str | None
@@ -184,12 +184,12 @@ class MapReport:
     holds: bool
     interrupted: bool
     wall_s: dict[str, float]
-    axes: str  # coupling or environment: whose K and B they are
+    axes: str  # "coupling" or "environment", to which K and B belong
     ratios: dict[str, _Ratio] = off_table("inlined")
     fixed: FixedCoupling | None = off_table("inlined")  # of a map over environments
     error: dict[str, MapError | None] | None = off_table("if given")
     marks: list[_Marked] | None = off_table("if given")
-    claim: str | None = off_table("if given")  # of a condition of the user's own that certifies a cell
+    claim: str | None = off_table("if given")  # of a user's own condition, if it certifies a cell
     not_covered: str = CAVEATS
 
     @classmethod
@@ -204,7 +204,7 @@ class MapReport:
         humans: int,
         seed: int,
     ) -> MapReport:
-        """The report of a map; `humans` were drawn for each device."""
+        """Return the report of a map; `humans` is the number of draws for each device."""
         loop, complete, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
@@ -246,7 +246,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
-    """Return why some cells have no figure, by the example of one of them; None if all have one."""
+    """Return why some cells have no figure, with one of them as an example; None if all have one."""
     if name in sweep.refusals:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat

@@ -1,1 +1,1 @@
-"""The running loop in a window or as a film: session (keys, scripts, clock, forces, mouse) <- stage (what is shown)."""
+"""The running loop in a window or as a film: `stage` shows what `session` computes from keys, scripts and mouse."""

@@ -1,7 +1,7 @@
-"""The virtual object as pictures show it: where its nodes are at each tick, and its masses, springs and walls.
+"""The virtual object in pictures: its masses, springs and walls, and the places of its nodes at each tick.
 
-What is drawn is computed beside the loop and changes nothing in it. The displacements of the nodes come from the same
-equations as the forces of a tick before Theta, with these displacements as further outputs.
+The displacements of the nodes are computed beside the loop and change nothing in it. They are further outputs of the
+equations that give the forces of a tick before Theta.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from haptic_loop.models.device import AXES
 from haptic_loop.models.scene import APART, STEP, quiet_warnings, written
 from haptic_loop.sim.run import Simulation
 
-if TYPE_CHECKING:  # MuJoCo, for which help does not wait
+if TYPE_CHECKING:  # --help does not load MuJoCo
     import mujoco
 
-_FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03  # [m] from the handles to the contacts, between columns, of all
+_FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03  # [m] handles to contacts, between columns, above the floor
 _RADIUS = {"contact": 0.012, "node": 0.008, "mass": 0.02}  # [m]; a mass is a cube
 SPRING = 0.002  # [m] radius
 _WALL = (0.03, 0.03, 0.002)  # [m] half the sides of a wall; the last is along its normal
@@ -42,8 +42,8 @@ class Shape(NamedTuple):
     """One shape of the object."""
 
     kind: Literal["contact", "node", "mass", "spring", "wall"]
-    at: Array  # (3,) [m] its centre, or where a spring begins
-    to: Array  # (3,) [m] where a spring ends, or the normal of a wall; unused elsewhere
+    at: Array  # (3,) [m] centre, or the first end of a spring
+    to: Array  # (3,) [m] second end of a spring, or normal of a wall; unused for other shapes
 
     @property
     def rgba(self) -> tuple[float, float, float, float]:
@@ -51,12 +51,12 @@ class Shape(NamedTuple):
 
     @property
     def size(self) -> tuple[float, ...]:
-        """Half the sides, or the radius first [m]; not of a spring."""
+        """Half the sides of a box, or the radius of a sphere three times [m]; meaningless for a spring."""
         return _WALL if self.kind == "wall" else (_RADIUS[self.kind],) * 3
 
     @property
     def quat(self) -> Array:
-        """The quaternion that turns z to the normal of a wall; of other shapes none."""
+        """The quaternion that turns z to the normal of a wall; the identity for other shapes."""
         import mujoco
 
         quat = np.array([1.0, 0.0, 0.0, 0.0])
@@ -70,7 +70,7 @@ class DrawnObject:
     """A network of springs with a place for each of its points, left of the devices."""
 
     network: Network
-    rest: dict[str, Array]  # (3,) [m] of each point, and of the ground beside it
+    rest: dict[str, Array]  # (3,) [m] of each point at rest
     contacts: tuple[str, ...]  # points, one per device
 
     @classmethod
@@ -94,15 +94,15 @@ class DrawnObject:
 
     @property
     def reach(self) -> float:
-        """[m] from the handles to the ground behind the object."""
+        """The distance [m] from the handles to the ground behind the object."""
         return _FIRST + _COLUMN - min(0.0, *(float(at[0]) + _FIRST for at in self.rest.values()))
 
-    def motion(self, coupling: Coupling, psi: Sequence[int], T: float) -> Motion:
-        """Return what follows the nodes tick by tick."""
-        return Motion(self.network, coupling, psi, T)
+    def motion(self, coupling: Coupling, psi: Sequence[int], T: float) -> _Motion:
+        """Return the displacements of the nodes, tick by tick."""
+        return _Motion(self.network, coupling, psi, T)
 
     def shapes(self, displacements: Array | None = None) -> Iterator[Shape]:
-        """Yield the shapes where the nodes have these displacements (nodes,) [m], or at rest."""
+        """Yield the shapes for displacements (nodes,) [m] of the nodes; None is at rest."""
         moved = {name: np.zeros(3) for name in self.rest}
         if displacements is not None:
             q = dict(zip(self.network.nodes(), displacements, strict=True))
@@ -136,14 +136,14 @@ def _place(column: int, y: float) -> Array:
     return np.array([-_FIRST - column * _COLUMN, y, _HEIGHT])
 
 
-class Motion:
-    """Displacements of all nodes of a network behind a coupling, as the devices move; forces do not reach limits."""
+class _Motion:
+    """Displacements of all nodes of a network behind a coupling, while the devices move, without force limits."""
 
     def __init__(self, network: Network, coupling: Coupling, psi: Sequence[int], T: float) -> None:
         self._m, nodes = len(network.contacts), len(network.nodes())
         further = nodes + len(network.walls)
         G = walled_environment(network, T, places=True)
-        if coupling.compliance(T) is not None:  # otherwise the contacts are where the devices are
+        if coupling.compliance(T) is not None:  # Otherwise the contacts coincide with the devices.
             late = Lti.diag(delay(psi, T), Lti.constant(np.eye(further), T))
             G = Coupling.around(coupling, late @ G, further)
         self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # [x; forces on nodes] -> [f; nodes]
@@ -154,7 +154,7 @@ class Motion:
         self._nodes, self._next = self._after[self._m : ports, 0], self._after[ports:]
 
     def rest(self, x: Array) -> Array:
-        """Begin where the devices have been held at x (m,) [m] for long, and return the displacements (nodes,) [m]."""
+        """Start from the equilibrium for devices at x (m,) [m], and return the displacements (nodes,) [m]."""
         self._z[:, 0] = self._law.at_rest(np.concatenate([x, np.zeros(self._nodes.size)]))
         self._x[:] = x
         self._tick(self._before, self._after)
@@ -180,7 +180,7 @@ def object_of(simulation: Simulation) -> DrawnObject | None:
 
 
 def scene_xml(simulation: Simulation) -> str:
-    """Return the MJCF of the devices with the object at rest beside them, which does not move and touches nothing."""
+    """Return the MJCF of the devices with the object beside them; the object is at rest and collides with nothing."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(simulation.scene.xml)

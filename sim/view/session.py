@@ -1,14 +1,13 @@
-"""The running loop behind the window: keys, scripts, the mouse and a clock go in, frames come out. It knows no display.
+"""The running loop behind the window, without a display: it turns keys, scripts, mouse and clock into frames.
 
-When the coupling or a delay is _changed while the loop runs, the plant goes on from where it is, position and velocity.
-The new process begins at rest with the devices held where they are, z = A z + B x: its delay lines hold the
-force F(1) x, and nothing starts with a step in x. The force changes to what the new coupling makes of that
-position; what the environment's masses had of motion is lost.
+When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities. The new process
+starts at the equilibrium for these positions, z = A z + B x. Its delay lines hold the force F(1) x, so that no step in
+x occurs. The force changes to that of the new coupling, and the motion of the environment's masses is lost.
 
-The mouse is a hand: a spring and a damper between the handle and the point that it drags. It is part of the plant, so
-it is held exactly and is as passive as any other human: a certificate that covers every passive human covers this one.
-Only its end moves with the mouse, as in a voluntary motion. A force computed from one picture to the next would be no
-such hand: it comes too late, and sets a certified loop in motion by itself.
+The mouse is a hand: a spring and a damper between the handle and the dragged point. It is part of the exact plant and
+passive, so a certificate for every passive human covers it. Only the end of the spring moves with the mouse, as in a
+voluntary motion. A force that is computed once per picture would not be passive: it comes too late, and may destabilise
+a certified loop.
 """
 
 from __future__ import annotations
@@ -40,20 +39,20 @@ from haptic_loop.sim.view.drawn_object import object_of
 from haptic_loop.sim.world import START_J, InWorld, Late, WorldFigures, live
 
 # ----------------------------------------------------------------------------------------------------
-# What may happen to a running loop, by a key or by a script.
+# Events of a running loop, by a key or by a script.
 
 
-#: what a user calls a coupling -> what sim.couplings calls it
+#: name of a coupling in scripts -> its name in sim.couplings
 COUPLINGS = {"designed" if name == "spring-damper" else name: name for name in NAMES}
-#: the other way round: a user may say it as the other commands do
+#: name in sim.couplings, which scripts may also use -> name in scripts
 LABELS = {kind: label for label, kind in COUPLINGS.items()}
 GIVEN = "given"  # the coupling of --coupling FILE.json
-_STRONGEST = 100.0  # [N] a push
+_STRONGEST = 100.0  # [N] largest push
 
 
 @dataclass(frozen=True)
 class Couple:
-    """Another coupling, made for the delays as they are now."""
+    """Another coupling, made for the present delays."""
 
     name: str  # one of COUPLINGS, or GIVEN
 
@@ -68,7 +67,7 @@ class _Delay:
 
 @dataclass(frozen=True)
 class _Push:
-    """A force on a handle, until the next one."""
+    """A force on a handle, until the next push."""
 
     channel: int  # counted from 1
     force: float  # [N]
@@ -76,12 +75,12 @@ class _Push:
 
 @dataclass(frozen=True)
 class _Restart:
-    """The plant and the process from rest."""
+    """A restart of plant and process from rest."""
 
 
 _Event = Couple | _Delay | _Push | _Restart
 
-#: GLFW's key codes, left free by the viewer itself: 0 to 5 and the letters show and hide parts of the scene
+#: GLFW's key codes that the viewer does not use; it uses 0 to 5 and the letters
 KEYS: dict[int, tuple[str, _Event]] = {
     ord("6"): ("6", Couple("none")),
     ord("7"): ("7", Couple("published")),
@@ -97,7 +96,7 @@ KEYS: dict[int, tuple[str, _Event]] = {
 
 
 def keys_help(with_file: bool) -> list[tuple[str, str]]:
-    """Return the keys and their actions; `given` adds the coupling from a file. The mouse comes last."""
+    """Return the keys and their actions, then those of the mouse; `with_file` adds the coupling from a file."""
     keys = [(name, words(event)) for name, event in KEYS.values() if with_file or event != Couple(GIVEN)]
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
@@ -157,28 +156,28 @@ def _number(text: str) -> float:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A loop ready to be entered while another one runs: what a key asks for, with its growth rate and certificates.
+# A loop that is prepared while another one runs, with its growth rate and certificates.
 
 
 @dataclass(frozen=True)
 class Menu:
-    """What the keys choose from."""
+    """The settings by which keys and scripts choose couplings."""
 
     case: str
-    condition: str | Condition | None = None  # what a coupling is designed for, by default its own
+    condition: str | Condition | None = None  # of designs; None is the default of the kind
     given: str | None = None  # the file of --coupling
     limiter: bool | None = None  # False: forces are clipped
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedLoop:
-    """A loop, and what can be said of it before it runs."""
+    """A loop that is ready to run, with its dominant mode and its assessment."""
 
     menu: Menu
-    label: str  # as the user calls the coupling
+    label: str  # name of the coupling in scripts
     chosen: Chosen
     simulation: Simulation
-    mode: Mode | None  # of the exact linear loop; before walls, of the worst contact state; a world has none
+    mode: Mode | None  # of the exact linear loop, or of the worst contact state; None for a world
     assessment: Assessment
 
     @property
@@ -232,25 +231,25 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 # The session.
 
 
-HISTORY = 4.0  # [s] of forces that are kept for the picture
-_BLOCK = 64  # ticks between two looks at what is due
-LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
-_STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
+HISTORY = 4.0  # [s] of forces in a picture
+_BLOCK = 64  # largest number of ticks in one block
+LONGEST_LAG = 0.1  # [s] that a window may catch up in one frame; more is dropped and counted
+_STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as of the hands of the default scenario
 
 
 @dataclass
 class _Pace:
-    """Ticks of T seconds against a clock that is read from outside and began at 0."""
+    """The number of ticks of T seconds that are due on a clock that began at 0."""
 
     T: float  # [s]
     patience: float = LONGEST_LAG  # [s]
     done: int = 0  # ticks
-    overruns: int = 0  # how often the loop fell behind by more than `patience`
-    lost: float = 0.0  # [s] clock time that no tick was made for
+    overruns: int = 0  # number of times that the loop fell behind by more than `patience`
+    lost: float = 0.0  # [s] clock time without ticks
 
     def due(self, now: float) -> int:
-        """Count the ticks to be made now, so that the next one lies in the future, and mark them as done."""
-        # a clock that is a rounding error short of a tick has reached it
+        """Return the number of ticks due at the time `now` [s], and count them as done."""
+        # The addend keeps a rounding error of the clock from hiding a tick.
         ticks = max(0, int((now - self.lost) / self.T + 1e-6) - self.done)
         most = self.patience / self.T
         if ticks > most:
@@ -268,7 +267,7 @@ class _Pace:
 
 @dataclass(frozen=True)
 class Grip:
-    """Which handle is held, and where it is drawn to."""
+    """The device that the mouse holds, and the point to which it draws the handle."""
 
     channel: int  # the first one of the device, counted from 0
     target: tuple[float, ...]  # [m] displacement of the handle on each axis of the device
@@ -301,18 +300,18 @@ def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What is shown at one moment."""
+    """The contents of one picture."""
 
-    t: float  # [s] simulated
+    t: float  # [s] simulated time
     q: Array  # (n,) positions of all joints [m], motors first
-    mean: Array  # (m,) force fed back [N], over the ticks since the last frame
-    low: Array  # (m,) its least value since then
-    high: Array  # (m,) its largest
+    mean: Array  # (m,) mean force fed back since the last frame [N]
+    low: Array  # (m,) least force since the last frame [N]
+    high: Array  # (m,) largest force since the last frame [N]
     push: Array  # (m,) force of the mouse or the script on each handle [N]
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks with a force at its limit, in `history`
     prepared: PreparedLoop
-    note: str  # what was last asked for and came or did not
+    note: str  # the last event, or the reason why it was refused
     overruns: int
     lost: float  # [s]
     factor: float  # simulated over real time
@@ -322,24 +321,27 @@ class Frame:
 
 
 class LiveLoop:
-    """The closed loop, advanced to wherever the clock is."""
+    """The closed loop, which `frame` advances to the time of the clock."""
 
     def __init__(
         self, prepared: PreparedLoop, executor: Executor, script: Script = (), patience: float = LONGEST_LAG
     ) -> None:
-        """`executor` makes what keys ask for, while the loop goes on; a script's loops are made here, beforehand.
+        """Start a session.
 
-        The clock begins at 0; what it runs ahead by more than `patience` [s] is not made up.
+        Args:
+            prepared: The first loop.
+            executor: Prepares the loops of keys while the present loop runs.
+            script: Events at given times, whose loops are prepared here.
+            patience: Lag behind the clock [s] that is caught up; more is dropped.
 
-        Raises what `_changed` raises where an event of the script is impossible.
+        Raises:
+            InputError, DesignFailed, SingularLoop: An event of the script is impossible.
         """
         self.prepared = prepared
         self.pace = _Pace(prepared.scenario.T, patience)
         self.keys: SimpleQueue[_Event] = SimpleQueue()
         self.clipped = 0  # ticks, since the start
-        self.log: list[tuple[float, str, PreparedLoop]] = [
-            (0.0, "start", prepared)
-        ]  # time [s], what was asked for, the loop
+        self.log: list[tuple[float, str, PreparedLoop]] = [(0.0, "start", prepared)]  # (time [s], event, loop)
         self.script_ends = script[-1][0] if script else 0.0  # [s]
         self._executor, self._latest = executor, prepared
         self._wanted: list[tuple[_Event, Future[PreparedLoop | str]]] = []
@@ -358,11 +360,11 @@ class LiveLoop:
 
     @property
     def state(self) -> Array:
-        """Positions, then velocities."""
+        """The plant state: positions [m], then velocities [m/s]."""
         return self._buffer.s[0, :, 0].copy()
 
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
-        """Take what has been asked for, then advance to `now` [s] with the mouse's hand where it is."""
+        """Handle keys and prepared loops, advance to `now` [s] with the mouse's hand `grip`, and return the frame."""
         self._take_keys()
         self._take_finished()
         self._hold(grip)
@@ -408,10 +410,10 @@ class LiveLoop:
                 self._happen(event)
 
     def _make(self, event: Couple | _Delay) -> PreparedLoop | str:
-        """Return the loop after an event, or why there is none. The executor makes them in turn."""
+        """Return the loop after an event, or the reason why there is none. The executor runs one event at a time."""
         try:
             self._latest = _changed(self._latest, event)
-        except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
+        except (InputError, DesignFailed, SingularLoop) as error:  # The old loop goes on.
             return " ".join(str(error).split())
         return self._latest
 
@@ -445,7 +447,7 @@ class LiveLoop:
         if self._grip:
             w[:, [scene.tapped[channel] for channel in self._grip.channels]] += self._grip.pull
         buffer.w[:count] = w[:, :, None]
-        with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
+        with np.errstate(over="ignore", invalid="ignore"):  # Overflow is checked below.
             run_block(buffer, self._engine, count)
             if self._motion:
                 self._nodes = self._motion.follow(buffer.process.measured(buffer.x[:count, :, 0]))
@@ -468,7 +470,7 @@ class LiveLoop:
         self._note = words(event)
 
     def _switch(self, event: _Event, prepared: PreparedLoop) -> None:
-        # a scene begins in its first pose, and so do the devices then
+        # A new scene starts in its initial pose, so the devices must start at rest, too.
         self._enter(prepared, np.zeros_like(self.state) if is_world(prepared.scenario) else self.state)
         self._note = words(event)
         self.log.append((self.t, words(event), prepared))
@@ -489,7 +491,7 @@ class LiveLoop:
 
     @property
     def world(self) -> InWorld | None:
-        """The MuJoCo scene in the loop, where there is one."""
+        """The MuJoCo scene in the loop, or None."""
         net = self._buffer.net
         return net.world if isinstance(net, Late) else None
 
@@ -508,7 +510,7 @@ class LiveLoop:
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
-    """Return the script with the tick of each event and the loop that it leads to."""
+    """Return (tick, event, loop after it) for each event of the script; None for events that keep the loop."""
     events = []
     for time, event in script:
         into = None

@@ -1,9 +1,8 @@
-"""What a picture shows, in the window and in a film: places, colours, text, arrows and plots.
+"""Pictures of the window and of films: places, colours, text, arrows and plots.
 
-The window is MuJoCo's own viewer, passive: it shows what the session has made, and hands over keys and the mouse. The
-scene that it shows is a dressed copy. What is simulated stays as small as models.scene builds it; the shapes have
-no mass and touch nothing, so both models have the same matrices. A film is drawn by Pillow, a GIF, or an MP4 by ffmpeg
-where that is installed.
+The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and the mouse to it. It shows
+a copy of the scene with added shapes. The shapes have no mass and collide with nothing, so that both models have the
+same matrices. Pillow draws the pictures of a film; Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -57,10 +56,10 @@ _PALETTE: tuple[_Colour, ...] = (
 _GREY: _Colour = (0.55, 0.55, 0.58)
 _ALARM: _Colour = (1.0, 0.15, 0.15)  # a force at its limit
 
-_LONGEST = 0.12  # [m] arrow of a force at its limit
+_LONGEST = 0.12  # [m] length of the arrow of a force at its limit
 _SIZE = (640, 640)  # pixels of a video
-_WORDS = 0.40  # share of a video's height, at its top, that is left to words
-_PLOT = 0.25  # share of the picture's height, at its bottom, that the forces take
+_WORDS = 0.40  # share of a video's height for the text at the top
+_PLOT = 0.25  # share of the picture's height for the forces at the bottom
 _WIDTH = 60  # characters of a line of words
 _COLUMNS = 250  # spans of the plotted forces, each with its least and largest
 
@@ -95,7 +94,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """Return how many steps each joint's body stands behind its handle: 0 the handle, -1 a motor, 1.. an arm."""
+    """Return the number of steps from the handle to each joint's body: 0 the handle, -1 a motor, 1.. an arm."""
     place = dict.fromkeys(range(scene.channels), -1)
     for i, points in enumerate(scene.points[: _devices(scene)]):
         place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
@@ -111,7 +110,7 @@ def _scale(history: Array) -> float:
 def _envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
     """Return least and largest forces (columns, m) in `columns` equal spans of the last `ticks` ticks.
 
-    Where the history is shorter than that, the spans before it are not-a-number.
+    Spans before the beginning of a shorter history are nan.
     """
     padded = np.full((ticks, history.shape[1]), np.nan)
     recent = history[-ticks:]
@@ -154,7 +153,7 @@ def _limited(prepared: PreparedLoop) -> str:
 
 
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
-    """Return in words what the energy shell of a world has done."""
+    """Return the row of the energy shell of a world: its label, and its figures in words."""
     W0, given_mJ, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
     most = f"gave {given_mJ:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
     return "energy shell", f"acted on {figures.limited_ticks} of {figures.ticks} ticks, {most}"
@@ -185,7 +184,7 @@ def _list(values: tuple[int, ...]) -> str:
 
 
 class ShownScene:
-    """A scene that can be looked at, and pushed with the mouse."""
+    """The scene of devices and object in a picture, with handles that the mouse can hold."""
 
     def __init__(
         self, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE, drawn: DrawnObject | None = None
@@ -197,13 +196,13 @@ class ShownScene:
         self._channels = [_own(scene, device) for device in range(_devices(scene))]
 
     def show(self, frame: Frame) -> None:
-        """Put the joints where they are in a frame."""
+        """Set the joints to the positions of a frame."""
         self.data.qpos[:] = frame.q
         self.data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return what the mouse holds: a hand holds the handle, whichever body of its device was taken."""
+        """Return the grip of the mouse, which holds the handle of a device whichever of its bodies was clicked."""
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
@@ -227,7 +226,6 @@ class ShownScene:
             axes, reach = self.model.jnt_axis[handles], _LONGEST / self.force_limit[channels]
             at = self.data.xpos[self.model.jnt_bodyid[handles[0]]] + np.array([0, 0, 0.045])
             clipped = np.maximum(-frame.low, frame.high)[channels] >= self.force_limit[channels]
-            # the device feels -f
             for axis, low, high, each, over in zip(
                 axes, frame.low[channels], frame.high[channels], reach, clipped, strict=True
             ):
@@ -258,12 +256,12 @@ class ShownScene:
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
-class ShownWorld(ShownScene):
-    """A MuJoCo scene that is touched, and each device as a stylus whose tip is where the device is."""
+class _ShownWorld(ShownScene):
+    """The MuJoCo scene of a world in a picture, with each device as a stylus whose tip is the device's position."""
 
     def __init__(self, world: World, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
         self.force_limit = force_limit
-        self.model = copy.deepcopy(world.model)  # the loop changes its own while a window draws
+        self.model = copy.deepcopy(world.model)  # The loop changes its own model while a window draws.
         self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
@@ -279,7 +277,7 @@ class ShownWorld(ShownScene):
         self._stylus = [length * one / max(float(np.linalg.norm(one)), 1e-9) for one in away]  # from tip to handle [m]
 
     def show(self, frame: Frame) -> None:
-        """Put the bodies where they are in a frame."""
+        """Set the bodies to the pose of a frame."""
         assert frame.pose is not None
         self.data.qpos[:] = frame.pose
         mujoco.mj_kinematics(self.model, self.data)
@@ -291,7 +289,7 @@ class ShownWorld(ShownScene):
         return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return what the mouse holds: a contact, in the directions in which it slides."""
+        """Return the grip of the mouse, which holds a contact in the directions in which the contact slides."""
         held = int(perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
         if perturb.select not in self._bodies or not held:
             return None
@@ -300,7 +298,7 @@ class ShownWorld(ShownScene):
         return Grip(self._channels[i][0], tuple((self._along[i] @ drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
-        """Draw a stylus for each device, and arrows at its handle for its force and for what pushes it."""
+        """Draw a stylus for each device, and arrows at its handle for its force and for pushes."""
         size = 0.045 * self.model.stat.extent
         forces, pushes = self._by_device(frame.mean), self._by_device(frame.push)
         for i, (along, x) in enumerate(zip(self._along, self._x, strict=True)):
@@ -321,10 +319,10 @@ class ShownWorld(ShownScene):
 
 
 def stage_for(session: LiveLoop) -> ShownScene:
-    """Return the stage that shows a loop."""
+    """Return the stage of a loop."""
     simulation = session.prepared.simulation
     if session.world:
-        return ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
+        return _ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
     return ShownScene(simulation.scene, simulation.process.force_limit, drawn=object_of(simulation))
 
 
@@ -338,12 +336,12 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
     seen = set[int]()
     for joint, (place, device) in enumerate(zip(where, _owners(scene), strict=True)):
         number = int(scene.model.jnt_bodyid[joint])
-        if number in seen:  # by another of its joints
+        if number in seen:  # The body has another joint.
             continue
         seen.add(number)
         body = spec.body(scene.model.body(number).name)
         body.pos = [place * STEP, device * -APART, 0.03]
-        if body.frame:  # of an attached device, which has a place of its own in the scene's file
+        if body.frame:  # The file of an attached device has a place of its own.
             body.frame.pos = [0.0, 0.0, 0.0]
         if place == 0:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(device), 1.0), **_MASSLESS)
@@ -353,7 +351,7 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
     devices = _devices(scene)
     middle = [(deepest - 1) * STEP / 2, -APART * (devices - 1) / 2, 0.03]
     for device in range(devices):
-        if len(_own(scene, device)) > 1:  # it moves in space and needs no rail
+        if len(_own(scene, device)) > 1:  # A device that moves in space needs no rail.
             continue
         at, rail = [middle[0], -APART * device, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
@@ -363,7 +361,7 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
 
 
 def _undress(spec: mujoco.MjSpec) -> None:
-    """Take out what a viewer shows of the scene's own file: this stage has its own shapes and colours."""
+    """Delete the shapes of the scene's own file, because this stage has its own shapes and colours."""
     drawn = [tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)]
     for part in [*drawn, *spec.geoms, *spec.sites]:
         spec.delete(part)
@@ -434,7 +432,7 @@ def _connect(
 _RATE = 60.0  # frames per second
 _PATIENCE = 30  # [s] for the display to answer
 
-# without a display the viewer's thread dies and its caller waits for ever: a process of its own asks first
+# Without a display the viewer's thread dies and its caller waits for ever, so a separate process asks first.
 _PROBE = (
     "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
     "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
@@ -455,15 +453,15 @@ def _display() -> bool:
 
 
 def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> None:
-    """Run the session in a window until that is closed, or until it is `until` [s] old.
+    """Run the session in a window until the window is closed, or for `until` [s].
 
-    Raises NoWindow where there is no display, or on macOS without MuJoCo's own launcher.
+    Raises NoWindow without a display, and on macOS without MuJoCo's own launcher.
     """
     if not _display():
         raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
     threads = set(threading.enumerate())
     try:
-        from mujoco import viewer  # asks for a display's library
+        from mujoco import viewer  # needs the library of a display
 
         window = viewer.launch_passive(
             stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
@@ -488,7 +486,7 @@ def _loop(
     sleep: Callable[[float], None],
     until: float | None = None,
 ) -> None:
-    """Show frame after frame: pass the mouse to the session and the session to the window."""
+    """Show frame after frame, and pass the mouse to the session."""
     start = clock()
     grip = None
     while window.is_running():
@@ -500,7 +498,7 @@ def _loop(
 
 
 def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
-    """Show a frame, and return what the mouse holds afterwards."""
+    """Show a frame, and return the grip of the mouse afterwards."""
     with window.lock():
         stage.show(frame)
         grip = stage.grip(window.perturb)
@@ -536,10 +534,7 @@ _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
 
 class FlatPictures:
-    """Frames of a scene as shapes, seen from above, and the forces, by Pillow: pictures of a film.
-
-    A body that moves along z becomes larger when it comes nearer.
-    """
+    """Pictures of a film by Pillow: the scene from above, and the forces. A body grows when it moves along z."""
 
     def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
         self.scene, self.force_limit, self.object = scene, force_limit, drawn
@@ -566,7 +561,7 @@ class FlatPictures:
         return np.asarray(image)
 
     def close(self) -> None:
-        """Free what drew the pictures."""
+        """Free the renderer, if there is one."""
 
     def _scene(self, image: Image.Image, frame: Frame, top: int, bottom: int) -> None:
         self._bodies(ImageDraw.Draw(image), frame, max(top, round(_WORDS * image.height)), bottom)
@@ -615,7 +610,7 @@ class FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw range and mean of the force since the last frame, in space the mean only; the device feels -f."""
+        """Draw range and mean of the force since the last frame (in space the mean only); the device feels -f."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
@@ -652,13 +647,13 @@ class FlatPictures:
                     pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_shade(i, axis)), 2)
 
 
-class WorldPictures(FlatPictures):
-    """Frames of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
+class _WorldPictures(FlatPictures):
+    """Pictures of a film of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
 
-    def __init__(self, stage: ShownWorld, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
+    def __init__(self, stage: _ShownWorld, scene: Scene, force_limit: Array) -> None:
         """Open the renderer. Raises InputError if there is no OpenGL."""
         super().__init__(scene, force_limit)
-        self.stage, self._gl = stage, _offscreen(*size)
+        self.stage, self._gl = stage, _offscreen(*_SIZE)
         self._gl.make_current()
         self._drawn = mujoco.MjvScene(stage.model, maxgeom=10_000)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
@@ -677,11 +672,11 @@ class WorldPictures(FlatPictures):
         self._gl.make_current()
         mujoco.mjr_render(size, self._drawn, self._context)
         mujoco.mjr_readPixels(pixels, depth, size, self._context)
-        pixels[(depth == depth.max()) & (depth.max() > 0.999)] = 255  # nothing is there
+        pixels[(depth == depth.max()) & (depth.max() > 0.999)] = 255  # the background
         return pixels[::-1]
 
     def close(self) -> None:
-        """Free the renderer, whose numbers for textures the next one would share."""
+        """Free the renderer, because the next one would share its texture numbers."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
@@ -691,10 +686,10 @@ class WorldPictures(FlatPictures):
 
 
 def pictures_for(session: LiveLoop) -> FlatPictures:
-    """Return what draws the pictures of a film. Raises InputError if a world needs OpenGL and there is none."""
+    """Return the painter of a film's pictures. Raises InputError if a world needs OpenGL and there is none."""
     simulation, stage = session.prepared.simulation, stage_for(session)
-    if isinstance(stage, ShownWorld):
-        return WorldPictures(stage, simulation.scene, simulation.process.force_limit)
+    if isinstance(stage, _ShownWorld):
+        return _WorldPictures(stage, simulation.scene, simulation.process.force_limit)
     return FlatPictures(simulation.scene, simulation.process.force_limit, stage.object)
 
 
@@ -714,7 +709,7 @@ def _rgb(parts: _Colour) -> tuple[int, int, int]:
 
 
 def check_film(path: Path) -> None:
-    """Check, before any work is done, that a film can be written. Raises InputError."""
+    """Raise InputError if a film cannot be written, before any work is done."""
     if path.suffix not in _FORMATS:
         raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
     check_file("--video", path)
@@ -723,7 +718,7 @@ def check_film(path: Path) -> None:
 
 
 def save_film(path: Path, pictures: Iterable[Picture], fps: float) -> int:
-    """Write the film and return its number of pictures. Raises InputError where ffmpeg refuses."""
+    """Write the film and return its number of pictures. Raises InputError if ffmpeg fails."""
     return _gif(path, pictures, fps) if path.suffix == ".gif" else _mp4(path, pictures, fps)
 
 
@@ -731,7 +726,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
     images: list[Image.Image] = []
     palette: Image.Image | None = None
     for picture in pictures:
-        # one palette for all: colours do not flicker, and what stands still costs nothing
+        # One palette for all pictures avoids flicker, and unchanged pixels then need no space in the file.
         palette = palette or _palette(picture)
         images.append(Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE))
 
@@ -751,7 +746,7 @@ def _palette(first: Picture) -> Image.Image:
 
 
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
-    """Write an MP4 film with ffmpeg elsewhere, and put it in its place when it is complete."""
+    """Write an MP4 film with ffmpeg to a temporary folder, and copy it to `path` when it is complete."""
     with tempfile.TemporaryDirectory() as folder:
         raw, film, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
         with raw.open("wb") as file:
