@@ -1,4 +1,4 @@
-"""python -m design.audit: are these gains safe, with what margin, and where does it bind?"""
+"""python -m design.audit: judge a coupling, with its margins and the frequency at which its condition binds."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def main(argv: list[str]) -> int:
     from haptic_loop.sim.report import encoder_steps
 
     if args.devices:
-        beside = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
-        if beside:
-            raise InputError(f"--devices with --{beside[0]}: the list is of the whole catalogue, give one of them")
+        extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
+        if extra:
+            raise InputError(f"--devices with --{extra[0]}: the list is of the whole catalogue, give one of them")
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
@@ -85,7 +85,7 @@ def main(argv: list[str]) -> int:
         with options.refused():
             audited = audit(loop, coupling, condition, args.seed, limits, move)
     notes = ()
-    if args.coupling and not _is_own(args):  # judge the file in the audited loop
+    if args.coupling and not _is_own(args):
         notes = from_file(read_coupling(args.coupling), loop, own=condition).notes
     _, own = name_and_own(condition)
     notes = (*notes, own.said(audited.assessment.requirements[own.name])) if own else notes
@@ -195,7 +195,7 @@ def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _is_own(args: argparse.Namespace) -> bool:
-    """Return whether --coupling names a function of the user's own, not a file."""
+    """Return whether --coupling names a user's own function instead of a file."""
     return ":" in (args.coupling or "") and not Path(args.coupling).exists()
 
 
@@ -270,19 +270,19 @@ def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:
-        if result.assessment.requirements[condition].certified:  # so at least this wall is
+        if result.assessment.requirements[condition].certified:  # This wall is certified, and perhaps stiffer ones.
             return f"The stiffest wall with {damper} was not found: {margin.reason}."
         return f"No wall with {damper} was found to be certified: {margin.reason}."
     return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."
 
 
 def _percent(error: float | None) -> str:
-    """Return a relative error in percent, rounded down, so that the printed one is tolerated."""
+    """Return a relative error in percent, rounded down, so that the printed error is tolerated, too."""
     return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
-    """Return stiffnesses with five digits, rounded down, so that the printed ones are certified."""
+    """Return stiffnesses with five digits, rounded down, so that the printed values are certified, too."""
     if None in K:
         return "-"
     units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)

@@ -1,4 +1,4 @@
-"""python -m hw.bridge: drive a device over a serial port with a coupling that is certified for the delay measured.
+"""python -m hw.bridge: drive a device over a serial port with a coupling that is certified for the measured delay.
 
 port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out -> trace and report
 """
@@ -42,29 +42,31 @@ def main(argv: list[str]) -> int:
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
+    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # A host without a device clock sends at once.
     if at_once and args.condition:
         choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
         if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
             raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # the account is that of the contacts
+        args.energy_budget = None  # The energy account of a world is at its contacts.
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     behind = session_cli.boards_behind(args, scenario)
-    for given, what in (
+    for present, feature in (
         (args.latch == "arrival", "--latch arrival"),
         (is_world(scenario), "a world"),
         (args.energy_budget, "--energy-budget"),
     ):
-        if behind and given:
-            raise InputError(f"--port is {args.port}: {what} counts forces by one clock, several boards have several")
+        if behind and present:
+            raise InputError(
+                f"--port is {args.port}: {feature} counts forces by one clock, several boards have several"
+            )
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # emulated people never let go
+    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated hands never let go.
     session = session_for(scenario, settings, **limits)
     session.record = recorder = Recorder(scenario.channels)
     out = options.out_folder(args, "bridge")
@@ -78,12 +80,12 @@ def main(argv: list[str]) -> int:
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
-    try:  # first, for a disk may be full
+    try:  # The figures are printed before files are written, because the disk may be full.
         _print_session(report, render.console(args), args.details)
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is closed
     files = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
@@ -119,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
 def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
-    """Print what is certified and what was measured for it, before anything is armed."""
+    """Print the measured ages and the certified couplings, before anything is armed."""
     console.print(verdict(programs[0].assessment), soft_wrap=True)
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
@@ -167,7 +169,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """Say how long ticks are, and how much energy a tick longer than the certified one may give."""
+    """Return a sentence on the length of ticks and on the energy that a tick beyond the certified length may give."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
@@ -184,7 +186,7 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
 
 
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
-    """Print the log, then what the link did."""
+    """Print the log of the session, then the figures of the link, of the energy accounts and of the scene."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
     link = report.link

@@ -127,12 +127,12 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         return None
     loop, coupling = stored.loop, stored.built()
     with render.progress("searching the ranges between their vertices") as move:
-        asked = condition_of(stored.certificate, condition)
-        if asked.extensible and not asked.multiplier_sizes(loop):
+        proved_by = condition_of(stored.certificate, condition)
+        if proved_by.extensible and not proved_by.multiplier_sizes(loop):
             return search_ranges(loop, coupling, move)
-        values = on_file(asked, loop, stored.certificate.multipliers)
+        values = on_file(proved_by, loop, stored.certificate.multipliers)
         return search_ranges(
-            loop, coupling, move, ratio=lambda there: required_damping(there, coupling, asked, values).ratio
+            loop, coupling, move, ratio=lambda there: required_damping(there, coupling, proved_by, values).ratio
         )
 
 
@@ -177,7 +177,7 @@ def _table(checked: _Checked) -> render.Table:
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]
     if checked.assessment:
         rows.append(("held torques", checked.assessment.held_torques))
-    if not checked.proved:  # the file's own words, although it is refused
+    if not checked.proved:  # The figures are claims of a file that is refused.
         claims = ("required", "margin", "switching, required", "switching, margin")
         rows = [(f"{name}, claimed" if name.startswith(claims) else name, text) for name, text in rows]
     return render.facts(title, rows, left=True)

@@ -31,7 +31,7 @@ _MOST = 6  # curves that can be told apart in one panel
 
 
 def main(argv: list[str]) -> int:
-    """Compare. 0: done, 1: something could not be designed, 130: interrupted, with what was done until then."""
+    """Compare couplings. 0: done, 1: a coupling could not be designed, 130: interrupted, with the finished parts."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "design.compare")
@@ -80,7 +80,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return the verdict: which coupling with a guarantee has the least force error."""
+    """Return the verdict, the guaranteed coupling with the least force error."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -215,7 +215,7 @@ def _guarantees(report: Comparison) -> render.Table:
 
 
 def _guaranteed(report: Comparison) -> str:
-    """Return the verdict: which couplings have a guarantee, and for what."""
+    """Return the verdict, the guarantee of each coupling."""
     guarantees = {coupling.name: coupling.assessment.guarantee for coupling in report.couplings}
     words = [f"{name} ({guarantee.words if guarantee else 'none'})" for name, guarantee in guarantees.items()]
     return f"Guarantee: {', '.join(words)}."

@@ -50,16 +50,16 @@ def main(argv: list[str]) -> int:
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
         raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
-    design, dies_away = _design(args, loop, scenario)
+    design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     useless = (
         f" [red]Useless[/] on {where}: it renders next to nothing there." if (where := _useless(assessment)) else ""
     )
-    slow = args.coupling == "optimal"  # its bound and its price take seconds
+    slow = args.coupling == "optimal"  # The bound and the price of an optimal coupling take seconds.
     if slow:
         render.announce(args, verdicts.verdict(assessment) + useless)
-    report = replace(_reported(args, loop, design, assessment, stored), ringing=dies_away)
+    report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
     said = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby) + useless
     lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
     render.publish(args, report, _tables(scenario, report), lines, verdict=said)
@@ -149,7 +149,7 @@ def _for_switching(args: argparse.Namespace) -> bool:
     return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
 
 
-def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
+def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """Return the options of a design by argument name. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     values = {name: value for name in known if options.given(value := getattr(args, name, None))}
@@ -166,11 +166,11 @@ def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
     """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling.
 
-    The second part says how a knock dies away, with --decay.
+    The second part is the decay of a knock, with --decay.
     """
     from haptic_loop.design.api import proved
 
-    further = _asked_of(args, args.coupling)
+    further = _options_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         further["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
@@ -180,12 +180,12 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
         if not kind_of(args.coupling).softened:
             able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
             raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
-    with render.progress("designing softer and softer couplings"):  # its failure names no other coupling
-        design, dies_away = _that_decays(scenario, loop, make, args.decay)
-        return proved(loop, design), dies_away
+    with render.progress("designing softer and softer couplings"):
+        design, decay = _that_decays(scenario, loop, make, args.decay)
+        return proved(loop, design), decay
 
 
-#: shares of the damping that the search for a damping ratio tries; number of bisections between two of them
+#: shares of the damping in the search for a damping ratio, and the number of bisections between two of them
 _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 
 
@@ -205,9 +205,9 @@ def _that_decays(
         if share < 1:
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
-        dies_away = ringing(assemble(scenario, design.coupling))
-        assert dies_away  # no world
-        return design, dies_away
+        decay = ringing(assemble(scenario, design.coupling))
+        assert decay  # None for worlds only, which `main` refuses
+        return design, decay
 
     tried: list[Ringing] = []
     outside = 1.0
@@ -264,7 +264,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
-    chosen_options = Options(**_asked_of(args, "optimal")) if best else DEFAULT
+    chosen_options = Options(**_options_of(args, "optimal")) if best else DEFAULT
     nearby, limit, interrupted = Nearby(), None, False
     note = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
     try:
@@ -277,7 +277,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         interrupted = True
     nominal = None
     if kind_of(args.coupling).model:
-        nominal = partial(design_by_kind, kind=args.coupling, **_asked_of(args, args.coupling))
+        nominal = partial(design_by_kind, kind=args.coupling, **_options_of(args, args.coupling))
     return _Report(
         case=args.case,
         seed=args.seed,

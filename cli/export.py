@@ -1,6 +1,6 @@
-"""python -m design.export coupling.json: export a stored coupling, or its whole discrete process, as C.
+"""python -m design.export coupling.json: export a stored coupling, or its discrete process, as C.
 
-Like design.check it uses the file alone, including its loop: the exported process is the certified one.
+The loop is that of the file, so that the exported process is the certified one.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
     limit, balls = _force_limits(args.force_limit, stored.loop) if args.force_limit else (None, ())
     try:
         block = process_block(stored, not args.without_theta, limit, balls) if args.process else coupling_block(stored)
-    except ValueError as error:  # also coefficients beyond floating point
+    except ValueError as error:
         raise InputError(f"{args.coupling}: {error}") from None
     block = with_origin(block, Path(args.coupling).name, stored, verdict, claim)
     return in_single_precision(block) if args.float else block

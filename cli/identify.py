@@ -1,9 +1,9 @@
-"""python -m hw.identify: how much damping does a device guarantee? From a chirp of a small force and a free release.
+"""python -m hw.identify: measure the damping that a device guarantees, by a chirp of a small force and a free release.
 
-Nobody holds the device, in two sittings with the handles at other places: a hand that only damps is found out by the
-sitting in which it was not there. The chirp passes through the same session as the bridge, with all its limits, capped
-at its own amplitude. With --transmission two sittings with clamped handles follow: they bound the mass of the motor and
-the transmission (hw/transmission.py), on which the known-device conditions rest.
+Nobody may hold the device, in two sittings with the handles at different places. The sitting without a hand reveals a
+hand in the other one that only damps. The chirp passes through the session of the bridge with all its limits, capped at
+its own amplitude. With --transmission two sittings with clamped handles follow. They bound the mass of the motor and
+the transmission (hw/transmission.py), which the known-device conditions need.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ _TRANSMISSION_LIMITS = (
     "parallel at these forces. They say nothing of a part on the motor's side that resonates above 250 Hz, of an "
     "encoder that is not on the motor's shaft, or of a transmission that was tightened or warmed since."
 )
-_LEVELS = 1.0, 0.5  # of the force, in the sittings with clamped handles: play differs between them
+_LEVELS = 1.0, 0.5  # shares of the force in the sittings with clamped handles; play shows as a difference
 _CLAMPED = 1000.0  # [kg] at the handle of an emulated device
 
 
 @dataclass(frozen=True, eq=False)
 class _Sitting:
-    """One session, and what its record says."""
+    """One session, and the estimates from its record."""
 
-    axes: list[Estimate]  # none where there is a reason
+    axes: list[Estimate]  # empty if there is a reason
     reason: str | None
     report: SessionReport = off_table("left out")
     session: Session = off_table("left out")
@@ -181,13 +181,13 @@ def _sitting(
 ) -> _Sitting:
     """Play the excitation to every axis, record and estimate.
 
-    With `clamped` handles it is a chirp of this part of the force, and nothing is estimated from it alone.
+    With `clamped` handles the excitation is a chirp of this share of the force, and nothing is estimated yet.
     """
-    asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
+    undamped = scenario.replace(delta=(1e-6,) * scenario.channels)  # The damping is unknown.
     r = scenario.lever  # the options are for the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # a lighter device than declared is stopped there
-    session = session_for(asks_nothing, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # stops a device that is lighter than declared
+    session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
     def played(link: int) -> Excitation:
@@ -205,7 +205,7 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
-    seconds = played(1).seconds - 0.2  # the lead has the ramp
+    seconds = played(1).seconds - 0.2  # The lead includes the ramp.
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
@@ -248,7 +248,7 @@ def _with_transmissions(
         return replace(report, no_transmissions=reason)
     bounds = list[TransmissionBounds]()
     for i in range(scenario.channels):
-        free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # the one without a hand
+        free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # A hand would add damping.
         try:
             first, *others = (records_of(s.recorder, s.session)[i] for s in (free, *clamped))
             step = free.session.units.encoder_step[i]

@@ -95,9 +95,9 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     code: str | int | None
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for child processes
     _load_on_first_use("f2py", "testing")  # SciPy's import names both without using them
-    os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown name would stop the import of matplotlib.
+    os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown backend would stop the import of matplotlib.
     _streams()
-    sys.unraisablehook = _not_lost
+    sys.unraisablehook = _repeat_interrupt
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     try:
@@ -110,14 +110,14 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         code = _say(f"not possible: {error}", DOES_NOT_HOLD)
     except KeyboardInterrupt:
         code = _say("interrupted", INTERRUPTED)
-    except SystemExit as end:  # argparse, after --help, and SIGTERM
+    except SystemExit as end:  # raised by --help and by SIGTERM
         code = end.code
     except MemoryError:
         code = _say("error: there is not enough memory for this", UNFINISHED)
     except OSError as error:  # mostly a full disk
         code = _cannot(error)
-    except Exception as error:  # not 1, which means that a claim does not hold
-        place, code = place_of(error), UNFINISHED  # a mistake in this package or in the user's own class
+    except Exception as error:  # The exit code 1 would mean that a claim does not hold.
+        place, code = place_of(error), UNFINISHED  # `place` is None for a mistake in this package
         if place and is_refusal(error):
             code = _say(f"error: {place}: {error}", BAD_INPUT)
         else:
@@ -158,8 +158,8 @@ def _terminated(number: int, frame: Any) -> NoReturn:
     raise SystemExit(_say("terminated", 128 + number))
 
 
-def _not_lost(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came during Python's clean-up, which would lose it."""
+def _repeat_interrupt(unraisable: Any) -> None:
+    """Repeat a Ctrl-C that came during Python's clean-up, where Python would ignore it."""
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         _thread.interrupt_main()
     else:

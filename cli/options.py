@@ -47,7 +47,7 @@ _Number = TypeVar("_Number", int, float)
 _Given = TypeVar("_Given")
 _Group = argparse._ActionsContainer
 _CHOICE = re.compile(r"argument ([\w-]+): invalid choice: (.*) \(choose from (.*)\)")  # argparse's own words
-_OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
+_OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # words of the types below
 
 
 class Parser(argparse.ArgumentParser):
@@ -436,10 +436,10 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     if args.environment is not None:
         scenario = with_environment(scenario, args.environment)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
-    said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     changes: dict[str, Any] = {
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device))
-        for name, value in said.items()
+        for name, value in values.items()
     }
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device))
@@ -489,15 +489,15 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 def place(args: argparse.Namespace) -> str:
     """Return the case or scenario, and the coupling and condition where options name them, for names of files.
 
-    A file stands there without its suffix, as `run-I-stiff` for `--coupling stiff.json`. One of another folder has a
-    digest of that folder behind it: files of one name in two folders do not share their results.
+    The name of a file loses its suffix: `run-I-stiff` for `--coupling stiff.json`. A file of another folder also gets a
+    digest of that folder, so that results of files with equal names in two folders stay apart.
     """
     if args.scenario == DEFAULT:
         loop = args.case
     else:
         loop = name_of(args.scenario) + ("" if args.case == "I" else f"-{args.case}")
-    named_by_options = (getattr(args, option, None) for option in ("coupling", "condition"))
-    return "-".join([loop, *(_in_file_names(what) for what in named_by_options if what)])
+    values = (getattr(args, option, None) for option in ("coupling", "condition"))
+    return "-".join([loop, *(_in_file_names(value) for value in values if value)])
 
 
 def name_of(file: str) -> str:
@@ -511,9 +511,9 @@ def name_of(file: str) -> str:
 _LONGEST = 80  # characters of a coupling or a condition in the name of a file, which may have 255
 
 
-def _in_file_names(what: str | tuple[str, ...] | Condition) -> str:
-    """Return the names of couplings or of a condition as a part of a file name; the end of a long one is its digest."""
-    names = what if isinstance(what, tuple) else (what if isinstance(what, str) else what.name,)
+def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:
+    """Return couplings or a condition as a part of a file name; a digest replaces the end of a long one."""
+    names = value if isinstance(value, tuple) else (value if isinstance(value, str) else value.name,)
     words = [part for name in names for part in name.split(":")]
     parts = (name_of(word) if word.endswith((".json", ".py")) else word for word in words)
     text = re.sub(r"[^\w.-]+", "-", "-".join(parts)).strip("-.")
@@ -543,8 +543,8 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
     if args.varying_delay is not None:
-        each = len(args.varying_delay) == len(scenario.device)
-        count = len(scenario.device) if each else scenario.channels
+        per_device = len(args.varying_delay) == len(scenario.device)
+        count = len(scenario.device) if per_device else scenario.channels
         pairs = per_channel("--varying-delay", args.varying_delay, count, "ranges")
         changes["lo"], changes["hi"] = zip(*pairs, strict=True)
     changes |= {name: value for name in ("loss", "playout") if given(value := getattr(args, name))}

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # loaded only by commands that need them
 # The terminal and progress bars. Rich is imported where it prints, because --help does not need it.
 
 
-_SHORT_NAME = 24  # characters of a row's name that are never broken
+_SHORT_NAME = 24  # longest name of a row, in characters, that is never broken
 
 
 def console(args: argparse.Namespace) -> Screen:
@@ -88,7 +88,7 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 
 
 # ----------------------------------------------------------------------------------------------------
-# A whole report: files, tables, lines below them, JSON.
+# Reports: files, tables, lines below them, and JSON.
 
 
 def publish(
@@ -214,7 +214,7 @@ def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:
 
 
 def rows_of(report: Any) -> Rows:
-    """Yield the figures of a report as rows; those that are None are left out."""
+    """Yield a row (name, text) for each figure of a report; the text is None for a figure without a value."""
     for one in fields(report):
         value, form = getattr(report, one.name), one.metadata.get("form")
         if form is not None:
@@ -274,11 +274,11 @@ def transparency_error(figures: Transparency) -> str:
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
 
-_MUCH = 2.0  # times the damping that is needed nearby: then the report says what helps
+_MUCH = 2.0  # ratio of required to available damping nearby, above which the report proposes --ranges
 
 
 def robustness_rows(nearby: Nearby) -> Rows:
-    """Yield what a wrong model of the environment costs, and what a design that allows for it would cost."""
+    """Yield the rows on a wrong model of the environment: the required damping, and the cost of a robust design."""
     if there := nearby.robustness:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
@@ -289,7 +289,7 @@ def robustness_rows(nearby: Nearby) -> Rows:
 
 
 def price_words(price: Spread) -> str:
-    """Describe what a design for more than one environment reaches and costs."""
+    """Return the mismatch, the cost and the proof of a design for several environments, in words."""
     worse = f"at most {price.price_db:.2f} dB worse" if price.price_db >= 0 else f"{-price.price_db:.2f} dB better"
     costs = worse if math.isfinite(price.price_db) else "not exact"
     proved = f"proved in {price.proved} of {price.environments} environments"

@@ -1,4 +1,4 @@
-"""python -m sim.run: close the loop once and say what happened, with figures and a picture."""
+"""python -m sim.run: close the loop once, and report stability, transparency and error with a picture."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
         "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
         "CPU s": "{r.cpu_s:.3f}",
-        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # too short for the clock
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # below the clock's resolution
     }
     title = "speed against error on this scene (*: the cheapest that keeps --error, this run)"
     return render.columns(title, cells, engines)

@@ -1,4 +1,4 @@
-"""The terminal of reports, which cuts no number of a table and reads no name as markup."""
+"""The terminal of reports, which never cuts numbers in tables and prints names literally."""
 
 from __future__ import annotations
 

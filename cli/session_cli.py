@@ -1,4 +1,4 @@
-"""What hw.bridge and hw.identify share: options, the keyboard, and the session from HELLO to its end."""
+"""Parts of hw.bridge and hw.identify: options, the keyboard, and the session from HELLO to its end."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] beside the run, after which a rehearsal ends by itself
-_SHOWN_US = 100_000  # of a rehearsal, between two moves of its progress bar
+_SPARE = 600.0  # [s] added to the run, after which a rehearsal ends by itself
+_SHOWN_US = 100_000  # [us] of virtual time between two moves of a rehearsal's progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 
 
 def add_link_options(parser: options.Parser) -> None:
-    """Add options for the device, its line, and how its delay is judged."""
+    """Add options for the device, its link, and the measurement of its delay."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
@@ -109,7 +109,7 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
     if args.port and not args.deadman and not args.no_dead_man:
-        args.deadman = "key"  # the least that a live device asks for
+        args.deadman = "key"
     if args.deadman and args.no_dead_man:
         raise InputError("--no-dead-man contradicts --deadman: give one of them")
     if args.deadman == "key" and not sys.stdin.isatty():
@@ -118,7 +118,7 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 
 def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
-    """Return the speed at which a session stops, where the damping is known. Raises InputError."""
+    """Return the speed [m/s or rad/s] at which a session stops. Raises InputError if the damping is unknown there."""
     known = scenario.lever * min(device.credible_speed for device in scenario.axis_devices)
     if args.max_speed is None:
         return min(1.0, known) / scenario.lever
@@ -131,21 +131,21 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Return whether a file was touched since the last call; False if there is no such file."""
-    last = [_mtime(path)]
+    """Return a function that tells whether a file was touched since its last call; False if there is no such file."""
+    last = _mtime(path)
 
     def touched_again() -> bool:
-        now, before = _mtime(path), last[0]
-        last[0] = now
-        return now is not None and now != before
+        nonlocal last
+        before, last = last, _mtime(path)
+        return last is not None and last != before
 
     return touched_again
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Return a function that tells whether the file of --deadman was touched; keys are read elsewhere.
+    """Return a function that tells whether the file of --deadman was touched; the driver reads the keys itself.
 
-    None where no one has to be present, or where the device has a switch of its own.
+    Returns None if nobody has to be present, or if the device has its own switch.
     """
     if named in (None, "device"):
         return None
@@ -171,7 +171,7 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
 def _baud(args: argparse.Namespace) -> int | None:
     """Return the speed of the UART in the line, or None without a UART.
 
-    A pseudo-terminal has none. /dev/ttyACM0 may be native USB, or a USB chip with a UART behind it: a UART is assumed.
+    A pseudo-terminal has no UART. /dev/ttyACM0 may be native USB or a USB chip before a UART; a UART is assumed.
     """
     if args.baud is None:
         pseudo = not args.port or all(os.path.realpath(path).startswith("/dev/pts/") for path in _ports(args))
@@ -184,7 +184,7 @@ def _baud_or_none(text: str) -> int:
 
 
 def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ...]:
-    """Return the ticks (m,) by which forces act later than the link's delay: none with one port. Raises InputError."""
+    """Return the ticks (m,) by which forces act later than the link's delay; () with one port. Raises InputError."""
     count, devices = len(_ports(args)), len(scenario.device)
     if count < 2:
         return ()
@@ -198,19 +198,19 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
 
 
 def _ports(args: argparse.Namespace) -> list[str]:
-    """Return the paths of --port; a host that is the clock has none."""
+    """Return the paths of --port; empty if the host gives the clock, because then no serial port is open."""
     port: str = args.port or ""
     return [] if host_clocked(args) else port.split(",")
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Return whether the host gives the clock, because the device has none."""
+    """Return whether the host gives the clock, because the device has no clock."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
 @dataclass(frozen=True)
 class _Held:
-    """Signals that came during the session, and how many bytes the port did not take at once."""
+    """Signals that came during the session, and the number of bytes that the port did not take at once."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -227,7 +227,7 @@ def hold_session(
 ) -> _Held:
     """Run a session from opening the port to its end, or in virtual time with an emulated device.
 
-    Where nobody is to hold an emulated device, `alone` is its scenario; `coulomb` [N] is its dry friction.
+    `alone` is the scenario of an emulated device that nobody holds; `coulomb` [N] is its dry friction.
     """
     with ExitStack() as stack:
         incidents = IncidentLog(out / "incidents.jsonl")
@@ -241,17 +241,17 @@ def hold_session(
                 problems = preflight(_ports(args))
             console(args).print(problems, soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        seen = sys.stderr.isatty()
-        if seen and keyboard is not None:
+        on_terminal = sys.stderr.isatty()
+        if on_terminal and keyboard is not None:
             console(args).print("keys: a arm · s stop · space e-stop · q quit")
 
         def watch(session: Session) -> None:
             incidents.update(session)
-            if seen:
+            if on_terminal:
                 _show(session)
 
         def planned(ages: Ages) -> Sequence[Armable]:
-            _clear()  # for what a plan prints
+            _clear()  # because a plan prints lines
             for path, own in zip(_ports(args), device.ages if isinstance(device, Boards) else (), strict=False):
                 at = {p: round(float(np.percentile(own, p))) for p in (50, 99)}
                 console(args).print(f"{path}: answers are {at[50]} us old, {at[99]} us at the 99th percentile")
@@ -265,7 +265,7 @@ def hold_session(
 
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
-    """Open the device behind the port, for as long as the stack."""
+    """Open the device behind the port; the stack closes it."""
     if host_clocked(args):
         adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
         if not adapter.guarded:
@@ -285,12 +285,12 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
 
 
 def _wait_for_any(ports: Sequence[SerialPort], seconds: float) -> None:
-    """Wait until a port has something to read, at the latest after so many seconds."""
+    """Wait until a port has something to read, at most for `seconds`."""
     select.select(ports, [], [], seconds)
 
 
 def _ask_for_clamp(axes: str) -> None:
-    """Ask whether a mechanical clamp holds these axes. Raises InputError where it does not, or nobody can answer."""
+    """Ask whether a mechanical clamp holds these axes. Raises InputError for "no", and if nobody can answer."""
     library = "the library's regulation (drd) locks x, y and z of a device together and cannot hold them"
     if sys.stdin.isatty():
         answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold them? [y/n] ")
@@ -331,7 +331,7 @@ def _rehearsed(
 
 
 def _show(session: Session) -> None:
-    """Write one line over the one before, where the terminal takes it without waiting."""
+    """Overwrite the status line, unless the terminal would block."""
     words, drive, counters = [str(session.stage)], session.drive, session.counters
     if session.stage == Stage.MEASURING:
         words.append(f"{len(session.measurement.ages)} of {session.settings.measure} answers")
@@ -340,7 +340,7 @@ def _show(session: Session) -> None:
     elif drive and drive.x:
         words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")
-    elif session.info and session.link.last:  # signs and sizes are looked at before anything is armed
+    elif session.info and session.link.last:  # The user checks signs and sizes before arming.
         words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)]
     words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
     words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]
@@ -363,5 +363,5 @@ def _keys() -> Iterator[int]:
     try:
         yield keyboard
     finally:
-        with suppress(termios.error):  # it may have been closed
+        with suppress(termios.error):  # The terminal may be closed.
             termios.tcsetattr(keyboard, termios.TCSANOW, before)

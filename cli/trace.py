@@ -11,7 +11,7 @@ from haptic_loop.design.files import check_file
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
 
-_ZOOM_HZ = 10.0  # without an oscillation the picture shows six periods of this frequency
+_ZOOM_HZ = 10.0  # frequency of the picture's zoom if nothing oscillates
 
 
 @dataclass(frozen=True)

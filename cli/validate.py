@@ -1,4 +1,4 @@
-"""python -m sim.validate: does the verdict hold for everyone? Random passive humans, both engines, an adversary."""
+"""python -m sim.validate: test a loop with random passive humans in both engines, and with an adversary."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
+    """Test random humans. 0: all claims hold, 1: a claim does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     args.humans = args.humans or (_IN_A_WORLD if is_world(scenario) else _HUMANS)
@@ -154,20 +154,17 @@ class _Searched:
     """Results of the adversary; None without --adversary, or if Ctrl-C ended its search."""
 
     worst: Worst | None = None
-    drawn: Worst | None = None  # the worst that the scenario's own population draws
-    ratio: float = 0.0  # required over available damping of the loop that was attacked
+    drawn: Worst | None = None  # the worst human of the scenario's own population
+    ratio: float = 0.0  # required over available damping of the attacked loop
     interrupted: bool = False
-
-
-#: conditions for the environment of the loop
-_OF_HERE = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
     """Search the worst humans in the environment that needs the most damping, until Ctrl-C or the end."""
     from haptic_loop.sim.adversary import search, search_population
 
-    judged = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
+    here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
+    judged = [need for need in assessment.requirements.values() if need.condition in here]
     scenario, ratio = question.scenario, min(need.ratio for need in judged)
     if question.environments and assessment.ranges:
         member, requirement = assessment.ranges.worst_found
@@ -195,7 +192,7 @@ def _save(
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
         crowd = question.crowd(i)
-        if not isinstance(crowd.humans(0)[0], Human):  # A class of the user's own draws this hand again.
+        if not isinstance(crowd.humans(0)[0], Human):  # No file can hold a hand of a user's own class.
             continue
         remark = f"seed {question.seed}, index {i}"
         mechanics = crowd.mechanics[0] if crowd.mechanics else ()
@@ -309,16 +306,16 @@ def _reported(
     wall: float,
     searched: _Searched,
 ) -> _Report:
-    """Return the report, and whether all of its claims hold."""
+    """Return the report; `holds` says whether all claims hold."""
     scenario, any_done = question.scenario, bool(findings.index.size)
     guarantee = assessment.guarantee
     certified = guarantee is not None
-    if question.environments:  # of the ranges
+    if question.environments:  # The humans meet environments of the ranges.
         certified = guarantee is not None and guarantee.environments in (ANY, RANGES)
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
-    # W counts delta dx^2/T, which a proof for known devices does not need
+    # W counts delta dx^2/T, and a proof for known devices does not bound this sum.
     energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
     switching, timing = _varying(question, chosen, assessment, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))

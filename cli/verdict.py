@@ -50,7 +50,7 @@ def assessment_of(
 # The verdict.
 
 
-#: environments of a guarantee -> what a user touches
+#: environments of a guarantee -> the touched objects in words
 _OBJECTS = {
     ANY: "any passive object",
     RANGES: "every vertex of the ranges (between them searched, not proved)",
@@ -66,7 +66,7 @@ def verdict(
     force_error: float | None = None,
     encoder: EncoderSteps | None = None,
 ) -> str:
-    """Say in one or two sentences for whom the loop is stable, what is felt, and what would end it.
+    """Return the verdict in one or two sentences: hands and objects of the guarantee, felt stiffness, restrictions.
 
     Args:
         assessment: The assessment of exactly the loop that the command runs or judges.

@@ -1,4 +1,4 @@
-"""python -m sim.view: the loop in real time in MuJoCo's viewer, or as a film where there is no display."""
+"""python -m sim.view: the loop in real time in MuJoCo's viewer, or as a film without a display."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     require_even_ticks(scenario, "sim.view")
     if args.video:
         check_film(Path(args.video))
-        if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second
+        if args.video.endswith(".gif") and 100 % args.fps:  # A GIF counts in hundredths of a second.
             raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
     if is_world(scenario):
         args.coupling, args.duration = args.coupling or "moving-average", args.duration or scenario.duration
@@ -183,11 +183,11 @@ def _parser() -> options.Parser:
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
     """Return the first coupling by the user's name, and the script after it. Raises InputError."""
     label = _label(args)
-    told = args.video and args.coupling is None and args.case != "none"
-    text = args.script if args.script is not None else _SCRIPT if told else None
+    usual = args.video and args.coupling is None and args.case != "none"
+    text = args.script if args.script is not None else _SCRIPT if usual else None
     script = () if text is None else parse_script(text, channels)
     if script and script[0][0] == 0 and isinstance(script[0][1], Couple):
-        return script[0][1].name, script[1:]  # the only coupling that is needed first
+        return script[0][1].name, script[1:]
     return label, script
 
 

@@ -1,4 +1,4 @@
-"""What commands say of a MuJoCo world: sim.run, sim.validate, design and design.audit, for scenarios with a world."""
+"""The commands sim.run, sim.validate, design and design.audit for scenarios with a MuJoCo world."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Report:
-    """What every command says of a coupling in a world; SI units."""
+    """The report of every command on a coupling in a world; SI units."""
 
     scenario: str
     scenario_digest: str
@@ -86,7 +86,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """Return W0 [J] of --energy-budget. Raises InputError for a cap, which the account of a world does not have."""
+    """Return W0 [J] of --energy-budget. Raises InputError for a cap, because the account of a world has none."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget
@@ -129,7 +129,7 @@ _WRITTEN = ("scene.xml", "world.xml")  # the devices, and the scene with its spr
 
 
 def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Run a scenario with a world and report it; 0, or 130 where it was interrupted."""
+    """Run a scenario with a world and report it. 0: the run was completed, 130: interrupted."""
     for name in ("paper", "cross_check", "error", "vertex"):
         if getattr(args, name, None):
             shown = name.replace("_", "-")
@@ -193,7 +193,7 @@ def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Ite
 
 
 def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Throw random and lossless hands at a world. 0: none was given more than the account, 1: one was."""
+    """Throw random and lossless hands at a world. 0: the energy account holds for all, 1: not."""
     if args.adversary:
         raise InputError("--adversary: of a world, `design.audit` reports what adversaries reached")
     if args.duration == 0:
@@ -238,16 +238,16 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     loop, kind = scenario.loop(args.case), args.coupling
     condition = args.condition or ANY_ENVIRONMENT.name
     with options.refused(args=args), render.designing(loop, kind, condition) as progress:
-        design_made = proved(loop, design_by_kind(loop, kind, condition, progress))
-    filed = store(loop, design_made, out)
-    report = _reported(args, scenario, replace(design_made, kind=kind), START_J)
+        designed = proved(loop, design_by_kind(loop, kind, condition, progress))
+    filed = store(loop, designed, out)
+    report = _reported(args, scenario, replace(designed, kind=kind), START_J)
     rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
     _publish(args, report, report.guarantee, rows)
     return options.exit_code(report.guaranteed)
 
 
 def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Path) -> int:
-    """Say what is in a scene and what adversaries reached. 0: the coupling is certified for any environment, 1: not."""
+    """Report the parts of a scene and the energy that adversaries gained. 0: the run is guaranteed, 1: not."""
     began = time.perf_counter()
     report = _reported(args, scenario, chosen, START_J)
     with render.progress("attacking"):

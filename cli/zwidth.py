@@ -28,8 +28,8 @@ _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
-_PRESS = 3.0  # [N] steady force of a hand; the soft environments of a map over environments give way to it
+_FINEST = 1e-5  # [m] least amplitude of an oscillation, the resolution of a desk device's encoders
+_PRESS = 3.0  # [N] steady force of a hand in maps of couplings; soft environments would yield to it
 
 
 def main(argv: list[str]) -> int:
@@ -146,7 +146,7 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep, of_coupling: bool) -> P
 
 
 def _verdict(report: MapReport) -> str:
-    """Return what share of the map each condition certifies, and what share random hands leave stable."""
+    """Return the share of the map that each condition certifies, and the share that is stable with random hands."""
     shares = ", ".join(f"{_share(report.ratios[name].certified_cells, report)} ({name})" for name in report.conditions)
     crowd = report.population
     return (
@@ -177,10 +177,10 @@ def _share(count: int, report: MapReport) -> str:
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     """Yield the rows of the fixed coupling in the environment of its design."""
-    needs_by_name, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
+    requirements, guarantee = fixed.assessment.requirements, fixed.assessment.guarantee
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})"
-        for name, need in needs_by_name
+        for name, need in requirements.items()
         if need.margin
     )
     yield "coupling", f"{fixed.kind}, fixed"

@@ -1,4 +1,4 @@
-"""`from design import design_coupling, certify, ..`: what python -m design does, for scripts. SI units."""
+"""`design_coupling`, `certify` and `transparency_of` for scripts, as in python -m design. SI units."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from haptic_loop.design.result import ConditionName, Design, NotProved, Requirem
 from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
-
-
 _LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
@@ -35,12 +33,12 @@ class DesignOptions(TypedDict, total=False):
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl: no gain across channels
-    switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
-    limiter: bool  # spring-damper and optimal for this-environment: whether limited forces are covered (the default)
+    switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
+    limiter: bool  # spring-damper and optimal for this-environment: cover limited forces, too (the default)
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal, spring-damper for this environment: band of the mismatch
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: no limit, but a small gain
-    seconds: float  # optimal: no larger basis is tried later than this
+    seconds: float  # optimal: time after which no larger basis is tried
 
 
 def design_coupling(
@@ -49,23 +47,29 @@ def design_coupling(
     condition: ConditionName | Condition | None = None,
     **options: Unpack[DesignOptions],
 ) -> Design:
-    """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
+    """Design a coupling for a loop.
 
-    `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
-    also while forces are limited; for any environment before walls, ranges or delays that vary. A Condition of your own
-    (design.conditions) must hold beside the kind's usual one. `options` are those of the kind, see DesignOptions;
-    switching is not taken from loop.varying_delay.
+    Args:
+        loop: The loop, `scenario.loop("I")`.
+        kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
+        condition: The name of a condition, or your own Condition (design.conditions), which must hold beside the usual
+            one of the kind. None is the default of the commands: this-environment, also while forces are limited, and
+            any-environment for spring-dampers before walls, ranges or varying delays.
+        options: Options of the kind (DesignOptions). The range of switching delays must be given here; it is not taken
+            from loop.varying_delay.
 
-    Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
-    that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
+    Returns:
+        A Design: `coupling` (a spring-damper has K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the required damping,
+        from a sweep of the coupling alone), `figure` and `objective` (the name of the minimised figure, and its value).
 
-    Raises TypeError for an argument of another type or an option that the kind does not have, ValueError for a kind,
-    condition or loop that makes no sense, DesignFailed where no such coupling exists.
+    Raises:
+        TypeError: An argument has the wrong type, or the kind does not have an option.
+        ValueError: The kind, the condition or the loop is impossible.
+        DesignFailed: No such coupling exists.
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
-    named(condition or usual_condition(loop, kind))  # refuses a taken name
+    named(condition or usual_condition(loop, kind))  # raises ValueError if an own condition has a taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
     design = design_by_kind(loop, kind, condition, **options)
     return replace(design, certified_for=certified_for(loop, design.requirement.certified))
@@ -77,7 +81,7 @@ def certified_for(loop: Loop, certified: bool) -> str:
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: alternatives that are designed quickly; of the optimal coupling the smallest basis
+#: quick designs; "seconds" 0 limits the optimal coupling to its smallest basis
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
@@ -87,9 +91,9 @@ _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
 
 
 def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> str:
-    """Return the alternatives to a design that failed, in words, least rms mismatch first, or "".
+    """Return the alternatives to a failed design in words, least rms mismatch first, or "".
 
-    Every other kind and condition is designed and certified here. For delays that vary nothing is tried.
+    Each alternative is designed and certified here. Nothing is tried for varying delays.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for other, target, options in _QUICK:
@@ -107,21 +111,24 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
 
 
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
-    """Judge a coupling in its loop by both conditions, "any-environment" and "this-environment".
+    """Judge a coupling in its loop by "any-environment" and "this-environment".
 
-    Beside them that of the design, or a `condition` of your own, under its name.
+    The condition of the design, or your own `condition`, is judged, too. With loop.varying_delay there is a further
+    entry "switching" for any switching of the delays within that range.
 
-    With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
-    that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
-    violation found there (design.worst_member) is the figure then, and not certified. With a range of delays,
-    loop.varying_delay, there is a third, "switching": what any switching within the range asks.
+    With ranges around the loop's environment, "this-environment" covers the environment and every vertex of the ranges.
+    The figure is the largest of them, and it is proved only if all are proved. Between the vertices a search replaces
+    the proof (design.worst_member); a violation there becomes the figure and is not certified.
 
-    Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
-    where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
-    A condition that no damping satisfies has infinite `required` and a `reason`.
+    Returns:
+        A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
+        the frequency [Hz] at which it binds, and `proof`: "rational" for exact arithmetic, "sampled" for a refined
+        sweep. A condition that no damping satisfies has an infinite `required` and a `reason`.
 
-    Raises TypeError for an argument of another type, ValueError where coupling and loop do not fit each other,
-    SingularLoop where their algebraic loop has no solution.
+    Raises:
+        TypeError: An argument has the wrong type.
+        ValueError: Coupling and loop have different numbers of channels.
+        SingularLoop: The algebraic loop of environment and coupling has no solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
     own = coupling.own if isinstance(coupling, Design) else None
@@ -144,10 +151,12 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
     """Return figures of the mismatch (8), M = F - Lambda E, in the loop's environment with all walls touching.
 
-    `mismatch_db` is the largest share of M in the environment over `band_hz`, `rms_mismatch_db` the mean one; 0 dB is
-    as wrong as no force. `dc_ratio` is the rendered share of the static stiffness.
+    `mismatch_db` is the largest ratio of M to the environment over `band_hz`, `rms_mismatch_db` its rms; 0 dB is as
+    wrong as no force. `dc_ratio` is the rendered share of the static stiffness.
 
-    Raises TypeError and ValueError as `certify` does.
+    Raises:
+        TypeError: An argument has the wrong type.
+        ValueError: Coupling and loop have different numbers of channels.
     """
     of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
@@ -155,7 +164,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
 @dataclass(frozen=True)
 class _SwitchingFiled:
-    """The guarantee for delays that vary, with its proof or the reason why there is none."""
+    """The guarantee for varying delays, with its proof or the reason why there is none."""
 
     guarantee: str = off_table()
     proof: str | None = off_table()
@@ -174,7 +183,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its certificate; over ranges unchanged, because they have to be searched first."""
+    """Return the design with its certificate; with ranges or varying delays it is returned unchanged."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -189,10 +198,10 @@ def store(
     path: Path,
     assessment: Assessment | None = None,
 ) -> Filed:
-    """Save the coupling with the proof of its condition and of limited forces in `assessment`, if they are proved.
+    """Save the coupling with its proof; `assessment` may bring proofs for ranges and for limited forces.
 
-    Without a proof for the ranges or for switching delays the file is for the nominal environment or for constant
-    delays. Raises InputError if the file cannot be written.
+    Without a proof for the ranges the file is for the nominal environment; without one for switching delays it is for
+    constant delays. Raises InputError if the file cannot be written.
     """
     ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
@@ -216,9 +225,8 @@ def store(
 
 def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Certificate | None, str | None]:
     """Return (the certificate of the design in this loop or None, the reason why there is none)."""
-    held = design.certificate
     limited = limiter if named(design.asked).extensible else None
-    for certificate in (limited, held):
+    for certificate in (limited, design.certificate):
         if certificate and certificate.scenario == digest(loop, design.coupling.form()):
             return certificate, None
     try:
@@ -232,11 +240,7 @@ def _certificate(loop: Loop, design: Design) -> Certificate:
     if design.c:
         limiter = LimitedForces(lags=len(design.c[0]))
         return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])
-    return prove(loop, design.coupling, design.asked, _multiplier(design))
-
-
-def _multiplier(design: Design) -> list[float] | None:
-    return None if design.phi is None else design.phi.tolist()
+    return prove(loop, design.coupling, design.asked, None if design.phi is None else design.phi.tolist())
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

@@ -1,10 +1,10 @@
-"""A coupling in a loop, assessed: what its conditions require, what is proved, and for whom the loop is safe.
+"""The assessment of a coupling in a loop: requirements of the conditions, proofs, and the guarantee.
 
     assessment = assess(scenario.loop("I"), coupling)
     assessment.guarantee  # a Guarantee, or None: assessment.reason then says why there is none
 
-Every command that names a guarantee takes it from such a record of exactly the loop, coupling, environment and force
-limits that run. Where one of them changes, `assess` has to be called again.
+Every command takes its guarantee from an Assessment of exactly the loop, coupling, environment and force limits that
+run. If one of them changes, `assess` must be called again.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotP
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-PluggedEnvironment = Callable[[Array], Array]  # where the port would be without force, (m,) [m] -> its force (m,) [N]
+PluggedEnvironment = Callable[[Array], Array]  # positions of the port without a force, (m,) [m] -> force (m,) [N]
 
 
 # ----------------------------------------------------------------------------------------------------
 # The environments of ranges.
 
 
-SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at
+SAMPLES = 64  # default number of environments that are drawn evenly from inside the ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +66,9 @@ class RangesResult:
         at_members: The requirement of each member.
         samples: Environments drawn from inside the ranges.
         at_samples: The requirement of each sample.
-        vertices: The number of vertices of the ranges; of more than 128 vertices only so many are members.
+        vertices: The number of vertices of the ranges; at most 128 of them are members.
         searched: The search between the vertices.
-        at_found: The requirement at the worst environment that the search has found.
+        at_found: The requirement at the worst environment of the search.
         seed: The seed of the samples.
         certificate: The Certificate for all members, with the guarantee "these ranges", or None.
         reason: Why the ranges are not guaranteed, or None.
@@ -129,7 +129,7 @@ class RangesResult:
 
 @dataclass(frozen=True)
 class SearchFigures:
-    """What the search between the vertices has found: evidence, no proof."""
+    """The figures of the search between the vertices, which is evidence and no proof."""
 
     environments: int
     worst_ratio: float
@@ -161,11 +161,11 @@ def check_ranges(
     certificate: Certificate | None = None,
     condition: Condition = THIS_ENVIRONMENT,
 ) -> RangesResult | None:
-    """Check a coupling over the ranges of its loop by this-environment or known-device; None where it has none.
+    """Check a coupling over the ranges of its loop by this-environment or known-device; None without ranges.
 
-    The search is the same every time; `samples` more environments are drawn from inside, by the seed. A design that
-    has already searched, or proved the ranges, passes `searched` and `certificate`. One set of multipliers serves all
-    environments, those between the vertices included.
+    The search is deterministic; `samples` more environments are drawn from inside, by the seed. `searched` and
+    `certificate` are the search and the proof of an earlier call or design. One set of multipliers serves all
+    environments, including those between the vertices.
     """
     if loop.ranges is None:
         return None
@@ -206,8 +206,7 @@ def _proved_ranges(
 ) -> tuple[Certificate | None, str | None, Sequence[Any] | None]:
     """Return (the certificate for all members or None, the reason why there is none, the multipliers)."""
     if certificate and certificate.guarantee == RANGES and certificate.condition == condition.name:
-        asked = condition_of(certificate)
-        values = on_file(asked, loop, certificate.multipliers)
+        values = on_file(condition_of(certificate), loop, certificate.multipliers)
         return certificate, None, values[: sum(condition.multiplier_sizes(loop).values())] if values else None
     swept = required_damping(loop, coupling, condition) if condition.multiplier_sizes(loop) else None
     multiplier = swept.multiplier if swept else None
@@ -218,7 +217,7 @@ def _proved_ranges(
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Explain why ranges are not guaranteed although every vertex is proved: a point between them violates."""
+    """Return the reason why ranges with proved vertices are not guaranteed: a violation between the vertices."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"
 
@@ -227,23 +226,23 @@ def violated_between(place: Member, ratio: float) -> str:
 # Forces at their limits.
 
 
-_OWN_PROOF = "by a proof of its own, for this environment"
+_OWN_PROOF = "by a proof of its own, for this environment"  # part of a printed line
 
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """How forces are limited, and whether a condition holds while they are limited.
+    """The limiter or the clipping of forces, and the condition that covers it.
 
     Attributes:
-        rho: (m,) stiffnesses of the limiter [N/m]; None where no condition covers it, so that the tick clips.
+        rho: (m,) stiffnesses of the limiter [N/m]; None if no condition covers a limiter, so that forces are clipped.
         reason: Why a condition covers limited forces, or why none does.
-        requirement: The requirement of the condition `limiter`, where it was evaluated.
-        c: The multiplier of that condition, one row per channel, no unit.
-        certificate: The proof of that condition, or None.
+        requirement: The requirement of the condition `limiter`, if it was evaluated.
+        c: The multiplier of the condition `limiter`, one row per channel, no unit.
+        certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
-        less: Whether it is proved in one environment, while the guarantee holds in more.
-        energy_budget: The energy W0 [J] that forces may give in all; None without a budget.
-        void: Whether nothing is guaranteed of the loop that runs, so that the limiter's proof says nothing of it.
+        less: Whether the limiter is proved in one environment, while the guarantee holds in more.
+        energy_budget: The energy W0 [J] that forces may give in total; None without a budget.
+        void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
     """
 
     rho: tuple[float, ...] | None
@@ -296,10 +295,10 @@ def covered_limits(
     proof: Certificate | None = None,
     known: Certificate | None = None,
 ) -> ForceLimits:
-    """Find the limiter that a condition covers: without lag under any-environment, else that of this-environment.
+    """Return the limiter that a condition covers: one without lag, or else that of this-environment or known-device.
 
-    The limiter of `proof` is used if the proof holds in this loop; otherwise one of the same beta is searched. The
-    proof of `known` is not repeated (design.certificate.recheck).
+    The limiter of `proof` is used if the proof holds in this loop; otherwise a limiter of the same beta is searched.
+    The proof of `known` is not repeated (design.certificate.recheck).
     """
     for each in requirements.values():
         if each.certified and each.lag is not None:
@@ -321,14 +320,14 @@ _EXTENDED = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name  # conditions that have a b
 def _by_its_own_block(
     loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None, base: str
 ) -> ForceLimits:
-    """Find the limiter of the condition `base`."""
+    """Return the limiter that extends the condition `base` to limited forces, or clipping with the reason."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
             c = _rows(condition, loop, requirement)
             return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof)
-        except NotProved:  # made for another loop
+        except NotProved:  # The proof belongs to another loop.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
     limiter = LimitedKnownDevice(plain) if base == KNOWN_DEVICE.name else plain
@@ -354,7 +353,7 @@ def _rows(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The guarantee, and the record that it belongs to.
+# The guarantee and the assessment.
 
 
 @dataclass(frozen=True)
@@ -362,15 +361,16 @@ class Guarantee:
     """The hands, environments and forces for which a coupling keeps its loop safe.
 
     Attributes:
-        condition: The condition by which it holds, or "energy-budget".
+        condition: The condition that gives the guarantee, or "energy-budget".
         proof: "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick.
-        facts: What the condition covers beside a linear environment (Assessment.facts).
-        hands: The hands for which it holds, in words.
+        facts: Properties of the loop that the condition covers (Assessment.facts).
+        hands: The hands that the guarantee covers, in words.
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", or the restriction.
         delays: The delays of the forces [samples], lo and hi (m,); any of them at every tick.
         periods: The longest period [s].
-        energy_J: The energy [J] that a hand may be given beyond what the devices dissipate; None: it comes to rest.
+        energy_J: Bound of the energy [J] that a hand receives beyond the dissipation of the devices; None: the loop
+            comes to rest.
     """
 
     condition: str
@@ -388,12 +388,12 @@ class Guarantee:
 
     @property
     def any_environment(self) -> bool:
-        """Whether it holds whatever passive environment is touched."""
+        """Whether the guarantee holds for every passive environment."""
         return self.environments == ANY
 
     @property
     def words(self) -> str:
-        """One line for a report: for whom and where the loop is safe."""
+        """One line for a report: the environments of the guarantee, and the energy if it is bounded."""
         if self.energy_J is not None:
             join = "" if self.environments.startswith("and ") else ","
             amount = f"more than {self.energy_J:g} J" if self.energy_J else "any energy"
@@ -411,20 +411,20 @@ class Guarantee:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """A coupling in a loop, assessed. Every report of a coupling and every run begins with this record.
+    """The assessment of a coupling in a loop, the record behind every report and every run.
 
     Attributes:
         loop: Devices, delays and environment of the conditions.
         coupling: The coupling as it runs.
-        requirements: Per condition the required and the available damping (m,) [N s/m], and where it binds [Hz].
-        environment: The environment that runs: a network, or a function that is plugged in.
-        ranges: Every vertex of the ranges, and the search between them; None without ranges.
+        requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition.
+        environment: The environment that runs: a network, or a plugged-in function.
+        ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
-        transparency: The mismatch; None where the environment has no E(z), or the loop no solution.
+        transparency: The mismatch; None if the environment has no E(z) or the loop has no solution.
         certificate: The exact proof, if one was given or made for the ranges.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold; the others are reported only.
+        condition: The name of the condition that must hold; other conditions are reported only.
     """
 
     loop: Loop
@@ -454,7 +454,7 @@ class Assessment:
 
     @property
     def holds(self) -> bool:
-        """Whether the condition that must hold is certified, with a guarantee for all of the loop's properties."""
+        """Whether the required condition is certified, with a guarantee that covers all properties of the loop."""
         if self.guarantee is None or not self.decisive.certified:
             return False
         return self.loop.ranges is None or self.guarantee.environments in (ANY, RANGES)
@@ -466,11 +466,11 @@ class Assessment:
 
     @property
     def held_torques(self) -> str | None:
-        """A remark on held torques of devices with several axes, which conditions do not charge, or None."""
+        """A remark on held torques of devices with several axes, which no condition counts, or None."""
         return "not charged: forces count as held in space while the pose moves on" if self.loop.axes else None
 
     def without_guarantee(self, reason: str) -> Assessment:
-        """Return the record without its guarantee, for a reason that the loop does not describe."""
+        """Return the assessment without its guarantee, for a reason outside the loop's data."""
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
@@ -514,17 +514,18 @@ def assess(
 
     Args:
         loop: The loop; ranges, switching delays, latency and longest period must all be covered.
-        coupling: The coupling as it runs; a Design also brings its condition, proof and search.
+        coupling: The coupling as it runs; a Design also has a condition, a proof and a search.
         environment: The environment that runs, if it is not the loop's: a network, or a function that is plugged in
             behind the coupling and a shell that makes it passive.
-        energy_budget: W0 [J] of the shell before a function (by default 0) or a MuJoCo world (by default 2 mJ), else of
-            an energy budget before the delays.
-        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling and was verified
-            here or made in this process.
-        condition: The condition that must hold, by name or of the user's own; by default this-environment, and
-            known-device where the loop has bounds of its devices.
-        ranges_seed: Seed of the `ranges_samples` environments that are drawn from inside the ranges.
-        searched: A search between the vertices that a design has already made for this loop and coupling.
+        energy_budget: W0 [J] of the shell before a function (default 0) or a MuJoCo world (default 2 mJ), or of an
+            energy budget before the delays.
+        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling, and if this
+            process has verified or made it.
+        condition: The condition that must hold, by name or a user's own. The default is this-environment, or
+            known-device if the loop has bounds of its devices.
+        ranges_seed: Seed of the environments that are drawn from inside the ranges.
+        ranges_samples: Number of these environments.
+        searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
         force_limit: (m,) [N], for reports; no proof depends on it.
@@ -580,7 +581,7 @@ def assess(
         wanted_condition.name,
     )
     guarantee, reason = _guarantee(assessment)
-    by_itself = limits.requirement is not None and limits.rho is not None  # The limiter is proved where it runs.
+    by_itself = limits.requirement is not None and limits.rho is not None  # The limiter is proved in `network` only.
     if guarantee and guarantee.environments == RANGES and by_itself and environment is not None:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
         guarantee, reason = _guarantee(assessment)
@@ -597,7 +598,7 @@ def _force_limits(
     proof: Certificate | None,
     known: Certificate | None,
 ) -> ForceLimits:
-    """Find the limiter for a loop, or say why forces are clipped."""
+    """Return the limiter for a loop, or clipping with the reason."""
     if limiter is False:
         return ForceLimits(None, "forces are clipped, as asked")
     return covered_limits(loop, coupling, requirements, proof, known)
@@ -607,7 +608,7 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
     """Return the mismatch, with all walls touching, or None if the environment has no E(z)."""
     try:
         F, E = loop.F(coupling), loop.E()
-    except ValueError:  # a rigid wall has no E(z), and a singular loop no F
+    except ValueError:  # A rigid wall has no E(z), and a singular loop has no F.
         return None
     if too_long(F) or silent(E):
         return None
@@ -625,7 +626,7 @@ def shelled(environment: Environment | PluggedEnvironment) -> bool:
 def _facts_of(
     loop: Loop, environment: Environment | PluggedEnvironment | None = None, limits: ForceLimits | None = None
 ) -> tuple[str, ...]:
-    """Name what a loop has beyond constant delays, even periods and one linear environment, in a fixed order."""
+    """Return the loop's properties beyond constant delays, even periods and one linear environment, in fixed order."""
     network = loop.environment if environment is None or callable(environment) else environment
     plugged = shelled(network if environment is None else environment)
     there = {

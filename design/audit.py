@@ -40,39 +40,37 @@ from haptic_loop.design.worst_member import Progress
 # A coupling in its loop, judged by either condition.
 
 
-#: longest delay [samples]: beyond it a sweep takes seconds, and no device has enough damping
-LONGEST_DELAY = 100
+LONGEST_DELAY = 100  # samples; beyond it a sweep takes seconds, and no device has enough damping
+
+_Condition = ConditionName | Condition
 
 
-_Asked = ConditionName | Condition
-
-
-def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requirement:
+def requirement(loop: Loop, coupling: Coupling, condition: _Condition) -> Requirement:
     """Return the damping that the condition requires of the devices."""
     resolved = named(condition)
     try:
         return resolved.judge(loop, coupling)
     except (TooLong, InputError):
         raise
-    except ValueError as error:  # no solution of the algebraic loop
-        if place_of(error):  # an error in the user's own code
+    except ValueError as error:  # The algebraic loop has no solution, or a user's own code is wrong.
+        if place_of(error):
             raise
         return refusal(resolved.name, loop.delta, str(error))
 
 
 def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
-    """Return `requirement` with some of the loop's fields changed; infinite for an impossible loop."""
+    """Return the requirement of a condition after changes of the loop's fields; infinite for an impossible loop."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
     except TooLong:
         raise
-    except ValueError as error:  # a latency that is longer than the period
+    except ValueError as error:  # The latency may exceed a shorter period.
         return refusal(condition.name, loop.delta, str(error))
 
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
-    """Return `requirement` at another T [s], with the same coefficients and delays in samples."""
-    longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))  # in proportion
+    """Return the requirement at another T [s]; coefficients and delays in samples stay, T_max and T_min scale."""
+    longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest, T_min=shortest)
 
 
@@ -95,9 +93,9 @@ def check_loop(loop: Loop) -> None:
 
 _Ratio = Callable[[float], float]  # required over available damping, of a varied loop
 
-#: ends of the searches for the stiffest K and the largest T, far outside the use of any device
+#: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
-_SOFTEST, _STEP = 1.0, 3.0  # [N/m]; between two stiffnesses tried
+_SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m], and the ratio of two tried stiffnesses
 _EDGE = 1e-7  # relative accuracy of an edge
 _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
@@ -119,13 +117,13 @@ class _Sensitivity:
 
     least_delta: tuple[float, ...] | None = None  # [N s/m]: the required damping
     delta_error: float | None = None
-    largest_T_s: float | None = None  # gains and delays in samples kept
+    largest_T_s: float | None = None  # with the same gains and delays in samples
     T_error: float | None = None
     extra_samples: int | None = None  # of delay, on all channels at once
     reason: str | None = off_table("if given", None)
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
+def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest:
     """Return the largest certified K: a common scale, or channel by channel if the condition is separable."""
     unknown, resolved = (None,) * loop.channels, named(condition)
     gains = coupling.figures(loop.T)
@@ -172,7 +170,7 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
-def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivity:
+def sensitivity(loop: Loop, coupling: Coupling, condition: _Condition) -> _Sensitivity:
     """Return the errors in delta, T and delay that the certificate of this condition tolerates."""
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if not needs.certified:
@@ -222,7 +220,7 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """Return the argument nearest `outside` at which the damping still suffices, to a relative EDGE."""
+    """Return the argument nearest `outside` at which the damping still suffices, to a relative _EDGE."""
     if suffices(ratio(outside)):
         return outside
 
@@ -238,10 +236,10 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
 
 
 def _crossing(f: Callable[[float], float], inside: float, outside: float) -> float:
-    """Return where `f` changes its sign, to a relative _EDGE of the place and of `inside`.
+    """Return the root of `f`, to an error of _EDGE relative to the root and to `inside`.
 
-    Bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997).
-    Importing scipy.optimize for its brentq takes longer than the ten values that either of them asks for.
+    The steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software
+    28, 1997). About ten values of `f` take less time than importing scipy.optimize.brentq.
     """
     a, b = outside, inside
     fa, fb = f(a), f(b)
@@ -279,7 +277,7 @@ class _Remedy:
     requirement: Requirement
 
 
-def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]:
+def remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
     """Return single changes that certify or lower the requirement by 10 %; [] for a certified coupling."""
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
@@ -316,12 +314,11 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
     """Return the largest factor that certifies, in steps of 0.001, or the one with the least requirement."""
-
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
             mildest = edge(lambda x: needs(x).ratio, factor, larger)
-            printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # certified as rounded for the report
+            printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # The printed factor must certify.
             mildest = printable if needs(printable).certified else factor
             return _Remedy(describe(mildest), needs(mildest))
     best = min(_FACTORS, key=lambda x: needs(x).ratio)
@@ -338,7 +335,7 @@ class Margins:
 
 @dataclass(frozen=True)
 class Help:
-    """A change that was tried, and the requirement after it."""
+    """A change that helps, and the requirement after it."""
 
     change: str
     condition: str
@@ -348,7 +345,7 @@ class Help:
 
 @dataclass(frozen=True)
 class Audit:
-    """The assessment of a coupling with its margins, and the changes that help where it fails."""
+    """The assessment of a coupling with its margins, and the changes that help if it fails."""
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the loop's own environment at the constant delays
@@ -361,28 +358,31 @@ class Audit:
 def audit(
     loop: Loop,
     coupling: Coupling,
-    asked: Condition | None = None,
+    condition: Condition | None = None,
     seed: int = 0,
     force_limit: Sequence[float] = (),
     progress: Progress = lambda done, total: None,
 ) -> Audit:
-    """Assess a coupling and measure how far it is from the edge of each condition.
+    """Assess a coupling, with its margins to the edge of each condition.
 
     Args:
         loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
-        asked: The condition that must hold, this-environment if None.
+        condition: The condition that must hold, by default that of `assess`.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
         force_limit: (m,) [N], for the report.
-        progress: Called with (points done, points in all) of the search over ranges.
+        progress: Called with (points done, number of points) of the search over ranges.
 
     Raises:
-        ValueError: Naming the field of the loop that is wrong.
+        ValueError: A field of the loop is wrong; the message names it.
     """
     check_loop(loop)
-    assessment = assess(loop, coupling, condition=asked, ranges_seed=seed, force_limit=force_limit, progress=progress)
+    assessment = assess(
+        loop, coupling, condition=condition, ranges_seed=seed, force_limit=force_limit, progress=progress
+    )
     constant, needs = loop.at(loop.environment).switching(None), assessment.requirements
-    conditions = {name: asked if asked and name == asked.name else named(name) for name in needs if name != "switching"}
+    own = {condition.name: condition} if condition else {}
+    conditions = {name: own.get(name) or named(name) for name in needs if name != "switching"}
     decisive = assessment.condition
     fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
     return Audit(
@@ -396,10 +396,12 @@ def audit(
 
 _SWEEPS = 60  # typical number of sweeps of a search
 
-_Found = TypeVar("_Found")
+_Result = TypeVar("_Result")
 
 
-def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], without: Callable[[str], _Found]) -> _Found:
+def _in_time(
+    loop: Loop, coupling: Coupling, search: Callable[[], _Result], without: Callable[[str], _Result]
+) -> _Result:
     """Return the result of a search by many sweeps, or `without(reason)` if it takes too long."""
     try:
         if reason := too_long(loop.F(coupling), _SWEEPS):

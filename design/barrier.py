@@ -2,9 +2,10 @@
 
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
-The barrier follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x): a strictly feasible point at
-most degree/t above the minimum, degree the total size of the S_k. A Newton step is a least-squares problem in the
-directions S^-1/2 dS S^-1/2, and the best length of a step follows from their eigenvalues without further evaluations.
+The barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is strictly
+feasible and at most degree/t above the minimum, where degree is the total size of the S_k. A Newton step is a
+least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from their eigenvalues
+without further evaluations.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from haptic_loop.design.frequency import hermitian
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
-_KEPT = 0.3  # of an eigenvalue, at least, after a step
-_LONGEST = 1e3  # times the Newton step
-_RIDGE = 1e-9  # of its column: what a direction that neither objective nor inequalities see is charged
+_KEPT = 0.3  # least share of an eigenvalue that a step must leave
+_LONGEST = 1e3  # largest step, in Newton steps
+_RIDGE = 1e-9  # weight, relative to its column, of a direction that neither objective nor inequalities depend on
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class MatrixInequality:
 
     @property
     def products(self) -> int:
-        """The products of a Newton step, about."""
+        """The approximate number of products in a Newton step."""
         k, square, n = self.slope.shape
         return k * square * n * (square + n)
 
@@ -56,7 +57,7 @@ class MatrixInequality:
         return _unpacked(self.constant + self.slope @ x)
 
     def moved(self, step: Array) -> Complex:
-        """Return what a step adds to S, (k, r, r)."""
+        """Return the change of S by a step, (k, r, r)."""
         return _unpacked(self.slope @ step)
 
     def directions(self, x: Array) -> Array:
@@ -82,8 +83,9 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    Unknowns are the X_n, entry by entry, and the x_a. S^-1 weighs all pairs of functions of two entries alike, so that
-    the Hessian is a product of the pairs of functions by the pairs of entries, over the frequencies.
+    The unknowns are the X_n, entry by entry, then the x_a. For two entries of X the weight from S^-1 is the same for
+    all pairs of functions. The Hessian is therefore a matrix product over the frequencies: (pairs of functions) times
+    (pairs of entries).
     """
 
     constant: Array  # (k, r^2): `packed`
@@ -98,7 +100,7 @@ class EntryInequality:
 
     @property
     def products(self) -> int:
-        """The products of a Newton step, about."""
+        """The approximate number of products in a Newton step."""
         (k, n), square, own = self.functions.shape, self.left.shape[-1] ** 2, self.slope.shape[2]
         return k * (n**2 * square**2 + square * own * (square + n * square + own))
 
@@ -107,7 +109,7 @@ class EntryInequality:
         return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
-        """Return what a step adds to S, (k, r, r)."""
+        """Return the change of S by a step, (k, r, r)."""
         r = self.left.shape[-1]
         X, own = np.split(step, [r * r * self.functions.shape[1]])
         filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)
@@ -138,7 +140,7 @@ class EntryInequality:
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
         entries = np.zeros((r * r, n, r * r, n))
         entries[one, :, two] = between
-        # inner products with S^-1 and S^-1 slope_a S^-1
+        # Inner products with S^-1 and S^-1 slope_a S^-1.
         turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
         through = V[:, None] @ _unpacked(np.swapaxes(turned, 1, 2)) @ L[:, None]
         entry = through[:, :, column, row].reshape(k, -1)
@@ -163,7 +165,7 @@ def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """The problem in coordinates y, x = change y, in which its directions are of similar size at the start."""
+    """minimise |A x - b|^2 + c'x under the blocks."""
 
     A: Array  # (rows, n)
     b: Array  # (rows,)
@@ -195,10 +197,10 @@ class Program:
         return all(_definite(block.at(x)) for block in self.blocks)
 
     def conditioned(self, x: Array) -> tuple[Program, Array]:
-        """Return the program in y and the upper triangle U, x = U^-1 y, that balance objective and barrier at x.
+        """Return the program in y = U x, and the upper triangle U that balances objective and barrier at x.
 
-        U is the triangle of the stacked rows of both, so that no inner product is ever formed in the ill-conditioned
-        coordinates of a basis of filters.
+        U is the triangle of a QR decomposition of the stacked rows of both. No inner product is formed in x, the
+        ill-conditioned coordinates of a basis of filters.
         """
         import scipy
 
@@ -234,7 +236,10 @@ def centre(program: Program, x: Array, t: float) -> Array:
 
 
 def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> Array:
-    """Return the feasible point nearest to x on the way from the feasible `start`: x itself if it is feasible."""
+    """Return x if it is feasible, else a feasible point on the way from the feasible `start` to x.
+
+    The point is at `reserve` of the distance from `start` to the boundary.
+    """
     if program.feasible(x):
         return x
     low, high = 0.0, 1.0
@@ -260,9 +265,9 @@ def _solved(hessian: Array, right: Array) -> Array:
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """Return the step length that minimises the barrier function, where no inequality falls by more than allowed.
+    """Return the step length that minimises the barrier function, while every eigenvalue keeps a share _KEPT.
 
-    A point that an exact search has taken close to the boundary leaves it in tiny steps only, along a curve.
+    The share keeps the search away from the boundary, where Newton's method would crawl along a curve.
     """
     along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
     residual, slope = program.A @ x - program.b, program.A @ step
@@ -287,7 +292,7 @@ def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Arra
 
 
 def _turned(W: Complex) -> Array:
-    """Return H -> W H W* of `packed` matrices (k, r^2, r^2); entry a, b is the sum of W_ac conj(W_bd) H_cd."""
+    """Return the map H -> W H W* on `packed` matrices, (k, r^2, r^2); entry a, b is the sum of W_ac conj(W_bd) H_cd."""
     r = W.shape[-1]
     c, d = np.triu_indices(r, 1)
     a, b = np.append(np.arange(r), c), np.append(np.arange(r), d)

@@ -1,22 +1,22 @@
-"""How small the mismatch of any linear coupling can be, of whatever order: a bound by weak duality.
+"""A lower bound, by weak duality, of the mismatch of every linear coupling of whatever order.
 
-Of a certified F only this is used: P(z) = Delta + T F(z)/(z-1) is analytic outside the unit circle with He P >= 0
-there, so S = He P = sum_k s_k z^-k is a positive matrix measure on the circle, s_0 = Delta, and the delays forbid
-some combinations of the first s_k (row i is zero for 1 <= k <= theta_i: no force has arrived). With <X, Y> the mean of
-Re tr X*Y over the circle and w the weight of the mean square relative mismatch J = <M, w M>, M = F - Lambda E, for
-every H with support in the band |M|^2 w >= 2 Re tr H*M - |H|^2/w, so
+The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is analytic outside the unit circle with
+He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the circle with s_0 = Delta. The delays
+make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because no force has arrived yet).
+Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mean square relative mismatch
+J = <M, w M>, M = F - Lambda E. For every H with support in the band |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
-F's coefficients are differences of the s_k. Hence 2 <H, F> + tr C_0 Delta = <D, S> >= 0 if, for some C_k that only
-weigh what the delays forbid,
+F's coefficients are differences of the s_k. Hence 2 <H, F> + tr C_0 Delta = <D, S> >= 0 if, for some C_k that weigh
+only combinations that are zero,
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k,
 and then J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h this is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 the mean over log frequency in the band. H is piecewise linear, so that its sums over the circle are closed forms, and
-D is bounded from below between any two frequencies (`dual_matrix`). What it lacks is added to C_0, which is charged:
-the bound that remains is one of every linear coupling.
-Where nothing remains, or where unequal psi make the forbidden sums known up to rounding only, there is an estimate: of
-a D that is positive at the frequencies of a sweep. The integrals over the band are by Gauss's rule, whose error is
-bounded (`_Dual.objective_again`) and charged, and _QUADRATURE beside it.
+D is bounded from below between any two frequencies (`dual_matrix`). A shortage of D is added to C_0, which lowers the
+bound; the result holds for every linear coupling.
+If the bound drops to zero, or if unequal psi make the zero combinations known up to rounding only, the result is an
+estimate, for which D is positive at the frequencies of a sweep only. The integrals over the band are by Gauss's rule.
+The bound is reduced by a bound of its error (`_Dual.objective_again`) and by _QUADRATURE.
 """
 
 from __future__ import annotations
@@ -43,36 +43,36 @@ from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points, even and even in the logarithm, on which H is given
-_KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # of h, by channels
-MOST = max(_KNOTS)  # channels for which there is a bound
+_KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h
+MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that is 1 dB off"
-_NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
-_NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
-_CLOSEST = 0.1  # of a step: nearer knots are one
-_MOST_ADDED = 96  # frequencies after a sweep
-_AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # of the band's ends: D bends there
+_NEAR_END = (0.22, 0.5)  # further knots near the band's ends, in steps, because h falls to zero there
+_NEAR_MODE = 1.0  # distance of further knots from a mode, in widths of the mode
+_CLOSEST = 0.1  # least distance of two knots, in steps
+_MOST_ADDED = 96  # largest number of frequencies that a sweep adds
+_AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # ratios of frequencies around the band's ends, where D bends
 _AROUND = np.array(
     [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
-)  # widths of a mode
-_DEGREE = 3  # of the splines that h is made of
-_FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in degrees by the objective, and by how much it rises
-_GAP = 0.004  # of the bound, relatively, that the barrier leaves
-_LEAST = 1e-9  # mean square below which a bound says nothing
-_WANTED = 1e-3  # of the bound: what may be charged for the error of the bounds of D between frequencies
-_QUADRATURE = 1e-8  # of the mean square, charged in any case: the estimate's rule has no bound of its error
-_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the bound that remains
-_DISK = 4.0  # half-widths of an interval: the disk in which the integrand is bounded, away from the poles
+)  # distances of frequencies from a mode, in widths of the mode
+_DEGREE = 3  # of the splines in h
+_FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objective, and the factor of its steps
+_GAP = 0.004  # gap that the barrier leaves, relative to the bound
+_LEAST = 1e-9  # mean square below which a bound is useless
+_WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative to the bound
+_QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimate's rule has no error bound
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the proved bound
+_DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53
-_LARGEST_CHARGE = 0.005  # of the bound, for what D lacks between the frequencies where it is imposed
+_LARGEST_CHARGE = 0.005  # shortage of D between its frequencies that ends the search, relative to the bound
 
 
 @dataclass(frozen=True)
 class _Bound:
-    """No linear coupling for this environment has less rms mismatch, if `proved`."""
+    """A lower bound of the rms mismatch of every linear coupling for this environment; an estimate unless `proved`."""
 
     rms: float  # relative to the environment
-    proved: bool  # the dual matrix is nonnegative on the whole circle; otherwise it was looked at at samples only
-    sampled_rms: float  # the estimate: what the samples alone would charge
+    proved: bool  # whether the dual matrix is nonnegative on the whole circle, not only at samples
+    sampled_rms: float  # the estimate from samples alone
     seconds: float
 
     @property
@@ -96,18 +96,19 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
 
 @dataclass(frozen=True, eq=False)
 class _Dual:
-    """Unknowns: h, entry by entry, its real parts and then its imaginary ones; C_0; the C_k. D in units of 1/delta.
+    """The dual problem. Its unknowns are h (entry by entry, real parts, then imaginary parts), C_0 and the C_k.
 
-    H is piecewise linear between the points of `grid`: its sums over the circle are closed forms (`_causal`).
+    D is in units of 1/delta. H is piecewise linear between the points of `grid`, so that its sums over the circle are
+    closed forms (`_causal`).
     """
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner): the scalar functions of H there; of those of h the mean products over the band are I
-    target: Array  # (2 inner, m^2): -Lambda E/|E| in the same units, real and then imaginary parts
+    heights: Array  # (k, inner) scalar functions of H on the grid; those of h are orthonormal over the band
+    target: Array  # (2 inner, m^2) -Lambda E/|E| in the same units, real and then imaginary parts
     knots: Array
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
-    exact: bool  # those sums are zero exactly, and not but for rounding
+    exact: bool  # whether these sums are exactly zero, not only up to rounding
     band: tuple[float, float]  # [rad/sample]
 
     @classmethod
@@ -123,9 +124,9 @@ class _Dual:
         spline = np.concatenate([[x[0]] * _DEGREE, x, [x[-1]] * _DEGREE])
         hats = scipy.interpolate.BSpline.design_matrix(np.clip(np.log(grid), x[0], x[-1]), spline, _DEGREE).toarray()
         unit = np.pi / (span * grid * np.linalg.norm(E.at(on_circle(grid)), axis=(1, 2)))
-        heights = unit[:, None] * hats[:, 1:-1]  # h is zero at both ends of the band, else H_+ would be unbounded there
+        heights = unit[:, None] * hats[:, 1:-1]  # h is zero at both ends of the band, where H_+ would be unbounded.
 
-        # objective, by Gauss's rule between the points of the grid: mean |h + Lambda E/|E||^2
+        # The objective, mean |h + Lambda E/|E||^2, by Gauss's rule between the points of the grid.
         w, weight, part = _gauss(grid)
         weight = weight / (w * span)
         H = np.concatenate([(1 - f) * heights[:-1] + f * heights[1:] for f in part])
@@ -139,7 +140,7 @@ class _Dual:
 
     @property
     def start(self) -> Array:
-        """h = 0 and C_0 = I/delta: D = I. As a row, tr C_0."""
+        """The point h = 0 and C_0 = I/delta, where D = I; as a row vector it gives tr C_0."""
         m = self.loop.channels
         unit = [float(i == j) for i, j in _triangle(m)]
         return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
@@ -149,7 +150,7 @@ class _Dual:
         return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.start
 
     def imposed(self) -> Array:
-        """Return the frequencies at which D > 0 is imposed first: dense at the band's ends, modes and delays."""
+        """Return the first frequencies at which D > 0 is imposed, dense at the band's ends, modes and delays."""
         low, high = self.grid[0], self.grid[-1]
         steps = np.arange(4 * self.knots.size - 3) / 4
         within = np.exp(np.interp(steps, np.arange(self.knots.size), np.log(self.knots)))
@@ -170,7 +171,7 @@ class _Dual:
         return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
-        """Return what unknowns of C_0 and the C_k add to D (k, unknowns, m, m), before its Hermitian part is taken."""
+        """Return the slopes of D in the unknowns of C_0 and the C_k, (k, unknowns, m, m), before the Hermitian part."""
         m, z = self.loop.channels, on_circle(w)
         triangle = _triangle(m)
         slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
@@ -207,9 +208,10 @@ class _Dual:
 
     @cached_property
     def _nodes(self) -> tuple[Array, Array, Complex, Array]:
-        """The middles and half-widths (k,) of intervals, Lambda E at Gauss's points (k, points, m, m), and (2, k):
+        """The intervals of Gauss's rule: (middles (k,), half-widths (k,), Lambda E at the points, bounds (2, k)).
 
-        bounds of |Lambda E| in the disk of _DISK half-widths around the middle, and of its rounding.
+        Lambda E has the shape (k, points, m, m). The bounds are those of |Lambda E| in the disk of _DISK half-widths
+        around the middle, and of its rounding.
         """
         E, half = self.loop.E(), np.diff(self.grid) / 2
         middle, nodes = self.grid[:-1] + half, []
@@ -231,12 +233,13 @@ class _Dual:
         return middle, half, response, bounds
 
     def objective_again(self, x: Array) -> tuple[float, float]:
-        """Return the bound of a point by Gauss's rule, from H itself, and its largest error.
+        """Return (the bound of a point by Gauss's rule, computed from H itself; its largest error).
 
-        In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, since H is
+        In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
         linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
-        positive: it is off by at most twice the length times the distance of g from such a polynomial. For that of
-        Taylor around the middle the distance is at most max |g| q^2N/(1 - q), over the disk of radius half-width/q.
+        positive. Its error is at most twice the length times the distance of g from such a polynomial. The distance
+        from the Taylor polynomial around the middle is at most max |g| q^2N/(1 - q), over the disk of radius
+        half-width/q.
         """
         middle, half, response, (size, error) = self._nodes
         low, high = self.band
@@ -257,9 +260,9 @@ class _Dual:
         return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
-        """Return the bound of a point after what D lacks is charged; where D was evaluated, and its eigenvalues.
+        """Return (the bound of a point less the shortage of D, the frequencies of D, its least eigenvalues there).
 
-        A sum that is zero only but for rounding leaves no bound.
+        The bound is zero if the forbidden sums are zero up to rounding only.
         """
         if not self.exact:
             return 0.0, swept, np.zeros(swept.size)
@@ -268,9 +271,9 @@ class _Dual:
         return again - error + m * min(lower, 0.0), where, least
 
     def best(self) -> tuple[float, float]:
-        """Return two bounds on the mean square: with D at samples, and with D charged on the whole circle.
+        """Return two bounds on the mean square: an estimate with D at samples, and one with D on the whole circle.
 
-        The points are along the barrier's path, with further frequencies where D fails between.
+        The points lie on the barrier's path. Frequencies at which D fails are added between the rounds.
         """
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
@@ -304,7 +307,7 @@ class _Dual:
 
 
 def _gauss(grid: Array) -> tuple[Array, Array, Array]:
-    """Return Gauss's rule of three points in each interval: points, weights, and shares of the interval before (3,)."""
+    """Return Gauss's rule of three points in each interval: points, weights, and positions in the interval (3,)."""
     part, weight = np.polynomial.legendre.leggauss(3)
     part, width = (1 + part) / 2, np.diff(grid)
     return (grid[:-1] + part[:, None] * width).ravel(), (weight[:, None] / 2 * width).ravel(), part
@@ -319,7 +322,10 @@ def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
-    """Return the point nearest to x on the way from `inner` at which no least eigenvalue is negative (concavity)."""
+    """Return the point nearest to x on the way from `inner` at which no least eigenvalue is negative, or None.
+
+    `room` and `lacking` are the least eigenvalues at `inner` and at x; least eigenvalues are concave in between.
+    """
     if room.min() <= 0:
         return None if lacking.min() < 0 else x
     fails = lacking < 0
@@ -328,7 +334,7 @@ def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | Non
 
 
 def _knots(E: Lti, low: float, high: float, count: int) -> Array:
-    """Return the knots of h: even in log frequency, dense at the band's ends and, by their width, at modes of E."""
+    """Return the knots of h, even in log frequency, and denser at the band's ends and at modes of E."""
     even = np.geomspace(low, high, count)
     step = np.log(even[1] / even[0])
     ends = np.exp(step * np.array(_NEAR_END))
@@ -351,13 +357,12 @@ def _triangle(m: int) -> list[tuple[int, int]]:
 
 
 def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]:
-    """Return what delays forbid: (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E.
+    """Return the sums that are zero because of delays, and whether they are exactly zero.
 
-    And whether these sums are exact: those of a null space are not but for rounding where the channels' psi differ.
-
-    Row i of s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E: where
-    the channels' psi differ they lie in a subspace, and v is from its complement. Of long delays the first steps are
-    taken: any part of all leaves a bound.
+    A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E. Row i of s_k is zero for
+    1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels' psi differ, they
+    lie in a subspace, and v is from its complement, which a null space gives up to rounding. Long delays are cut to
+    their first steps, because every part of the sums gives a bound.
     """
     import scipy
 
@@ -389,16 +394,16 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
 
 
 def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
-    """Return the columns that begin first, as many as are used."""
+    """Return the sums with the earliest first step, at most BOUND_SUMS of them."""
     return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[: budgets.BOUND_SUMS])
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:
-    """Return (1/z - 1) H_+ + H_0 at z = e^jw of H = a and H = j a, H(conj z) = conj H(z), (k, 2 functions).
+    """Return (1/z - 1) H_+ + H_0 at z = e^jw for H = a and H = j a, H(conj z) = conj H(z), (k, 2 functions).
 
-    Each a is piecewise linear with these heights on the grid, the first and last of them zero, and zero elsewhere. With
-    sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2), so that H_+ consists of dilogarithms
-    Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
+    Each a is piecewise linear with these heights on the grid and zero outside; the first and last heights are zero.
+    With sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2). H_+ therefore consists of
+    dilogarithms Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
     """
     slopes = np.diff(heights, axis=0) / np.diff(grid)[:, None]
     bends = np.diff(slopes, axis=0, prepend=0, append=0) / (2 * np.pi)
@@ -418,22 +423,23 @@ def _worst(lacking: Array, w: Array) -> Array:
 
 @dataclass(frozen=True)
 class BoundBeside:
-    """What no linear coupling can be better than, and by how much the best one is worse; or why there is no bound.
+    """The bound of every linear coupling, and the gap of the designed one; or the reason why there is no bound.
 
-    A gap is given where the bound is of all that was asked: what is asked beside this-environment only adds to it.
+    The gap is left out if the design had further requirements, because the bound is for this-environment alone.
     """
 
     rms_mismatch_db: float | None = None
     gap_db: float | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
-    even_without: tuple[str, ...] = ()  # what was asked and the bound does not know
-    relative_mismatch_db: float | None = off_table("if given", None)  # of the supremum, where that was minimised
-    proved: bool = False  # otherwise an estimate: the matrix behind it was looked at at samples only
+    even_without: tuple[str, ...] = ()  # further requirements of the design, which the bound neglects
+    relative_mismatch_db: float | None = off_table("if given", None)  # of the supremum, if that was minimised
+    proved: bool = False  # False: an estimate, whose dual matrix was checked at samples only
 
     @classmethod
     def of(
-        cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float], asked: Options
+        cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float], options: Options
     ) -> BoundBeside:
+        """Return the bound for the loop of a design; `reached_db` is the rms mismatch of the design."""
         if loop.channels > MOST:
             return cls(reason=_NO_BOUND)
         if best.objective == 0:
@@ -445,11 +451,11 @@ class BoundBeside:
             "latency": any(map(any, loop.latency or ())),
             "switching delays": loop.varying_delay is not None,
             "ranges": loop.ranges is not None,
-            "the limiter": asked.limiter,
-            "the cap above 100 Hz": asked.high_gain is not None,
+            "the limiter": options.limiter,
+            "the cap above 100 Hz": options.high_gain is not None,
         }
         without = tuple(name for name, present in more.items() if present)
-        if asked.objective == "sup":  # |M|_F <= sqrt(m) |M|, and |E|_F >= |E|
+        if options.objective == "sup":  # |M|_F <= sqrt(m) |M|, and |E|_F >= |E|
             return cls(
                 least.rms_db,
                 even_without=without,
@@ -461,7 +467,7 @@ class BoundBeside:
 
     @property
     def words(self) -> str:
-        """In one line."""
+        """One line for a report."""
         if self.reason or self.rms_mismatch_db is None:
             return self.reason or ""
         sup = f", nor than {self.relative_mismatch_db:.2f} dB at most" if self.relative_mismatch_db is not None else ""

@@ -140,7 +140,7 @@ def _proof(
     """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
-    complete = swept is not None and len(swept.multiplier or ()) == numbers  # quick sweeps search no multipliers
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # Quick sweeps search no multipliers.
     requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)
@@ -154,7 +154,7 @@ def _proof(
         require_size(real.order, requirement)
         P, reason = find_storage(real)
         if P is None:
-            share = f"the sweep asks {requirement.ratio:.9f} of the available damping"
+            share = f"the sweep requires {requirement.ratio:.9f} of the available damping"
             refuted = isinstance(reason, Violated)
             raise NotProved(f"{condition.place(loop, name)}{reason}; {share}", requirement, refuted)
         proof[name] = rows_of(P)
@@ -198,7 +198,7 @@ _MOST_COST = 2  # total cost of the members of ranges, in units of one proof wit
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
-    """Raise NotProved where the condition does not cover the loop or a proof would take minutes."""
+    """Raise NotProved if the condition does not cover the loop, or if a proof would take minutes."""
     if reason := condition.beyond(loop):
         raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
@@ -209,7 +209,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     try:
         states = loop.sent(coupling).order
     except SingularLoop:
-        return  # the sweep says where
+        return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
     states += sum(loop.theta) if members else 0  # The block of any-environment has the states of V only.
     require_size(states)
@@ -230,13 +230,13 @@ _MOST_LOST = 1e-4  # largest difference of float and exact response, relative to
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
-    """Return the reason why the floating-point block of a tick differs from the system that is proved, or None.
+    """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
-    Responses and rounding errors may differ by _MOST_LOST on the circle. They differ by more where terms cancel that
-    are far larger than the forces.
+    Responses and rounding errors may differ by _MOST_LOST on the circle. They differ by more if terms cancel that are
+    far larger than the forces.
     """
     try:
-        if loop.environment.world:  # a tick computes V alone, the scene is solved with its direct part
+        if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
             running, exact = coupling.compliance(loop.T), coupling.compliance(loop.period(exact=True))
         else:
             running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
@@ -298,8 +298,8 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     """Check the stored certificate's digest, seal and figures, and prove its matrices again in exact arithmetic.
 
-    `condition` is needed for a certificate of a condition of the user's own. Its block is proved again; that the block
-    keeps the loop safe is the claim of its author.
+    `condition` is needed for a certificate of a user's own condition. Its block is proved again; its author claims that
+    the block keeps the loop safe.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -315,7 +315,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         resolved = condition_of(certificate, condition)
         with _in_time():
             _check(loop, coupling, resolved, certificate)
-    except ValueError as refused:  # NotProved, or a user's own condition
+    except ValueError as refused:  # raised by a proof or by a user's own condition
         return Verdict(False, str(refused))
     if _is_ours(resolved):
         _made.add(certificate.seal)
@@ -338,15 +338,15 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
 def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
     """Return the requirement of a certificate's condition and multipliers in this loop, proved with its matrices.
 
-    `known` is a certificate that was proved in this process for this loop and coupling: it is only swept. Raises
-    NotProved if the certificate does not hold in the loop.
+    `known` is a certificate that this process has proved for this loop and coupling; for it the exact proof is not
+    repeated. Raises NotProved if the certificate does not hold in the loop.
     """
-    shown = known is certificate and certificate.scenario == digest(loop, coupling.form())
+    is_proved = known is certificate and certificate.scenario == digest(loop, coupling.form())
     try:
         condition = condition_of(certificate)
     except ValueError as error:
         raise NotProved(str(error)) from None
-    return _check_part(loop, coupling, condition, certificate, None if shown else certificate.matrices)
+    return _check_part(loop, coupling, condition, certificate, None if is_proved else certificate.matrices)
 
 
 def _check_part(
@@ -365,7 +365,7 @@ def _check_part(
     requirement, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
     reason = requirement.reason or _other_figures(claim, requirement)
     if not (reason or requirement.certified):
-        reason = f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
+        reason = f"the sweep requires {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
     if reason := reason or _another_system(loop, coupling):
         raise NotProved(_placed(place, reason))
     if matrices is None:
@@ -415,7 +415,7 @@ def _is_ours(condition: Condition) -> bool:
 
 
 def named(condition: str | Condition) -> Condition:
-    """Return the condition of a name, or the condition itself. Raises ValueError for an unknown or a taken name."""
+    """Return the condition of a name, or the condition itself. Raises ValueError for an unknown or reserved name."""
     if not isinstance(condition, str):
         name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in reserved
@@ -433,17 +433,15 @@ def named(condition: str | Condition) -> Condition:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """Return the damping that the condition requires, the same share of each device's, from a refined sweep.
+    """Return the damping that the condition requires, the same share of each device's damping, from a refined sweep.
 
-    With ranges this-environment returns the largest requirement of all members. It is infinite for a loop without a
-    solution.
+    With ranges this-environment returns the largest requirement of all members. The requirement of a loop without a
+    solution is infinite.
     """
     requirement = named(condition).judge(loop, coupling, multiplier)
-    return (
-        requirement
-        if requirement.reason
-        else replace(requirement, required=tuple(requirement.ratio * d for d in requirement.available))
-    )
+    if requirement.reason:
+        return requirement
+    return replace(requirement, required=tuple(requirement.ratio * d for d in requirement.available))
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:

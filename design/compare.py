@@ -27,15 +27,15 @@ from haptic_loop.design.result import PLAIN_CONDITIONS, Requirement
 
 
 _LOWEST_HZ = 0.1
-FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
+FEEL_HZ = (1.0, 10.0)  # frequencies of the table of perceived stiffness and damping
 
 
 @dataclass(frozen=True, eq=False)
 class Perceived:
-    """The effective impedance of one channel with the others held still: x -> f read as a spring and a damper."""
+    """The effective impedance of each channel with the others held still, as a spring and a damper."""
 
     stiffness: Array  # (k, m) Re G_ii [N/m]
-    damping: Array  # (k, m) Im G_ii / omega [N s/m]; below zero where motion is fed
+    damping: Array  # (k, m) Im G_ii / omega [N s/m]; negative where the motion receives energy
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Demands:
 
     F: Lti
     requirements: dict[str, Requirement]
-    demands: dict[str, Response | None]  # w -> required over available damping; None where no damping helps
+    demands: dict[str, Response | None]  # w -> required over available damping; None if no damping is enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +62,8 @@ def judge(
 ) -> Demands:
     """Evaluate every condition of a coupling, as figures and over frequency, with all walls touching.
 
-    `own` are conditions of the user's own; `known` are requirements from an assessment of this loop and coupling.
-    Raises SingularLoop.
+    `own` are a user's own conditions; `known` are requirements from an assessment of this loop and coupling. Raises
+    SingularLoop.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)

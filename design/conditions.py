@@ -1,4 +1,4 @@
-"""What a loop must satisfy so that no passive human can make it oscillate. Each condition states its block once.
+"""Conditions under which no passive human can make a loop oscillate. Each condition states its block once.
 
 A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.frame) holds it
 as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
@@ -10,17 +10,18 @@ and of **facts** of the environment's side (`Fact`: walls, delays that switch, t
 inputs and adds their forms, as design.frame describes. design.environments searches the multipliers of all conditions;
 design.certificate has one exact proof and one file format.
 
-How a hands' side is added. Derive from `HandsSide` and state
-  `inputs`   one `Input` per scalar input: `moved`, the weights of its share of the displacement that f[k] multiplies,
-             w_0 + w_1 z + .. (dx: (1,); xa of a latency, which f[k-1] multiplies: (0, 1); the speed v of a known device
-             in f'(dx + beta dv): (-beta, beta), `follows=0`), `slips` whether the limiter's slip is taken off it;
-  `damping`  the matrix over its inputs that grows in proportion to Delta_D;
-  `rest`     matrices M_0, M_1: what does not grow with Delta_D, M_0 + M_1/z;
+To add a hands' side, derive a class from `HandsSide` and state
+  `inputs`   one `Input` per scalar input. `moved` are the weights w_0 + w_1 z + .. of its share of the displacement
+             that f[k] multiplies. Examples: dx (1,); xa of a latency, which f[k-1] multiplies, (0, 1); the speed v of a
+             known device in f'(dx + beta dv), (-beta, beta) with `follows=0`. `slips` says whether the limiter's slip
+             is subtracted from the input;
+  `damping`  the matrix over its inputs that is proportional to Delta_D;
+  `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
   `unknowns` its multipliers, by name.
-`hands_side(loop)` then chooses it for the loops that declare it. Rows, walls, limiter and switching follow.
+`hands_side(loop)` chooses it for the loops that declare it. Rows, walls, limiter and switching follow.
 
-any-environment is Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
-`any_environment_demand`; of an environment that holds delay `delayed_environment_demand` (design.lmi).
+any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`v_hat`,
+`any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
 """
 
 from __future__ import annotations
@@ -64,9 +65,9 @@ from haptic_loop.design.result import Environments, Requirement, from_ratio, ref
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
     """Return He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces, in any arithmetic.
 
-    The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
-    what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
-    latch later than at the tick have a block of twice the size (design.facts.Latency).
+    In a tick the damping dissipates at least Delta_D dx^2/T, and the force map supplies the energy -F dx. With
+    F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that latch later than at the tick have a block
+    of twice the size (design.facts.Latency).
     """
     return compose(F, loop, late=False)
 
@@ -80,25 +81,26 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
 def v_hat(H: Block) -> tuple[Array, Block]:
     """Return H(1), symmetric, and H(1)/2 - (H - H(1))/(z - 1), with the Hermitian part of T V-hat/|1 - 1/z|^2.
 
-    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
-    z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
-    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one.
+    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) combines the compliance V and the delays. V-hat vanishes at z = 1,
+    where it cannot be strictly positive, so it is divided by |1 - 1/z|^2. The factor (1 - 1/z) becomes 1/(1 - z), whose
+    pole has the Hermitian part 1/2. The result is linear in H, so V and Theta-hat may be passed separately.
     """
     H1, regular = H.over_z_minus_one()
     return H1, -regular
 
 
-#: reason for which a condition is refused for devices whose levels Delta_i are not diagonal
+#: reason of a refusal for devices whose levels Delta_i are not diagonal
 FULL_LEVELS = "is proved where every Delta_i is diagonal: give damping as one number for each axis"
 
 
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
     """Return the block of Theorem 4 for the damping s Delta_D, times s; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
-    V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. Divided
-    by |1 - 1/z|^2, as `v_hat` is, T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat: by a Schur complement
-    He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, without rows of the second kind where phi is 0. Damping enters by
-    Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a multiplier.
+    V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. After the
+    division by |1 - 1/z|^2 (see `v_hat`) this is T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat. A Schur
+    complement gives He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
+    Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a
+    multiplier.
     """
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
@@ -106,18 +108,18 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     below = len(shortage) == len(damping) and ((shortage >= 0) & (shortage < damping)).all()
     if not below or (loop.levels and not positive_definite(level - np.diag(shortage))):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    paid = np.flatnonzero(shortage)
+    short = np.flatnonzero(shortage)
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
         """Return H(1) and the block of H with this corner, linear in both."""
         H1, regular = v_hat(H)
-        if not paid.size:
+        if not short.size:
             return H1, regular
-        corner = np.vstack([np.zeros((loop.channels, paid.size), dtype=int), corner])
-        return H1, hstack(vstack(T * regular, (2 * H).rows(paid)), constant_like(H, corner))
+        corner = np.vstack([np.zeros((loop.channels, short.size), dtype=int), corner])
+        return H1, hstack(vstack(T * regular, (2 * H).rows(short)), constant_like(H, corner))
 
-    V1, gain = excess(V, np.diag(1 / shortage[paid]))
-    inverted = inverse(level)[np.ix_(paid, paid)] if loop.levels else np.diag(1 / damping[paid])
+    V1, gain = excess(V, np.diag(1 / shortage[short]))
+    inverted = inverse(level)[np.ix_(short, short)] if loop.levels else np.diag(1 / damping[short])
     _, demand = excess(as_like(V, theta_hat(loop.theta, level, T)), inverted)
     return Demand(-demand, gain, {"V(1)": V1})
 
@@ -125,8 +127,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
     """Return E-hat + Phi without its pole, which must be positive real; `delayed` is Psi E.
 
-    E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2:
-    T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
+    E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2, so the
+    block is T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
     """
     T, E1 = delayed.T, delayed.dc()
     return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
@@ -155,13 +157,13 @@ def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
 
 #: A pair is singular if its determinant is below _SINGULAR times the diagonal's product; smaller entries are rounding.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
-_CELLS = 2**19  # entries of a response that are looked at together
+_CELLS = 2**19  # entries of a response that are processed together
 
 
 def least_scale(demand: Demand[Any], w: Array) -> Array:
     """Return the least s (k,) with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample], or inf."""
     step = max(_CELLS // demand.gain.outputs**2, 64)
-    if w.size > step:  # in pieces that stay near the processor
+    if w.size > step:  # Pieces fit into the processor's cache.
         return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -185,7 +187,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     if known.all() and diagonal:
         return largest_eigenvalue(-free)
     if gain.ndim > 2 and (gain == gain[..., :1, :, :]).all():
-        gain = gain[..., :1, :, :]  # the same at every frequency: one decomposition
+        gain = gain[..., :1, :, :]  # One decomposition serves all frequencies.
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
     if diagonal and eigenvalues.size == gain.shape[-1]:
@@ -198,7 +200,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     flat, shape = H.reshape(-1, *H.shape[-2:]), H.shape[:-2]
     missing = np.broadcast_to((eigenvalues <= floor).sum(axis=-1), shape).ravel()
     needed = np.empty(missing.size)
-    for r in set(missing.tolist()):  # eigenvalues ascend: the first r directions are those that the gain does not reach
+    for r in set(missing.tolist()):  # Eigenvalues ascend, so the first r directions span the null space of the gain.
         here = flat[missing == r]
         needed[missing == r] = _beyond_the_null_space(here, r) if r else largest_eigenvalue(-here)
     needed[np.broadcast_to((eigenvalues < -floor).any(axis=-1), shape).ravel()] = np.inf
@@ -206,7 +208,10 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
 
 
 def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
-    """Return `least_multiple` of 2 x 2 matrices with det(gain) = room, by a root; 20 times as fast as LAPACK."""
+    """Return `least_multiple` of 2 x 2 matrices with det(gain) = room, by a quadratic equation.
+
+    The closed form is 20 times as fast as LAPACK.
+    """
     (a, b, d), (p, q, r) = ((M[..., 0, 0].real, M[..., 0, 1], M[..., 1, 1].real) for M in (free, gain))
     twice, last = a * r + d * p - 2 * (b.real * q.real + b.imag * q.imag), a * d - b.real**2 - b.imag**2
     root = np.sqrt(np.maximum(twice**2 - 4 * room * last, 0.0))
@@ -231,23 +236,21 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 
 #: fields of a loop that go beyond even ticks, constant delays of its forces and one linear environment
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
-
-
-#: The facts of the environment's side that a certificate may cover, in the order of reports and files.
+#: facts of the environment's side that a certificate may cover, in the order of reports and files
 FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 
 
 class Condition(ABC):
-    """A block that must be strictly positive real. A condition of the user's own needs a name and `demand`.
+    """A block that must be strictly positive real. A user's own condition needs a name and `demand`.
 
-    `design.certificate` proves and verifies it like every condition. That the block keeps a loop safe is the claim of
-    its author. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
+    `design.certificate` proves and verifies it like every condition. Its author claims that the block keeps a loop
+    safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
     """
 
     name: str  # in requirements, certificates and reports
     covers: tuple[str, ...] = ()  # items of `BEYOND` that the block covers; a subclass does not inherit them
     source: str | None = None  # reference for a report
-    separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
+    separable: bool = False  # whether channels are judged one by one for a coupling without cross terms
 
     @property
     def extensible(self) -> bool:
@@ -268,7 +271,7 @@ class Condition(ABC):
         return max(shares, key=lambda requirement: requirement.ratio)
 
     def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return `required` with its guarantee; a loop that is not covered or has no solution gets an infinite one."""
+        """Return the requirement with its guarantee; infinite for a loop that is not covered or has no solution."""
         reason = self.beyond(loop)
         try:
             requirement = (
@@ -297,11 +300,11 @@ class Condition(ABC):
         loops = enumerate(self._loops(loop))
         return {f"P{i or ''}": self.is_demand(self.demand(each, coupling, exact=True, **more)) for i, each in loops}
 
-    def is_demand(self, found: Demand[Block]) -> Demand[Block]:
-        """Return `found`, the result of a user's own code. Raises InputError unless it is a Demand."""
-        if not isinstance(found, Demand):
-            raise InputError(f"the demand of condition {self.name} is {shown(found)}, expected a Demand")
-        return found
+    def is_demand(self, demand: Demand[Block]) -> Demand[Block]:
+        """Return `demand`, the result of a user's own code. Raises InputError unless it is a Demand."""
+        if not isinstance(demand, Demand):
+            raise InputError(f"the demand of condition {self.name} is {shown(demand)}, expected a Demand")
+        return demand
 
     def _loops(self, loop: Loop) -> list[Loop]:
         return [loop.at(member.network) for member in self.members(loop)] or [loop]
@@ -310,27 +313,26 @@ class Condition(ABC):
         """Return the reason why this loop is not covered, whatever the coupling, or None."""
         changes = loop.T_max not in (None, loop.T)
         walls = loop.environment.walls
-        has = (any(loop.psi), changes, loop.latency, loop.varying_delay, walls, loop.ranges)
-        named = vars(type(self)).get("covers", ())
-        missing = [name for name, there in zip(BEYOND, has, strict=True) if there and name not in named]
-        left = f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
-        if missing or self.guarantee(loop) != "any passive environment":
-            return left if missing else None
-        return loop.environment.active(loop.T)
+        present = (any(loop.psi), changes, loop.latency, loop.varying_delay, walls, loop.ranges)
+        covered = vars(type(self)).get("covers", ())
+        missing = [name for name, is_there in zip(BEYOND, present, strict=True) if is_there and name not in covered]
+        if missing:
+            return f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
+        return loop.environment.active(loop.T) if self.guarantee(loop) == "any passive environment" else None
 
     @property
     def base(self) -> str:
-        """The condition's name in a certificate, which lists the facts separately."""
+        """The name of the condition in a certificate, which lists the facts separately."""
         return self.name
 
     def fact_names(self, loop: Loop) -> tuple[str, ...]:
         """Return the names of `FACTS` that this loop has."""
         walls, limited = loop.environment.walls, self.parameters(loop)
-        there = loop.latency, walls, limited, loop.varying_delay, loop.ranges
-        return tuple(name for name, has in zip(FACTS, there, strict=True) if has)
+        present = loop.latency, walls, limited, loop.varying_delay, loop.ranges
+        return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
-        """Return the numbers that a run must use and a certificate keeps with the multipliers: rho [N/m]."""
+        """Return the numbers that a run must use and a certificate stores with the multipliers: rho [N/m]."""
         return {}
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
@@ -373,7 +375,7 @@ class Condition(ABC):
 
     @property
     def claim(self) -> str:
-        """The sentence of reports for a condition of the user's own that holds."""
+        """The sentence of reports for a user's own condition that holds."""
         return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
@@ -411,10 +413,10 @@ def unsound(system: Lti, delta: Sequence[float]) -> str | None:
     return f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle" if radius >= 1 else None
 
 
-def unsound_static(system: Lti, asked: Demand[Lti], delta: Sequence[float]) -> str | None:
+def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> str | None:
     """Return the reason why the demand's static matrices violate it by more than rounding, or None."""
     end = system.at(-1.0)
-    for matrix, value in asked.static.items():
+    for matrix, value in demand.static.items():
         skew, least = _static_errors(value, system.D, end)
         slack = _STATIC
         if max(skew, -least) > slack:  # The map may consist of rounding errors only.
@@ -423,7 +425,7 @@ def unsound_static(system: Lti, asked: Demand[Lti], delta: Sequence[float]) -> s
             slack = max(slack, allowed / max(size, 1e-12))
         if skew > slack:
             return f"the static stiffness {matrix} is not symmetric: a slow closed path could extract energy"
-        if least < -slack and matrix in asked.semidefinite:
+        if least < -slack and matrix in demand.semidefinite:
             return f"the static stiffness {matrix} has a negative direction: it pushes outwards"
     return None
 
@@ -441,7 +443,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     and filter are multiplied, because the poles of their series are defective and cost digits and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
-        return _of_whole(loop, coupling, thin)
+        return _by_force_map(loop, coupling, thin)
     E = loop.E()
     delayed = delay(loop.psi, loop.T) @ E
 
@@ -454,7 +456,8 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
 
 
-def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
+def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
+    """Return `ratio_in` by the poles and states of the force map."""
     try:
         F = loop.F(coupling)
         if thin == 1:
@@ -467,14 +470,13 @@ def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
 
 _LOWEST = 1e-6  # [rad/sample] responses are constant below it
 _W_ZERO = 1e-10  # [rad/sample] replaces w = 0 in stacks, where the response of a network may be 0/0
-#: allowed relative asymmetry and negativity of F(1)
-_STATIC = 1e-9
+_STATIC = 1e-9  # allowed relative asymmetry and negativity of F(1)
 
 
 def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
     """Return the asymmetry of F(1) and its least eigenvalue, (...,) each, relative to the largest of all matrices.
 
-    A free mass has F(1) = 0 as a difference of large numbers.
+    The other matrices count because F(1) of a free mass is a difference of large numbers, which should be 0.
     """
     scale = np.max([np.abs(part).max(axis=(-2, -1)) for part in (F1, *elsewhere)], axis=0, initial=1e-12)
     turned = np.swapaxes(F1, -1, -2)
@@ -485,7 +487,7 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
 def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
     """Return the damping that any-environment requires for V before any passive environment.
 
-    With phi (m,) [N s/m] of `any_environment_demand` V stands before the loop's own environment and its delay psi.
+    With phi (m,) [N s/m] (see `any_environment_demand`) V stands before the loop's own environment and its delay psi.
     """
     available = dampings(loop.delta, V.inputs)
 
@@ -510,10 +512,8 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
-#: allowed shortage of E-hat + Phi, relative to the damping; rounding makes 2e-13 of it for a lossless E
-_ROUNDING = 1e-9
-#: relative size of V below which a direction counts as one in which V vanishes
-_VANISHES = 1e-5
+_ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; a lossless E has 2e-13 by rounding
+_VANISHES = 1e-5  # relative size of V below which V counts as vanishing in a direction
 #: relative passivity that replaces that of V in these directions; ratio from which V counts as not passive there
 _SOFTENED, _NEVER = 1e-12, 1e6
 
@@ -527,8 +527,8 @@ def asymmetric(V1: Array) -> str | None:
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     """Return `least_scale` (k,), without a demand in directions in which V vanishes.
 
-    Where V and the delays' window vanish together, so does V-hat, and He V-hat >= Delta_V |V-hat|^2 is 0 >= 0: the
-    moving average does it at every zero of its window. Where only V does, the ratio is large.
+    If V and the delays' window vanish together, V-hat vanishes, and He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. The
+    moving average has this property at every zero of its window. If only V vanishes, the ratio is large.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -605,9 +605,9 @@ def l1_gain(F: Lti) -> Array:
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
     """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m] for any condition.
 
-    It acts at the encoder's own coordinate, besides the damping delta. It does not hold behind a limiter or walls.
-    Friction of a device with several `axes` opposes its velocity in space, and needs |W|_2 of these axes: the work of
-    the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
+    The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound does not hold behind
+    a limiter or walls. Friction of a device with several `axes` opposes its velocity in space, and |W|_2 of these axes
+    is needed, because the work of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
@@ -622,7 +622,7 @@ _Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at 
 
 
 def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
-    """Return required over available damping (n,) of n loops; inf where no damping is enough.
+    """Return required over available damping (n,) of n loops; inf if no damping is enough.
 
     `at` returns the responses of their force maps, and `poles` (n, p) are the poles of these maps.
     """

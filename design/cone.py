@@ -1,7 +1,7 @@
 """Linear matrix inequalities: minimise c'x where every block constant + sum_a x_a slope_a is positive semidefinite.
 
-A solver's status is a claim. A result is used only if it is finite, if its blocks are semidefinite when they are
-evaluated again, and if the caller's `accept` agrees. Otherwise the next of several solver settings is tried.
+The status of a solver is not trusted. A result is used only if it is finite, if its blocks are semidefinite when they
+are evaluated again, and if the caller's `accept` agrees. Otherwise the next of several solver settings is tried.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import numpy as np
 
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design import budgets
+from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that counts as rounding. Problems are scaled so that 1 is large.
 _TOLERANCE = 1e-4
-#: Clarabel is slower than `_interior` where a triangle has more entries than _LARGE and than _MANY times its unknowns.
+#: Clarabel is slower than `_interior` if a triangle has more entries than _LARGE and than _MANY times its unknowns.
 _LARGE, _MANY = 300, 4
 
 
@@ -49,9 +50,9 @@ class _Attempt:
 
     settings: str
     status: str
-    value: float | None  # the objective, None where the attempt was refused
+    value: float | None  # the objective, None for a refused attempt
     wall_s: float
-    reason: str | None = None  # why it was refused
+    reason: str | None = None  # reason of the refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +73,12 @@ class Inequality:
 
     @classmethod
     def least(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """x >= value, for each of the unknowns."""
+        """Return x >= value for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), -value), np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     @classmethod
     def most(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """x <= value, for each of the unknowns."""
+        """Return x <= value for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), value), -np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     def at(self, x: Array) -> Array | Complex:
@@ -90,7 +91,7 @@ class Inequality:
         return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
 
     def rows(self) -> tuple[Array, Array]:
-        """(k, r) and (q, k, r) real: the lower triangles row by row, such that inner products stay the same."""
+        """Return constant (k, r) and slopes (q, k, r) as real rows of lower triangles with the same inner products."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
         i, j = np.tril_indices(constant.shape[-1])
         weight = np.where(i == j, 1.0, np.sqrt(2))
@@ -98,7 +99,7 @@ class Inequality:
 
 
 def _real(H: Array | Complex) -> Array:
-    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
+    """Return [[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n), which is >= 0 if and only if H is."""
     if not np.iscomplexobj(H):
         return np.asarray(H, dtype=float)
     top, low = np.concatenate([H.real, -H.imag], axis=-1), np.concatenate([H.imag, H.real], axis=-1)
@@ -118,8 +119,8 @@ class ConeProgram:
         """Return the optimal x (p,), verified. `problem` names the problem in error messages.
 
         Raises:
-            Infeasible: two settings report that there is no solution, and none finds one.
-            DesignFailed: no setting gives a result that can be verified.
+            Infeasible: Two settings report that there is no solution.
+            DesignFailed: No setting gives a result that can be verified.
         """
         attempts: list[_Attempt] = []
         if settings is None:
@@ -197,13 +198,13 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 # A primal-dual interior-point method for large blocks in few unknowns.
 #
 # The S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a, and S Z = 0 at the optimum. S Z =
-# mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro), and <slope_a, Z + dZ> =
-# cost_a leaves as many equations as there are unknowns. A predictor with mu = 0 gives the next mu and the second-order
-# term dZ dS (Mehrotra). The start may be infeasible.
+# mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro). <slope_a, Z + dZ> = cost_a
+# then gives one equation for each unknown. A predictor with mu = 0 gives the next mu and the second-order term dZ dS
+# (Mehrotra). The start may be infeasible.
 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
 _ENOUGH = 1e-6  # the best point counts as solved below this error if rounding stops the iteration
-_KEPT = 0.98  # share of the way to the boundary that a step may go
+_KEPT = 0.98  # largest step, relative to the distance to the boundary
 _SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
 
 
@@ -227,18 +228,18 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
             break
         try:
             newton = _Newton(problem, S, Z, missing, wrong)
-        except np.linalg.LinAlgError:  # rounding
+        except np.linalg.LinAlgError:  # The equations are singular to rounding.
             break
         mu = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
         _, dS, dZ, of_S, of_Z = newton.direction(0.0, [0.0] * len(S))
         gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
         left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
         dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
-        if min(of_S, of_Z) < _SHORT:  # too near the boundary: back to the centre
+        if min(of_S, of_Z) < _SHORT:  # The point is too near the boundary, so the step goes to the centre.
             dx, dS, dZ, of_S, of_Z = newton.direction(_CENTRING * mu, [0.0] * len(S))
         x = x + of_S * dx
-        S = [_hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
-        Z = [_hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]
+        S = [hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
+        Z = [hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]
     return best, "Solved" if least < _ENOUGH else "NumericalError"
 
 
@@ -278,7 +279,7 @@ class _Newton:
     def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
         """Return dZ for a given dS."""
         parts = zip(self._Z, dS, left, self._inverse, strict=True)
-        return [_hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
+        return [hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 
 
 def _inner(problem: ConeProgram, Z: _Parts) -> Array:
@@ -298,10 +299,6 @@ def _longest(roots: _Parts, steps: _Parts) -> float:
 
 def _adjoint(X: Any) -> Any:
     return np.conj(np.swapaxes(X, -1, -2))
-
-
-def _hermitian(X: Any) -> Any:
-    return (X + _adjoint(X)) / 2
 
 
 def _product(X: Any, Y: Any) -> float:

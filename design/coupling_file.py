@@ -1,7 +1,7 @@
 """JSON files of couplings: the loop, the coefficients and the certificate.
 
-Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an error
-that names it.
+Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field raises an
+error with its name.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.result import Environments
 
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
-Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"
-
+Rows = tuple[tuple[_Rational, ...], ...]  # rows of a matrix, rationals "p/q"
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
 
@@ -32,14 +31,14 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 class Certificate(Strict, frozen=True):
     """The claim about a coupling in its loop and its proof: base condition, facts, multipliers, matrices."""
 
-    condition: str  # the base: a name of design.result.CONDITIONS, or the name of a condition of the user's own
-    facts: tuple[str, ...]  # what it covers beyond one linear network with constant delays (design.conditions.FACTS)
+    condition: str  # the base: a name of design.result.CONDITIONS, or the name of a user's own condition
+    facts: tuple[str, ...]  # covered properties beyond one linear network with constant delays (conditions.FACTS)
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep with these multipliers
-    available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
+    available: tuple[float, ...]  # (m,) [N s/m], the damping for which the condition is proved
     margin: float  # available / required
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
-    multipliers: dict[str, tuple[float, ...]]  # by name, each decimal taken exactly; "rho" is the limiter's lag [N/m]
+    multipliers: dict[str, tuple[float, ...]]  # by name, exact decimals; "rho" is the limiter's stiffness [N/m]
     matrices: dict[str, Rows]  # P, and P1, P2, .. of further environments
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
@@ -74,24 +73,23 @@ class Stored(Strict, frozen=True):
         return self.coupling.build(self.loop.T)
 
 
-#: allowed difference between the responses of a coupling and its form, relative to the largest response: rounding
-_SAME = 1e-9
+_SAME = 1e-9  # rounding between the responses of a coupling and its form, relative to the largest response
 
 
 def filed(loop: Loop, coupling: Coupling) -> Coupling:
-    """Return the coupling that a file gives back: itself, or the one that the form of a user's own class builds.
+    """Return the coupling as a file restores it: itself, or the one that the form of a user's own class builds.
 
-    Raises InputError if that is another system, in the loop or in its compliance.
+    Raises InputError if the restored coupling is another system, in the loop or in its compliance.
     """
     built = coupling.form().build(loop.T)
     if type(built) is type(coupling):
         return coupling
     through = loop.walled if loop.environment.walls else loop.sent
     V, rebuilt = coupling.compliance(loop.T), built.compliance(loop.T)
-    for what, own, other in (("around", through(coupling), through(built)), ("compliance", V, rebuilt)):
+    for method, own, other in (("around", through(coupling), through(built)), ("compliance", V, rebuilt)):
         if own is None:
             continue
-        name = f"coupling {type(coupling).__name__}: form(), which a file keeps, is another system than {what}()"
+        name = f"coupling {type(coupling).__name__}: form(), which a file keeps, is another system than {method}()"
         if other is None:
             raise InputError(f"{name}: it is a {built.kind} and has no compliance")
         z = on_circle(frequencies(own))
@@ -103,13 +101,13 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
 
 
 def digest(*parts: msgspec.Struct) -> str:
-    """Return sha256 over the canonical JSON of the parts: sorted keys, shortest decimals, floats with a point."""
+    """Return the SHA-256 of the parts' canonical JSON: sorted keys, shortest decimals, floats with a point."""
     plain = [msgspec.json.decode(_canonical(_read_back(part))) for part in parts]
     return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
 
 def _read_back(part: _Part) -> _Part:
-    """Return the part after writing and reading it; unchanged if it contains a class of the user's own."""
+    """Return the part after writing and reading it; unchanged if it contains a user's own class."""
     try:
         return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
     except (TypeError, msgspec.ValidationError):
@@ -121,7 +119,7 @@ def _canonical(part: Any) -> bytes:
 
 
 def own_fields(part: Any) -> Any:
-    """Return an environment or an array of the user's own as plain data: its class and its fields."""
+    """Return an array, or the class and the fields of a user's own environment, as plain data."""
     return part.tolist() if isinstance(part, np.ndarray) else {"class": type(part).__qualname__} | vars(part)
 
 
@@ -153,7 +151,7 @@ class _Twice(Exception):
 
 
 def _once(pairs: list[tuple[str, Any]]) -> None:
-    """Refuse a repeated name: a JSON reader would take the last value, a person may read the first."""
+    """Raise _Twice for a repeated name, of which JSON readers take the last value and people may read the first."""
     names: set[str] = set()
     for name, _ in pairs:
         if name in names:
@@ -171,7 +169,7 @@ def _place(content: bytes, message: str) -> str:
 
 
 def save(stored: Stored, path: str | Path) -> None:
-    """Write through a temporary file beside `path`, so that a reader never sees half of it. Raises InputError."""
+    """Write through a temporary file beside `path`, so that the file is always complete. Raises InputError."""
     if _read_back(stored) is stored:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
         own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")

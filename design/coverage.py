@@ -79,7 +79,7 @@ class OverRanges:
     required_over_available: NominalWorst
     rms_mismatch_db: NominalWorst
     relative_mismatch_db: NominalWorst
-    worst: str  # where the rms mismatch is largest
+    worst: str  # name of the member with the largest rms mismatch
 
     @classmethod
     def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
@@ -104,11 +104,11 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of a design over the ranges, after those of the design that `nominal` makes without ranges."""
+    """Return the figures of a design over the ranges, after those of `nominal`, a design without ranges."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}
-        with suppress(DesignFailed):  # Ranges have another basis by default.
+        with suppress(DesignFailed):  # The nominal design has another default basis and may fail.
             couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]

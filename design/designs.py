@@ -1,4 +1,4 @@
-"""The designs by name: which there are, what each can be asked, and one call for all of them."""
+"""The kinds of designs by name with their options, and one function that makes all of them."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 
 class _Kind(NamedTuple):
-    """One design: what it promises, where it is made, and what can be asked of it."""
+    """One kind of design: its conditions, its function and its options."""
 
-    conditions: tuple[Condition, ...]  # that it can be made for, its own first
+    conditions: tuple[Condition, ...]  # allowed conditions, the default first
     module: str  # of design/, imported on first use
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # further arguments: condition, progress
     options: tuple[str, ...] = ()  # names of design.api.DesignOptions that the function takes
-    model: bool = False  # whether the coupling contains a model of the environment, which admits ranges and no walls
+    model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether limited forces are covered by default
     softened: bool = False  # whether it may be redesigned for less damping until a second condition holds
 
@@ -70,19 +70,19 @@ KINDS = {
 }
 
 
-_OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # of a function of the user's own
+_OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # for a user's own function
 
 
 def kind_of(name: str) -> _Kind:
-    """Return the kind of that name, or the kind of the user's own functions."""
+    """Return the kind of that name, or the kind of a user's own function."""
     return KINDS.get(name, _OWN)
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
-    A spring-damper is designed for this environment, which feels best, and for any environment before walls and worlds,
-    for ranges and for delays that vary. Other kinds have one condition.
+    A spring-damper is designed for this environment, which has the least transparency error. For walls, worlds, ranges
+    and varying delays it is designed for any environment. Other kinds have one condition.
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
@@ -112,11 +112,11 @@ def design_by_kind(
     Args:
         loop: The loop.
         kind: A name of KINDS, or FILE.py:NAME of a function of the user's own.
-        condition: The condition; None for `usual_condition`. For a condition of the user's own the coupling is designed
-            for the kind's usual condition, with as much of the damping as lets both conditions hold.
+        condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed for
+            the kind's usual condition, for the largest share of the damping with which both conditions hold.
         progress: Called during long searches with (task, steps done, number of steps).
-        **options: Those of the kind's function: order, method and diagonal for ccl, design.program.Options for optimal.
-            A spring-damper covers limited forces if such a coupling is found; `limiter` True requires it.
+        **options: Options of the kind (design.api.DesignOptions). A spring-damper covers limited forces if such a
+            coupling exists; `limiter` True requires it.
 
     Raises:
         ValueError: The kind or condition does not exist, or does not suit the loop.
@@ -175,7 +175,7 @@ def design_by_kind(
 
 def _without_force(loop: Loop) -> bool:
     """Return whether the environment has a model and never exerts a force."""
-    with suppress(SingularLoop):  # a rigid wall or a world has no E(z)
+    with suppress(SingularLoop):  # A rigid wall or a world has no E(z).
         return silent(loop.E())
     return False
 
@@ -191,10 +191,10 @@ class _Turned(Environment):
         return Q.T @ self.of.E(T) @ Q
 
     def active(self, T: float) -> str | None:
-        return self.of.active(T)  # an orthogonal Q moves no power
+        return self.of.active(T)  # An orthogonal Q does not change the power.
 
 
-_ROUNDED = 1e-9  # of the damping: turned levels leave more than the rounding of their eigenvalues
+_ROUNDED = 1e-9  # share of the damping that covers the rounding of the levels' eigenvalues
 
 
 def _in_principal_axes(
@@ -204,14 +204,14 @@ def _in_principal_axes(
     progress: Callable[[str, int, int], None],
     options: dict[str, Any],
 ) -> Design:
-    """Return the design in the principal axes of the levels, turned back, and judged by the levels themselves.
+    """Design in the principal axes of the levels, turn the coupling back, and judge it by the levels themselves.
 
-    With Delta_i = Q_i diag(d) Q_i' of every device, Q' Delta Q is diagonal, and no condition and no mismatch changes
-    if E and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError where the condition or a design says nothing
-    of full levels, DesignFailed where the coupling is not certified.
+    With Delta_i = Q_i diag(d) Q_i' of every device, Q' Delta Q is diagonal. Conditions and mismatch do not change if E
+    and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError if the loop or the kind does not allow full levels,
+    DesignFailed if the coupling is not certified.
     """
-    for name, there in (("environment.walls", loop.environment.walls), ("ranges", loop.ranges)):
-        if there:
+    for name, present in (("environment.walls", loop.environment.walls), ("ranges", loop.ranges)):
+        if present:
             why = f"a {kind} is designed in the principal axes of the damping, into which {name} are not turned"
             raise ValueError(f"levels: {why}; a moving-average takes any")
     if kind == "ccl":
@@ -263,20 +263,19 @@ def own_coupling(name: str, loop: Loop) -> Any:
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
-#: largest unused share of the damping at which `_with_less_damping` ends
-_UNUSED = 0.005
+_UNUSED = 0.005  # largest unused share of the damping at which `_with_less_damping` ends
 
 
-def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Condition) -> Design:
+def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Condition) -> Design:
     """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
 
-    The designs neglect the latency and take all walls as touching; for any environment they have the longest delay.
+    The designs neglect the latency and assume that all walls touch; for any environment they have the longest delay.
     """
     share, best, shortfall = 1.0, None, ""
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
         part = msgspec.structs.replace(constant, latency=None, delta=tuple(share * d for d in loop.delta))
-        design = made(part)
+        design = make(part)
         needs = condition.judge(loop.at(loop.environment), design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
@@ -301,9 +300,9 @@ def nearby(
 ) -> Nearby:
     """Return the condition's requirement for environments within ten percent, and the cost of a design for them.
 
-    The result is empty for a condition that holds in any environment. The cost is left out for a condition of the
-    user's own, for walls, for ranges, for an environment that is no network of springs, and for a coupling other than
-    a force filter or none.
+    The result is empty for a condition that holds in any environment. The cost is left out for a user's own condition,
+    for walls, for ranges, for an environment that is no network of springs, and for a coupling other than a force
+    filter or none.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return Nearby()

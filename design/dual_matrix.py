@@ -1,21 +1,22 @@
-"""The matrix of a dual point, bounded from below on the whole circle and not only at samples.
+"""The matrix of a dual point, with a lower bound of its eigenvalues on the whole circle, not only at samples.
 
 D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 (see `bound`), scaled by root(delta) from both sides. H is
 piecewise linear with bends c_i at x_i, so that with H_0 = mean and a = 1/z - 1
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
-Let an interval of length l hold no bend inside. The error of linear interpolation is there at most
+In an interval of length l without a bend inside, the error of linear interpolation is at most
 - l^2/8 max |f^(2)| for any f;
-- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), d the distance of the interval from 0 modulo 2 pi, because
-  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2, |cot(x/2)|/2 <= 1/|x|, and because the error of x log x, whose second
-  derivative is 1/x, is largest on [0, l], where it is l/e;
-- l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with the derivatives in the middle: for the sum over the bends that
-  are far away, whose terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
-- |a| (that of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g: a times the interpolant of g is left, whose second
-  derivative is a^(2) times the interpolant and 2 a^(1) times its slope, |a^(1)| = |a^(2)| = 1.
-The line between two Hermitian matrices has no smaller eigenvalue than they have. So the least one in the interval is
-at least the smaller one of its ends less the Frobenius norm of these errors and of what rounding may add.
+- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi, because
+  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2 and |cot(x/2)|/2 <= 1/|x|, and because the error of x log x, whose
+  second derivative is 1/x, is largest on [0, l], where it is l/e;
+- l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with derivatives in the middle, for the sum over far bends, whose
+  terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
+- |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the
+  interpolant of g, whose second derivative is a^(2) times the interpolant and 2 a^(1) times its slope, with
+  |a^(1)| = |a^(2)| = 1.
+No matrix on the line between two Hermitian matrices has a smaller eigenvalue than both of them. The least eigenvalue in
+the interval is therefore at least the smaller one at its ends, less the Frobenius norm of these errors and of rounding.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from haptic_loop.design.frequency import hermitian
 _UNIT = 2.0**-53
 _EVALUATION = 6e-8  # units of counted work for one bend at one frequency
 _MOST = 40_000_000  # bends times frequencies of one matrix: about two seconds
-_CHUNK = 2**18  # bends times frequencies at once, so that they stay in the cache
-_FAR = 2.0  # lengths of an interval, beyond which a bend counts as far away
-_COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, with room
-_SHARE = 8  # the error is at most this part of what is wanted, or of what is missing at the ends anyway
+_CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache
+_FAR = 2.0  # distance beyond which a bend counts as far, in lengths of the interval
+_COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, rounded up
+_SHARE = 8  # intervals are halved until their error is below 1/_SHARE of the tolerance, or of the shortage at the ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class DualMatrix:
 
     @classmethod
     def of(cls, points: Array, heights: Complex, scale: Array, sums: Array) -> DualMatrix:
-        """Return D of an H that is piecewise linear with these heights (n, m, m) at the points, zero at both ends.
+        """Return D for a piecewise linear H with these heights (n, m, m) at the points, zero at both ends.
 
         `scale` (m, m) is 4/T times the roots of the damping.
         """
@@ -63,10 +64,10 @@ class DualMatrix:
         return self._parts(w)[1]
 
     def lower(self, swept: Array, wanted: float) -> tuple[float, Array, Array]:
-        """Return a number below every eigenvalue of D on the circle, and where D was evaluated with what least one.
+        """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
         The intervals between the frequencies `swept` and the bends are halved until each has a bound above -wanted, or
-        one that is as low as D is at its ends, or until the counted work is spent.
+        a bound near the eigenvalues at its ends, or until the counted work is spent.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
         budget = _MOST // self.points.size - w.size
@@ -97,12 +98,12 @@ class DualMatrix:
         return float(bound) - self.rounding(), np.concatenate(where)[order], np.concatenate(values)[order]
 
     def rounding(self) -> float:
-        """Return how far rounding may move an eigenvalue of D, at any frequency.
+        """Return a bound of the error of D's eigenvalues by rounding, at any frequency.
 
-        In units of u = 2^-53: a complex sum of n products is off by 3 (n + 6) of the sum of their absolute values, with
-        |Li2| <= 2; Li2 itself by 300, of which its argument's own rounding of 2 pi times the logarithm in its slope are
-        160; a bend by 8 of the slopes beside it; |a| is at most 2, and off by 2; a power z^-k by 7 (k + 2). An
-        eigenvalue is off by 20 m of the norm.
+        The errors are, in units of u = 2^-53: 3 (n + 6) times the sum of absolute values for a complex sum of n
+        products, with |Li2| <= 2; 300 for Li2, of which 160 come from the rounding of its argument near 2 pi; 8 times
+        the adjacent slopes for a bend; 2 for a, with |a| <= 2; 7 (k + 2) for a power z^-k; 20 m times the norm for an
+        eigenvalue.
         """
         m, bends, slopes = len(self.mean), np.abs(self.bends).sum(axis=0), self.slopes.sum(axis=0)
         steps = np.arange(len(self.sums))[:, None, None]
@@ -137,7 +138,7 @@ class DualMatrix:
         squares = np.arange(len(self.sums))[:, None, None] ** 2
         error = error + length**2 / 8 * (squares * np.abs(self.sums)).sum(axis=0)
         norm = np.linalg.norm((error + np.swapaxes(error, 1, 2)) / 2, axis=(1, 2))
-        return (1 + 1e-9) * norm  # these sums have no negative terms: they are off by far less
+        return (1 + 1e-9) * norm  # The sums have no negative terms, so their rounding is far smaller.
 
     def _interpolation(self, left: Array, right: Array) -> Array:
         """Return bounds on the errors of the entries of g, (k, m^2); left and right are (k, 1)."""

@@ -121,14 +121,14 @@ class Multiplied(Condition):
         ratio, w = search.swept(values)
         if np.isinf(ratio):
             names = ", ".join(each.name for each in unknowns)
-            reason = f"no multiplier {names} that was found proves it, whatever the damping"
+            reason = f"no multiplier {names} was found for which any damping is enough"
             return replace(refusal(self.name, delta, reason), multiplier=values)
         needed = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
         return replace(needed, multiplier=values, bound=bound and min(bound, ratio))
 
-    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
+    def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         """Return the reason why the block's static matrices violate it by more than rounding, or None."""
-        return unsound_static(asked.free, asked, loop.delta)
+        return unsound_static(demand.free, demand, loop.delta)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if self.unknowns(loop):
@@ -162,8 +162,8 @@ _DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; smaller ones 
 class _Search:
     """Search for the multiplier with the least required damping, by cutting planes."""
 
-    def __init__(self, condition: Multiplied, G: Lti, loop: Loop, asked: Demand[Lti]) -> None:
-        system, self._block, unknowns = asked.free, partial(condition.block, G, loop), condition.unknowns(loop)
+    def __init__(self, condition: Multiplied, G: Lti, loop: Loop, demand: Demand[Lti]) -> None:
+        system, self._block, unknowns = demand.free, partial(condition.block, G, loop), condition.unknowns(loop)
         self._scaled, self._named = partial(condition.scaled, G, loop), partial(condition.named, loop)
         self._hands, self._loop = condition.hands(loop), loop
         self._names = ", ".join(each.name for each in unknowns)
@@ -173,7 +173,7 @@ class _Search:
         self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last values and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
-        self._spare = np.diag(np.zeros(system.outputs) if asked.spare is None else asked.spare)
+        self._spare = np.diag(np.zeros(system.outputs) if demand.spare is None else demand.spare)
         self._plain: list[Demand[Lti]] = []  # the block for zero multipliers, then for each unknown alone
         self._root = np.ones(system.outputs)  # scales the rows of an inequality to about one
         self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0
@@ -242,7 +242,10 @@ class _Search:
         return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
-        """Return (largest ratio at these values with the spare kept, frequencies to add); none at the bound."""
+        """Return (largest ratio at these values, frequencies to add); no frequencies if the ratio is at the bound.
+
+        The ratio is for the block less its spare, so that the multiplier may be rounded.
+        """
         demand = self._block(values)
         demand = replace(demand, free=demand.free - self._spare) if self._spare.any() else demand
 
@@ -300,8 +303,8 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the start of each multiplier.
 
-        alpha is half the width of the delays times a device's largest own force per displacement. For many devices,
-        whose multipliers are not searched, it is the best share of that.
+        alpha is half the width of the delays times the device's largest force per own displacement. With many devices,
+        whose multipliers are not searched, alpha is the best of several shares of this value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -370,10 +373,10 @@ class ThisEnvironment(Multiplied):
         best, _ = most(super().required(hardest, coupling).multiplier)
         return min(usual, best, key=lambda requirement: requirement.ratio)
 
-    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
-        """Check the static part, with rounding relative to the size of each channel and wall: their units differ."""
+    def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
+        """Check the static part; rounding is relative to the size of each channel and wall, whose units differ."""
         if not loop.environment.walls:
-            return super().unsound_static(G, loop, asked)
+            return super().unsound_static(G, loop, demand)
         m, S1 = loop.channels, G.dc()
         own = np.abs([np.diag(part) for part in (S1, G.D, G.at(-1.0))]).max(axis=0)
         if (np.abs(S1 - S1.T) > _ROUNDING * np.sqrt(np.outer(own, own))).any():
@@ -470,7 +473,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device, to six digits; the factor on the damping does not scale it."""
+        """Return rho [N/m] per device, to six digits; rho does not grow with the factor s on the damping."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -490,12 +493,12 @@ class LimitedForces(ThisEnvironment):
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
 
     def not_designed(self, loop: Loop) -> str | None:
-        """Return why no design spends the damping on this condition, which judges more loops, or None."""
+        """Return the reason why no design for limited forces exists in this loop, or None; other loops are judged."""
         if loop.varying_delay:
             return "limiter: designs for limited forces are made for constant delays, not for delays that switch"
         if loop.environment.walls or loop.latency:
-            what = "walls" if loop.environment.walls else "a latency"
-            return f"limiter: designs for limited forces are made in linear environments without {what}"
+            obstacle = "walls" if loop.environment.walls else "a latency"
+            return f"limiter: designs for limited forces are made in linear environments without {obstacle}"
         if loop.ranges:
             return "limiter: designs for limited forces are made for one environment, not for ranges"
         return self.beyond(loop)

@@ -1,4 +1,4 @@
-"""Exact arithmetic: definiteness and positive realness over the rationals, and a proof's matrix as a file holds it."""
+"""Exact arithmetic: definiteness and positive realness over the rationals, and the matrices of proofs in files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from haptic_loop.design.result import NotProved, Requirement
 
 
 _Integers = NDArray[np.object_]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +81,9 @@ _LIMBS, _BIT = 5e-9, 3e-11  # units of counted work of a product of integers, an
 
 
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
-    """Multiply X' M X exactly. This is the one place that converts to FLINT's matrices and back.
+    """Return the exact product X' M X, (m, m), of Python integers X (n, m) and M (n, n), by FLINT's matrices.
 
-    Args: X (n, m), M (n, n), Python integers. Returns (m, m). Raises TooLong if the budget of `within` is spent.
+    Raises TooLong if the budget of `within` is spent.
     """
     import flint
 
@@ -101,12 +100,12 @@ def _congruence(X: _Integers, M: _Integers) -> _Integers:
 
 @dataclass(frozen=True)
 class _Definiteness:
-    """What the exact elimination of a symmetric matrix found."""
+    """The result of the exact elimination of a symmetric matrix."""
 
     definite: bool
     semidefinite: bool
     minor: int | None = None  # order of the first leading minor that is not positive, 1-based
-    sign: int | None = None  # its sign: -1, or 0
+    sign: int | None = None  # sign of that minor: -1, or 0
 
     def __str__(self) -> str:
         if self.definite:
@@ -115,15 +114,15 @@ class _Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
-_MANY_ROWS = 8
+_MANY_ROWS = 8  # above it `strictly_positive` is tried before the elimination
 
 
 def definiteness(S: Matrix) -> _Definiteness:
     """Decide whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
-    The pivots of the elimination are the leading minors themselves. A zero pivot leaves a semidefinite
-    matrix only if its whole row of the Schur complement is zero; that row is then passed over. A large matrix is tried
-    by `strictly_positive` first. Raises ValueError if S is not exactly symmetric.
+    The pivots of the elimination are the leading minors themselves. If a pivot is zero, S is semidefinite only if the
+    pivot's entire row in the Schur complement is zero; the row is then skipped. A large matrix is tested with
+    `strictly_positive` first. Raises ValueError if S is not exactly symmetric.
     """
     if S.shape[0] > _MANY_ROWS and strictly_positive(S):
         return _Definiteness(True, True)
@@ -148,23 +147,24 @@ def definiteness(S: Matrix) -> _Definiteness:
 # ----------------------------------------------------------------------------------------------------
 # A proof that a symmetric rational matrix S is positive definite, whose cost is that of a few products.
 #
-# Floating point proposes, integers decide: for any matrix R, R'SR > 0 implies S > 0 (x = R y; R'SR could not be
-# definite if R lost a direction). R is the inverse of the Cholesky factor of S in floating point, rounded to binary
-# fractions; then R'SR is nearly the identity, and an exact product shows that its diagonal dominates its rows
-# (Gershgorin). Elimination would be exact too, but its numbers grow with every pivot.
+# For any square matrix R, R'SR > 0 implies S > 0: x = R y reaches every x, because R'SR could not be definite with a
+# singular R. R is the inverse of the Cholesky factor of S in floating point, rounded to binary fractions. R'SR is then
+# nearly the identity, and an exact product shows that its diagonal dominates its rows (Gershgorin). Elimination would
+# be exact, too, but its numbers grow with every pivot.
 
 
 BITS = 192  # of the rounded matrix whose definiteness is tested
 _FACTOR_BITS = 46  # of the entries of R, relative to the largest
-GROWTH = 2.0**-40  # part of the identity that is added where rounding has made the factorisation fail
+GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
 def strictly_positive(S: Matrix) -> bool:
     """Return whether S > 0 is proved, for an exactly symmetric S (n, n).
 
-    S is scaled by powers of two to a diagonal near one and every entry rounded to a multiple of 2^-BITS. The error is
-    at most 2^-BITS / 2 per entry, hence n 2^-BITS in norm, which is taken off the diagonal. The numbers in the products
-    stay short however long those of S are. Raises ValueError if S is not exactly symmetric.
+    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-BITS. The error
+    is at most 2^-BITS / 2 per entry, hence at most n 2^-BITS in norm, which is subtracted from the diagonal. Rounding
+    keeps the numbers in the products short, however long those of S are. Raises ValueError if S is not exactly
+    symmetric.
     """
     if not (S.num == S.num.T).all():
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
@@ -224,28 +224,28 @@ def _longest(W: _Integers) -> int:
     return max((v.bit_length() for v in W.ravel().tolist()), default=0)
 
 
-def _dominates(W: Floats) -> bool:
+def _dominates(W: Array) -> bool:
     """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
 
-    Decided for the integers of which `_floats` made W. Those are within 2^-53 of each entry and 2^-900 of the largest
-    one, and a sum of n < 2^11 terms is within n 2^-53 of its value: both are far below the factor 1 + 2^-40.
+    The answer holds for the integers from which `_floats` made W. Their rounding is 2^-53 of each entry and 2^-900 of
+    the largest one, and that of a sum of n < 2^11 terms is n 2^-53. Both are far below the factor 1 + 2^-40.
     """
     diagonal = np.diag(W)
     others = np.abs(W).sum(axis=1) - np.abs(diagonal)
     return bool((diagonal > (1 + 2.0**-40) * (others + 2.0**-40 * np.abs(diagonal) + 2.0**-800)).all())
 
 
-def _floats(W: _Integers) -> Floats:
+def _floats(W: _Integers) -> Array:
     """Return W in double precision, times a power of two that brings its largest entry near one.
 
-    Each entry is off by at most 2^-53 of itself and 2^-900 of the largest.
+    The error of each entry is at most 2^-53 of itself plus 2^-900 of the largest.
     """
     longest = _longest(W)
     shift = max(longest - 950, 0)
     return np.ldexp((W >> shift).astype(np.float64), shift - longest)
 
 
-def _whitening(W: Floats) -> _Integers | None:
+def _whitening(W: Array) -> _Integers | None:
     """Return R for which R'WR is nearly a multiple of the identity, or None if W is far from definite."""
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
@@ -253,7 +253,7 @@ def _whitening(W: Floats) -> _Integers | None:
     half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2  # powers of two that make the diagonal even
     with np.errstate(over="ignore"):
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
-    if not np.isfinite(W).all():  # entries beyond all proportion to the diagonal
+    if not np.isfinite(W).all():  # An entry is far too large for the diagonal.
         return None
     for added in (0.0, GROWTH):
         try:
@@ -268,35 +268,35 @@ def _whitening(W: Floats) -> _Integers | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Strict positive realness of a block G = (A, B, C, D): found by a Riccati equation, proved in exact arithmetic.
+# Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, exact arithmetic proves it.
 #
 # Kalman-Yakubovich-Popov: if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
-# then A is stable (x'Px falls along x+ = Ax, by the first block) and He G > 0 on the whole unit circle,
-# because [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequalities
-# are tested exactly for P rounded to some bits, a P as good as any other; what else is rounded is bounded and paid.
+# then A is stable (x'Px falls along x+ = Ax, by the first block) and He G > 0 on the unit circle, because
+# [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequalities are tested exactly for a rounded P,
+# which is as good as any other. The errors of all other rounding are bounded and subtracted.
 
 
-_MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
+_MOST_BITS = 4000  # of the common denominator of a stored P; our own have some hundred bits
 _STORED_BITS = 48  # of each entry of P, relative to its diagonal
-_EXTENDED_BITS = 96  # of what is multiplied exactly, relative to the largest entry: more than extended precision has
-_LEAST_MOVED = 1e-10  # of the largest: a smaller variance of states that move by as much each is taken for this
-_LEFT = 0.02  # part of the drive that rounding may leave of the Riccati equation
+_EXTENDED_BITS = 96  # of the factors of exact products, relative to the largest entry; extended precision has fewer
+_LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
+_LEFT = 0.02  # largest residual of the Riccati equation, relative to its drive
 _UNIT = 2.0**-53  # of double precision
-_ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and of A, B, C and D, that a proof is tried with
+_ACCURACIES = (48, 112), (192, 192)  # pairs of binary digits of P, and of A, B, C and D, with which a proof is tried
 _MOST_UNITS = 2.0**50
-_SAMPLES = 400  # frequencies at which states are looked at, about
+_SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
 
 def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
     """Return the matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
-    multiples of 2^-bits: the rounded P is as good a proof as any other, and is exactly known. The other matrices are
+    multiples of 2^-bits; the rounded P is exactly known and as good a proof as any other. The other matrices are
     rounded to multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded
-    down to multiples of u. So every entry is off by less than 2 u, and the matrix by less than 2 (n + m) u in norm,
-    apart from E: |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point gives to
-    better than a hundredth.
+    down to multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm. The error
+    by E is |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, of which floating point gives at least
+    two digits.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
@@ -312,7 +312,7 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     J = rounded(np.hstack([G.A, G.B]), state, [*state, *channel])
     C = rounded(G.C, minus := [-h for h in channel], state)
     D = rounded(G.D, minus, channel)
-    W = -_congruence(J, storage)  # in units of 2^-bits u^2, like the parts that are added to it
+    W = -_congruence(J, storage)  # in units of 2^-bits u^2, like the following terms
     W[:n, :n] += storage << 2 * finer
     W[n:, :n] += C << bits + finer
     W[:n, n:] += C.T << bits + finer
@@ -326,14 +326,14 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
 
 
 def too_large(states: int) -> str | None:
-    """Return the reason why no proof is tried for a model of so many states, or None."""
+    """Return the reason why no proof is tried for this number of states, or None."""
     if states <= budgets.PROOF_STATES:
         return None
     return f"a proof over {states} states takes long: up to {budgets.PROOF_STATES} are tried"
 
 
 def require_size(states: int, requirement: Requirement | None = None) -> None:
-    """Raise NotProved if exact arithmetic over so many states would take minutes."""
+    """Raise NotProved if exact arithmetic over this number of states would take minutes."""
     if reason := too_large(states):
         raise NotProved(reason, requirement)
 
@@ -363,8 +363,8 @@ def prove_positive_real(G: Lti, P: Matrix) -> str | None:
 def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     """Return whether a direction makes the KYP matrix negative by more than every rounding error.
 
-    The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], sums of products of three correctly
-    rounded numbers: entry by entry the computed one is within gamma (|S| + |J|'|P||J|),
+    The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], whose entries are sums of products of three
+    correctly rounded numbers. The error of each entry is at most gamma (|S| + |J|'|P||J|),
     gamma = (2n + 8) u / (1 - (2n + 8) u).
     """
     F, p = G.floats(), P.floats()
@@ -380,16 +380,16 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(M)), np.diag(error)) + np.finfo(float).tiny)
     _, basis = np.linalg.eigh(scale[:, None] * M * scale)
     x = scale * basis[:, 0]
-    # x'Mx is itself computed with at most 2(n + m) + 2 roundings per term
+    # The computation of x'Mx has at most 2(n + m) + 2 roundings per term.
     k = 2 * (x.size + 1) * _UNIT
     bound = np.abs(x) @ error @ np.abs(x) + 2 * k * (np.abs(x) @ np.abs(M) @ np.abs(x))
     return bool(x @ M @ x < -2 * bound)
 
 
 def reached(G: Lti) -> Lti:
-    """Return the same map over states that an input reaches, by the pattern of A and B; others stay zero from rest.
+    """Return the same map without the states that no input reaches, by the pattern of A and B.
 
-    Behind a contact that is lost a filter's states are such. No equation of Riccati is in need of them.
+    Such states stay zero from rest, for example those of a filter behind a lost contact.
     """
     reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
@@ -401,22 +401,21 @@ def reached(G: Lti) -> Lti:
 
 
 class Violated(str):
-    """Why nothing proves a block: somewhere it is negative beyond rounding, as no proof that is only hard to find."""
+    """The reason why a block has no proof: it is negative beyond rounding at some frequency."""
 
 
-_CLEARLY = 1e-6  # below 0, of a block with inputs of size one
+_CLEARLY = 1e-6  # shortage beyond rounding, of a block with inputs of size one
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
-    P is over the states that an input reaches (`reached`).
-    P solves the discrete algebraic Riccati equation of G pushed half-way into its margin: D is reduced by
-    a part of mu = min over |z| = 1 of the least eigenvalue of He G, and the equation is driven by e I,
-    small enough that e |(zI - A)^-1 B|^2 leaves the rest of it. It is solved in coordinates in which white noise at the
-    inputs moves every state alike and independently of the others (but for those that next to none of it moves): there
-    P has condition numbers of 1e9 where it has 1e15 in the states as they are, which are tried next. Back there it is
-    multiplied exactly, and rounded to _STORED_BITS where the proof survives that.
+    P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
+    half of its margin subtracted: D is reduced by a part of mu, the minimum over |z| = 1 of the least eigenvalue of
+    He G. The equation is driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first
+    solved in coordinates in which white noise at the inputs moves all states equally and independently, because there
+    the condition number of P is 1e9 in place of 1e15. The original states are tried next. The result is transformed
+    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -445,7 +444,10 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return the change to independent coordinates and P there, or of the states unchanged. Raises LinAlgError."""
+    """Return (the change of coordinates, P in these coordinates); `white` makes states independent.
+
+    Raises LinAlgError.
+    """
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
         out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2
@@ -462,7 +464,7 @@ def _double(parts: _Parts) -> Lti:
 
 
 def _extended(M: Any) -> Array:
-    """Return Fractions or floats in extended precision: 64 binary digits where the machine has it."""
+    """Return Fractions or floats in extended precision, which has 64 binary digits on some machines."""
     extended = np.asarray(M, dtype=np.float64).astype(np.longdouble)
     if M.dtype == object:
         for place in zip(*np.nonzero(M), strict=True):
@@ -485,7 +487,7 @@ def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
 
 
 def _states(G: Lti) -> NDArray[np.complex128]:
-    """Return (zI - A)^-1 B (k, n, m) on a grid of the circle that knows the poles, to estimate sizes."""
+    """Return (zI - A)^-1 B (k, n, m) on a grid of the circle that is dense near the poles, to estimate sizes."""
     n, m = G.B.shape
     w = frequencies(G, points=100)
     return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(w[:: 1 + w.size // _SAMPLES]))
@@ -493,27 +495,26 @@ def _states(G: Lti) -> NDArray[np.complex128]:
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
-    value, w = supremum(  # of 1 - lambda: `supremum` refines what is within a fifth of the largest, little near zero
+    value, w = supremum(  # of 1 - lambda, because `supremum` refines peaks within a fifth of the largest one
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )
     return 1 - value, w
 
 
 def _independent(covariance: Array) -> tuple[Array, Array]:
-    """Return the change to coordinates of covariance I, and back."""
+    """Return the change to coordinates with the covariance I, and its inverse."""
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # of equal and opposite pushes rounding is left
+    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Cancelling inputs leave rounding only.
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     root = np.sqrt(np.maximum(size, size[-1] * _LEAST_MOVED))
     return (V / root).T / deviation, deviation[:, None] * V * root
 
 
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
-    """Return P (n, n) of the Riccati equation by doubling: its limit from below.
+    """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    What rounding leaves of the equation, Newton's steps take off while there is more of it than a part of the drive:
-    in extended precision, since a lightly damped mode has room for little. Raises LinAlgError where there is no
-    solution.
+    Newton's steps reduce the residual that rounding leaves to a part _LEFT of the drive. They need extended precision,
+    because lightly damped modes have a small margin. Raises LinAlgError if there is no solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)
@@ -526,7 +527,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     for _ in range(budgets.RICCATI_STEPS):
         PA = P @ A
         cross, gap = C - B.T @ PA, R - B.T @ P @ B
-        feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # at the best one its error counts squared
+        feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # The residual is of second order in it.
         half = cross.T @ feedback
         left = A.T @ PA - P + half + half.T - feedback.T @ gap @ feedback + drive * one
         if np.abs(left).max() < _LEFT * drive:
@@ -538,7 +539,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
 def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
     """Return the limit of X = H + A'X (I + S X)^-1 A from X = 0, or without S of X = H + A X A', by doubling.
 
-    Raises LinAlgError where it grows without limit.
+    Raises LinAlgError if the iteration diverges.
     """
     one = np.eye(len(A))
     for _ in range(budgets.DOUBLINGS):
@@ -554,7 +555,7 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
             break
         if np.abs(step).max() <= _UNIT * np.abs(H).max():
             return H
-    raise np.linalg.LinAlgError("what it adds in twice the time does not become less")
+    raise np.linalg.LinAlgError("doubling did not converge")
 
 
 def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
@@ -579,7 +580,7 @@ def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power:
 
 
 def _shortened(P: Matrix) -> Matrix:
-    """Return P to STORED_BITS binary digits relative to its diagonal; unchanged if the diagonal is not positive."""
+    """Return P rounded to _STORED_BITS relative to its diagonal; unchanged if the diagonal is not positive."""
     if any(v <= 0 for v in np.diag(P.num)):
         return P
     half = _halves(P)
@@ -590,13 +591,13 @@ _Rows = tuple[tuple[str, ...], ...]
 
 
 def rows_of(M: Matrix) -> _Rows:
-    """Return every entry in lowest terms."""
+    """Return every entry as a text "p/q" in lowest terms."""
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
-    """Return why the matrix of a name does not prove that the block is strictly positive real, or None if it does."""
-    if len(rows) != block.order:  # files made before kept the states that no input reaches
+    """Return the reason why the named matrix does not prove that the block is strictly positive real, or None."""
+    if len(rows) != block.order:  # Older files also have the states that no input reaches.
         block = reached(block)
     n = block.order
     if len(rows) != n:

@@ -1,8 +1,8 @@
-"""A stored coupling, or its whole discrete process, as C99, plain data or a python-control block, with its own test."""
+"""A stored coupling, or its discrete process, as C99 with its own test."""
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("export")
@@ -25,27 +25,27 @@ from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.result import listed, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
-# What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.
+# An export is one state-space block with a fixed order of its sums, and a test vector in that order.
 #
-# A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision that starts at
-# 0.0 and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, ..: an order
-# that every language can keep, so that an exported block repeats its test vector to the last bit. In single precision
+# A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision. It starts at 0.0
+# and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, .. Every language
+# can keep this order, so that an exported block repeats its test vector to the last bit. In single precision
 # coefficients, inputs and every operation are rounded to 24 bits.
 #
-# Where forces are limited, a tick that asks for more solves the box problem of controller.complementarity by switching
-# the first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no
-# pivots since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to
-# f_e. Where the force of a device is limited as a vector, the tick alternates Newton's method in u = f + tau e, whose
-# steps are taken back unless they halve the residual, with the iteration of Douglas and Rachford, which converges. A
-# force that misses its tolerance after _MOST_STEPS is 0, and `unsolved` counts its tick.
+# If a force exceeds its limit, the tick solves the box problem of controller.complementarity. It switches the first
+# wrong limit until none is wrong, which ends (docs/theory.md). The elimination keeps the order of the channels. It
+# needs no pivots, because all principal minors are positive. e then moves [y; z+] by its kick, and the sent forces are
+# set to f_e. If the force of a device is limited as a vector, the tick alternates two methods: Newton's method in
+# u = f + tau e, whose steps are undone unless they halve the residual, and the iteration of Douglas and Rachford, which
+# converges. A force that misses its tolerance after _MOST_STEPS is 0, and `unsolved` counts its tick.
 
 
-_TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
-_MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
+_TICKS = 64  # length of a test vector, longer than the delays and the fast modes of a loop
+_MOST_TURNS = 100_000  # switches in a tick's box problem; a handful are needed
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 170 units in the last place
-_RESIDUAL = 1e-12  # of the limit, in a vector's force; single precision has its rounding, _BALL_ROUNDING units
+_RESIDUAL = 1e-12  # allowed residual of a force vector, relative to the limit; rounding is allowed in addition
 _BALL_ROUNDING = 16  # units in the last place of the terms of a residual
-_MOST_STEPS = 1000  # of a vector's force; five are usual, 93 the most for well-conditioned random problems
+_MOST_STEPS = 1000  # steps for a force vector; five are usual, 93 the most in well-conditioned random problems
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
 
@@ -54,13 +54,13 @@ class _Signal:
     """One side of a block: m numbers of one kind."""
 
     letter: str
-    what: str  # with its unit
-    size: float  # of a test vector's numbers, in that unit
+    what: str  # quantity with its unit
+    size: float  # typical number in a test vector, in that unit
 
 
 _FORCE = _Signal("f", "force [N]", 1.0)
 _DISPLACEMENT = _Signal("x", "displacement [m]", 1e-3)
-_GIVEN_WAY = _Signal("d", "displacement [m]", 1e-3)
+_DEFLECTION = _Signal("d", "displacement [m]", 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +71,13 @@ class ExportedBlock:
     system: Lti  # at least one state
     input: _Signal
     output: _Signal
-    about: tuple[str, ...]  # what it is, one line each
-    limiter: Limiter | None = None  # whose loop the system is while no force is limited
+    about: tuple[str, ...]  # comment lines of the file
+    limiter: Limiter | None = None  # the limiter; `system` is the block while no force is limited
     single: bool = False  # whether the file computes in single precision
 
     @property
     def dtype(self) -> type[np.floating]:
-        """Return the type of every number in the file."""
+        """The type of every number in the file."""
         return np.float32 if self.single else np.float64
 
 
@@ -85,22 +85,18 @@ class ExportedBlock:
 class _Trial:
     """A test vector."""
 
-    inputs: Array  # (TICKS, m)
-    outputs: Array  # (TICKS, m)
-
-
-class NothingToExport(ValueError):
-    """The coupling has no block of the kind that was asked for."""
+    inputs: Array  # (_TICKS, m)
+    outputs: Array  # (_TICKS, m)
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """Return V(z), force to displacement. Raises NothingToExport if the coupling is no V in feedback."""
+    """Return V(z), force to displacement. Raises ValueError if the coupling is no V in feedback."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
-        reason = "this coupling is no V in feedback around the environment; the whole process can be had (--process)"
-        raise NothingToExport(reason)
-    about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)
-    return ExportedBlock("coupling", _with_a_state(V), _FORCE, _GIVEN_WAY, about)
+        reason = "this coupling is no V in feedback around the environment; --process exports the process with it"
+        raise ValueError(reason)
+    about = ("d = V f: the deflection of the coupling. In its loop the environment sees u = x - d, and f = Psi E u.",)
+    return ExportedBlock("coupling", _with_a_state(V), _FORCE, _DEFLECTION, about)
 
 
 def process_block(
@@ -109,18 +105,24 @@ def process_block(
     force_limit: Sequence[float] | None = None,
     balls: Sequence[slice] = (),
 ) -> ExportedBlock:
-    """Return F(z) (6), displacements to forces, without Theta if the link to the devices is the delay.
+    """Return F(z) (6), displacements to forces.
 
-    With `force_limit` (m,) [N] they leave through the limiter of the certificate, which limits the channels of each of
-    `balls` as one vector. Raises NothingToExport where the certificate covers none.
+    Args:
+        stored: The coupling with its loop.
+        with_theta: Whether the block contains Theta; False if the link to the devices is this delay.
+        force_limit: (m,) [N] limits of the certificate's limiter; None for a block without a limiter.
+        balls: Channels whose forces the limiter limits as one vector.
+
+    Raises:
+        ValueError: The loop is not linear, or the certificate covers no limiter.
     """
     loop, delays = stored.loop, _delays(stored.loop, with_theta)
     if not with_theta:
         loop = loop.delayed((0,) * loop.channels)
     if getattr(loop.environment, "world", None):
-        raise NothingToExport("a MuJoCo world is no linear block: export the coupling alone, without --process")
+        raise ValueError("a MuJoCo world is no linear block: export the coupling alone, without --process")
     if loop.environment.walls:
-        raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
+        raise ValueError("environment.walls: contact that makes and breaks is not a linear block")
     if force_limit is not None:
         return _limited_block(stored, loop, force_limit, balls, delays)
     about = (
@@ -135,11 +137,11 @@ def _limited_block(
 ) -> ExportedBlock:
     rho = lag(stored.loop, stored.certificate)
     if rho is None:
-        raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
+        raise ValueError("its certificate covers no limited forces: design it anew, or leave out --force-limit")
     limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho, balls=balls)
-    what = "Lengths of a device's force vector" if balls else "Forces"
+    limited = "Lengths of a device's force vector" if balls else "Forces"
     about = (
-        f"f: the whole discrete process with its limiter; the devices get -f, held for T. {what} never exceed "
+        f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
         delays,
     )
@@ -147,7 +149,7 @@ def _limited_block(
 
 
 def _with_a_state(system: Lti) -> Lti:
-    """Return the same block with at least one state, which stays zero: C has no empty arrays."""
+    """Return the same block with at least one state, because C has no empty arrays; an added state stays zero."""
     if system.order:
         return system
     m = system.inputs
@@ -178,11 +180,11 @@ def single_precision_error(block: ExportedBlock, seed: int = 0) -> tuple[float, 
 
 
 def in_single_precision(block: ExportedBlock) -> ExportedBlock:
-    """Return the block in single precision, with a line on the error that this costs."""
+    """Return the block in single precision, with a comment line on its error."""
     error, largest = single_precision_error(block)
-    said = f"Single precision: {_COMPARED} ticks differ from double precision by at most {error:.2g} where the largest "
-    said += f"{block.output.what} is {largest:.3g}. No proof covers this rounding."
-    return replace(block, single=True, about=(*block.about, said))
+    line = f"Single precision: {_COMPARED} ticks differ from double precision by at most {error:.2g} where the largest "
+    line += f"{block.output.what} is {largest:.3g}. No proof covers this rounding."
+    return replace(block, single=True, about=(*block.about, line))
 
 
 def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
@@ -194,7 +196,7 @@ def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
 def sequential(
     system: Lti, inputs: Array, limiter: Limiter | None = None, dtype: type[np.floating] = np.float64
 ) -> Array:
-    """Return outputs (ticks, p) for inputs (ticks, m) from rest, each sum in the order that the module states."""
+    """Return outputs (ticks, p) for inputs (ticks, m) from rest, with the order of sums in the exported file."""
     rows = np.block([[system.C, system.D], [system.A, system.B]]).astype(dtype)
     z, outputs = np.zeros(system.order, dtype), []
     limits = _limits(limiter, dtype) if limiter else None
@@ -217,15 +219,15 @@ def sequential(
 
 
 def _box_matrix(limiter: Limiter) -> Array:
-    """Return M of the box problem (m, m), regular also where nothing holds the environment."""
+    """Return M of the box problem (m, m), made regular if the environment floats."""
     problem = limiter.problem
-    assert isinstance(problem, BoxProblem)  # the exported tick limits channel by channel
+    assert isinstance(problem, BoxProblem)
     M = problem.M
     return M if problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
 
 
 def _turns(m: int) -> int:
-    """Bound the number of switches after which the box problem is solved."""
+    """Return a bound of the number of switches after which the box problem is solved."""
     return min(3**m, _MOST_TURNS)
 
 
@@ -284,9 +286,9 @@ class _Balls(NamedTuple):
     """The problem of limited vectors, with the channels in the order in which its blocks are solved."""
 
     at: list[int]  # (m,) channels
-    first: list[int]  # (m,) where the vector of each entry begins
-    last: list[int]  # (m,) and where it ends
-    end: list[int]  # where each block ends
+    first: list[int]  # (m,) first entry of the vector to which each entry belongs
+    last: list[int]  # (m,) end of the vector to which each entry belongs
+    end: list[int]  # end of each block
     M: list[list[Any]]
     resolvent: list[list[Any]]  # (1 + M/tau)^-1 of each block
     tau: list[Any]
@@ -852,13 +854,13 @@ def _row(values: Array, suffix: str) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What stands above the block.
+# The comment above the block.
 
 
 def with_origin(
     block: ExportedBlock, file: str, stored: Stored, verdict: Verdict, claim: str | None = None
 ) -> ExportedBlock:
-    """Add comment lines on the block's file and on what is proved there; `claim` is a further line."""
+    """Add comment lines on the block's file and on its proof; `claim` is a further line."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
     proved = _guarantee(stored, verdict, block.limiter is not None)
     return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))

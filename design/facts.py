@@ -21,19 +21,20 @@ Values = Mapping[str, Sequence[Any]]  # of the multipliers, by name
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The numbers of one multiplier, and where a search looks for them: in [least, most] units each."""
+    """The numbers of one multiplier, which a search takes from [least, most] units each."""
 
-    name: str  # what a file calls them
-    units: tuple[float, ...]  # (n,); 0 for a number that is 0
-    expected: str  # what they must be, for messages; positive where `least` is
-    least: float
+    name: str  # in files
+    units: tuple[float, ...]  # (n,); 0 for a number that is always 0
+    expected: str  # the allowed values in words, for messages
+    least: float  # if positive, the numbers must be positive
     most: float
-    start: tuple[float, ...] | None = None  # (n,) where a search begins; the units if None
+    start: tuple[float, ...] | None = None  # (n,) first values of a search; the units if None
 
     def check(self, values: Sequence[Any]) -> None:
         """Raise ValueError unless the values may be a multiplier.
 
-        A value without a unit is 0; others are of any sign where `least` is negative, else at least 0, or positive.
+        A number whose unit is 0 must be 0. The others may have any sign if `least` is negative. They must be at least 0
+        if `least` is 0, and positive if `least` is positive.
         """
 
         def allowed(v: Any) -> bool:
@@ -47,48 +48,48 @@ class Unknowns:
 
 
 def longest(loop: Loop, T: Number) -> Any:
-    """The longest period [s] in the arithmetic of T."""
+    """Return the longest period [s] in the arithmetic of T."""
     return T if loop.T_max is None else numbers(loop.T_max, T)
 
 
 # ----------------------------------------------------------------------------------------------------
-# Hands' sides: what every passive hand takes, whatever forces act.
+# Hands' sides: the energy that every passive hand and its device dissipate, whatever forces act.
 
 
 class HandsSide(ABC):
-    """A bound from below on what devices and hands take per tick, as a quadratic form of some inputs."""
+    """A lower bound of the energy that devices and hands dissipate per tick, as a quadratic form of some inputs."""
 
     @abstractmethod
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
-        """Its inputs: their shares of the displacement that a force multiplies, and whether the environment follows."""
+        """Return the inputs, with their shares of the displacement that a force multiplies."""
 
     @abstractmethod
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
-        """The matrix (n, n) over its inputs that grows in proportion to the damping of the devices [N s/m^2]."""
+        """Return the matrix (n, n) over the inputs that is proportional to the devices' damping [N s/m^2]."""
 
     def rest(self, loop: Loop, T: Number, values: Values) -> Sequence[Any]:
-        """Matrices M_0, M_1 over its inputs: M_0 + M_1/z does not grow with the damping."""
+        """Return matrices M_0, M_1 over the inputs; M_0 + M_1/z does not depend on the damping."""
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Its multipliers. A search takes s times each of them as unknown, s the factor on the damping."""
+        """Return the multipliers. A search has s times each of them as unknown, with the factor s on the damping."""
         return ()
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Matrices (k, n, n), linear in s and in s times the multipliers: semidefinite where these are allowed."""
+        """Return matrices (k, n, n), linear in s and in s times the multipliers, that must be semidefinite."""
         return []
 
     def allowed(self, loop: Loop, values: Values) -> Values:
-        """The multipliers, made smaller until they are allowed."""
+        """Return the multipliers, scaled down until they are allowed."""
         return values
 
     def excess(self, loop: Loop, values: Values) -> str | None:
-        """Why the multipliers are not allowed, in exact arithmetic, or None."""
+        """Return the reason why the multipliers are not allowed, by exact arithmetic, or None."""
         return None
 
 
-class EvenPeriods(HandsSide):
-    """Periods that are even, or vary up to T_max: dx' Delta dx/T_max."""
+class _EvenPeriods(HandsSide):
+    """The form dx' Delta dx/T_max, for periods that are even or vary up to T_max."""
 
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
         return [Input("dx", i) for i in range(loop.channels)]
@@ -100,9 +101,9 @@ class EvenPeriods(HandsSide):
 class Latency(HandsSide):
     """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every device.
 
-    The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest
-    period must be longer than t2. Where t1 < t2 the multiplier Q weighs the squares of both parts together: any
-    symmetric Q <= diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
+    The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest period
+    must be longer than t2. If t1 < t2, the multiplier Q weighs both parts together; it may be any symmetric
+    Q <= diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
     """
 
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
@@ -115,11 +116,11 @@ class Latency(HandsSide):
             return ()
         q11, q22 = (tuple(each) for each in zip(*(_separate(loop, d) for d in range(len(loop.devices))), strict=True))
         q12 = tuple(float(np.sqrt(a * b)) for a, b in zip(q11, q22, strict=True))
-        said = "an entry of Q [1/s] of each device, 0 where the latency does not vary"
+        expected = "an entry of Q [1/s] of each device, 0 where the latency does not vary"
         return (
-            Unknowns("q11", q11, said, 0.0, 1e6),
-            Unknowns("q12", q12, said, -1e6, 1e6, start=(0.0,) * len(q12)),
-            Unknowns("q22", q22, said, 0.0, 1e6),
+            Unknowns("q11", q11, expected, 0.0, 1e6),
+            Unknowns("q12", q12, expected, -1e6, 1e6, start=(0.0,) * len(q12)),
+            Unknowns("q22", q22, expected, 0.0, 1e6),
         )
 
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
@@ -135,7 +136,7 @@ class Latency(HandsSide):
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """s - D Q D with D = diag(tau, T_max - tau)^(1/2), at latencies of the range."""
+        """Return s - D Q D with D = diag(tau, T_max - tau)^(1/2), at _LATENCIES latencies of each range."""
         bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
@@ -149,7 +150,7 @@ class Latency(HandsSide):
             tau = np.linspace(*_ranges(loop)[d], _CLOSER)
             D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
             most = np.linalg.eigvalsh(D[:, :, None] * Q * D[:, None, :]).max()
-            for less in _LESS:  # than what rounding of entries and latencies in between cost
+            for less in _LESS:  # The reduction covers rounding of the entries, and latencies between the samples.
                 entries = [float(f"{(1 - less) / most * Q[a, b]:.{_DIGITS}g}") for a, b in ((0, 0), (0, 1), (1, 1))]
                 if _admits(loop, d, entries):
                     break
@@ -169,23 +170,23 @@ class Latency(HandsSide):
         return None
 
 
-_LATENCIES, _CLOSER = 9, 400  # of a range: in a search, and where its result is made smaller
+_LATENCIES, _CLOSER = 9, 400  # samples of a range: in a search, and for scaling its result
 _DIGITS = 10  # of an entry of Q
-_LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4
+_LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4  # relative reductions of Q that are tried
 
 
 def _varies(loop: Loop) -> list[int]:
-    """The devices whose latency lies in a range."""
+    """Return the devices whose latency lies in a range."""
     return [d for d, (first, last) in enumerate(_ranges(loop)) if first < last]
 
 
 def _ranges(loop: Loop) -> list[tuple[float, float]]:
-    """The latency [s] of every device, which its axes share."""
+    """Return the latency [s] of every device, which its axes share."""
     return [loop.latency[own.start] for own in loop.devices] if loop.latency else []
 
 
 def _separate(loop: Loop, d: int) -> tuple[float, float]:
-    """Decimals of at most 1/t2 and 1/(T_max - t1) [1/s], which charge both parts of a period apart; 0, 0 without Q."""
+    """Return decimals of at most 1/t2 and 1/(T_max - t1) [1/s], the diagonal Q; (0, 0) for a constant latency."""
     if d not in _varies(loop):
         return 0.0, 0.0
     (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
@@ -197,15 +198,15 @@ def _separate(loop: Loop, d: int) -> tuple[float, float]:
 
 
 def _entries(values: Values, d: int) -> Array:
-    """Q (2, 2) of a device."""
+    """Return Q (2, 2) of a device."""
     q11, q12, q22 = (values[name][d] for name in ("q11", "q12", "q22"))
     return np.array([[q11, q12], [q12, q22]])
 
 
 def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
-    """Whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of device d, over the rationals.
+    """Return whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of device d, over the rationals.
 
-    That is q11 tau <= 1, q22 (T_max - tau) <= 1, and a quadratic in tau, the determinant, that is nowhere negative.
+    This means q11 tau <= 1, q22 (T_max - tau) <= 1, and a determinant, quadratic in tau, that is nowhere negative.
     """
     (t1, t2), T = map(rational, _ranges(loop)[d]), rational(loop.T_max or loop.T)
     q11, q12, q22 = map(rational, entries)
@@ -232,7 +233,7 @@ class PeriodCost(NamedTuple):
 
 
 class KnownMotor(HandsSide):
-    """Motors and transmissions within known bounds (Theorem B): f'(dx + beta dv) + L, of the speed v at a tick."""
+    """The form f'(dx + beta dv) + L of motors and transmissions within known bounds (Theorem B); v is the speed."""
 
     def __init__(self, cost: PeriodCost, beta: Any) -> None:
         self.cost, self.beta = cost, beta
@@ -254,7 +255,8 @@ class KnownMotor(HandsSide):
 
 
 def hands_side(loop: Loop) -> HandsSide:
-    return Latency() if loop.latency else EvenPeriods()
+    """Return the hands' side of a loop whose devices are known by their damping only."""
+    return Latency() if loop.latency else _EvenPeriods()
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -262,14 +264,14 @@ def hands_side(loop: Loop) -> HandsSide:
 
 
 class Fact(ABC):
-    """How the forces of the environment's side come about, beyond one linear network with constant delays.
+    """A property of the environment's side beyond one linear network with constant delays.
 
-    A fact of the user's own needs `enter` alone; docs/extending.md shows one.
+    A user's own fact needs `enter` alone; docs/extending.md shows one.
     """
 
     @abstractmethod
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
-        """Enter the inputs, rows and multipliers of this fact into the block; `values` are its multipliers, by name."""
+        """Add the inputs and rows of this fact to the block; `values` are its multipliers, by name."""
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         """Return the multipliers that a search finds; none by default."""
@@ -277,18 +279,18 @@ class Fact(ABC):
 
 
 class Walls(Fact):
-    """Walls that make and break contact: the wall's own law, at every tick, weighed by multipliers a, c, d, m.
+    """Walls that make and break contact, by the law of each wall at every tick, with multipliers a, c, d, m.
 
-    Inputs per wall: u, the step of the depth h, and, where the wall has a damper, s >= 0, which differs from 0 only
-    where the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z). With `stiff`
-    the block is that of a wall of k + 2b without a damper, and covers every wall up to it.
+    The inputs of a wall are u, the step of the depth h, and for a wall with a damper s >= 0, which is positive only
+    when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z). With `stiff`
+    the block is that of a wall of k + 2b without a damper, and covers every softer wall.
     """
 
     def __init__(self, stiff: bool = False) -> None:
         self.stiff = stiff
 
     def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:
-        """(k, b) of every wall [N/m], b the damping divided by T."""
+        """Return (k, b) of every wall [N/m]; b is the damping divided by T."""
         each = []
         for wall in loop.environment.walls:
             k, b = numbers(wall.stiffness, T), numbers(wall.damping, T) / T
@@ -300,12 +302,12 @@ class Walls(Fact):
         stiff, damped = tuple(float(k) for k, _ in laws), tuple(float(k) if b else 0.0 for k, b in laws)
         ones = tuple(1.0 if b else 0.0 for _, b in laws)
         none = (0.0,) * len(laws)
-        said = f"a number >= 0 for each of {len(laws)} walls"
+        expected = f"a number >= 0 for each of {len(laws)} walls"
         return (
-            Unknowns("a", stiff, said, 0.0, 1e3),
-            Unknowns("a + c", damped, said, 0.0, 1e3),
-            Unknowns("d", damped, said, 0.0, 1e3),
-            Unknowns("m", ones, said, 0.0, 1e3, start=none),
+            Unknowns("a", stiff, expected, 0.0, 1e3),
+            Unknowns("a + c", damped, expected, 0.0, 1e3),
+            Unknowns("d", damped, expected, 0.0, 1e3),
+            Unknowns("m", ones, expected, 0.0, 1e3, start=none),
         )
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
@@ -329,19 +331,18 @@ class Walls(Fact):
 
 
 class Switching(Fact):
-    """Delays that switch within [lo, hi] at every tick and on every device, weighed by alpha_i > 0 [N/m] per device.
-
-    Axes of a device share its delay, so that its error may be weighed by alpha_i Delta_i over the mean of its diagonal.
+    """Delays that switch within [lo, hi] at every tick and on every device, with alpha_i > 0 [N/m] per device.
 
     A force that is late by n in [lo, hi] differs from the nominal one by at most half the width times the sum of the
-    steps in between; the multiplier weighs that error w against the displacement that the force multiplies.
+    steps in between. The multiplier weighs this error w against the displacement that the force multiplies. The axes of
+    a device share its delay, so that the weight may be alpha_i Delta_i over the mean of Delta_i's diagonal.
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         moves = np.array(loop.delays.hi) > np.array(loop.delays.lo)
         units = tuple(loop.per_device(even_damping(loop) / loop.T * moves).tolist())
-        said = "a positive number where the delay varies and 0 elsewhere"
-        return (Unknowns("alpha", units, said, 1e-8, 1e6),)
+        expected = "a positive number where the delay varies and 0 elsewhere"
+        return (Unknowns("alpha", units, expected, 1e-8, 1e6),)
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
         level = loop.Delta(isinstance(block.T, Fraction))
@@ -365,17 +366,17 @@ class Switching(Fact):
 
 
 def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
-    """(power of 1/z, weight) of the terms of p(1/z) q(z) that are causal: the others are their mirror images."""
+    """Return (power of 1/z, weight) of the causal terms of p(1/z) q(z); the other terms are their mirror images."""
     return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
 
 
-_SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
+_SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's diagonal, so that c may be rounded
 
 
 class Limiter(Fact):
     """Forces that leave through the limiter of controller.law, of lag rho > 0 [N/m] per device.
 
-    One rho and one multiplier c per lag for all axes of a device: that covers a ball and a box of forces.
+    All axes of a device share rho and the multiplier c of each lag, which covers both a ball and a box of forces.
     """
 
     def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
@@ -402,7 +403,7 @@ class Limiter(Fact):
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
-    """The damping's form for matrix levels: q_ab delta_i of the inputs a, b of axis i becomes q_ab Delta_i."""
+    """Return the damping's form for matrix levels: q_ab delta_i of the inputs a, b of axis i becomes q_ab Delta_i."""
     if loop.levels is None:
         return form
     level, at = loop.Delta(isinstance(T, Fraction)), {(each.name, each.channel): g for g, each in enumerate(inputs)}
@@ -424,15 +425,19 @@ def compose(
     scaled: bool = False,
     hands: HandsSide | None = None,
 ) -> Demand[Block]:
-    """The block of the loop's hands' side with these facts, at these values of their multipliers.
+    """Return the block of the loop's hands' side with these facts, at these values of their multipliers.
 
     Args:
-        G: [x; p], displacements (m,) and wall forces, to [f_e; y], forces as they leave and ways into the walls.
-        late: whether the delays Theta are still to come; False where G has them.
-        hands: the hands' side, where it is not that of the loop.
-        scaled: whether the values of the hands' side are s times its multipliers, which makes the block affine in both.
+        G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and ways into the walls.
+        loop: The loop.
+        facts: The facts of the environment's side.
+        values: The multipliers by name.
+        late: Whether the delays Theta have to be added; False if G contains them.
+        scaled: Whether the values of the hands' side are s times its multipliers, which makes the block affine in both.
+        hands: The hands' side; None for that of the loop.
 
-    Raises ValueError for values that are no multipliers.
+    Raises:
+        ValueError: The values are no multipliers.
     """
     values = values or {}
     path: list[Weights] = [(1,)] * loop.channels
@@ -458,7 +463,7 @@ def compose(
 
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
-    """Enter what the hands' side takes; where `scaled`, what its multipliers weigh does not grow with s."""
+    """Add the form of the hands' side; if `scaled`, the terms with its multipliers do not grow with s."""
 
     def form(values: Values) -> Any:
         return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)
@@ -472,7 +477,7 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
 
 
 def _paths(loop: Loop, switch: bool) -> list[Weights]:
-    """The weights of Theta, channel by channel; of delays that switch the mean of both ends."""
+    """Return the weights of Theta for each channel; for switching delays the mean of both ends."""
     spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
     return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
 
@@ -485,10 +490,10 @@ def compose_any(
     scaled: bool = False,
     hands: HandsSide | None = None,
 ) -> Demand[Block]:
-    """The block of the loop's hands' side before any passive object behind the coupling V, without delay in between.
+    """Return the block of the loop's hands' side for any passive object behind the coupling V, without delay psi.
 
-    On the inputs of hands and facts and, last in the order of rows, df_e, the steps of the forces as they leave: its
-    own row is V(1)/2 - (V - V(1))/(z-1). Raises ValueError for values that are no multipliers.
+    The inputs are those of hands and facts and, last, df_e, the steps of the sent forces. The row of df_e is
+    V(1)/2 - (V - V(1))/(z-1). Raises ValueError for values that are no multipliers.
     """
     values, hands, T = values or {}, hands or hands_side(loop), V.T
     path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))

@@ -36,7 +36,7 @@ _MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
 _MOST_UNPACKED = 4_000_000_000  # bytes of a trace: ten hours of two channels take 3e9
 _MOST_WORDS = 1000  # characters of one message
 
-_DEEPEST_KEY = 20  # names joined by dots: tomllib takes time and memory that grow with their square
+_DEEPEST_KEY = 20  # most names joined by dots, because tomllib's time and memory grow with their square
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{_DEEPEST_KEY}}}")
 
@@ -63,7 +63,7 @@ def _cut(text: str) -> str:
 
 def one_line(text: object) -> str:
     """Return a message in one line of at most _MOST_WORDS characters; quoted user input is cut to 80 characters."""
-    words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
+    words = _QUOTED.sub(lambda match: _cut(match[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
 
@@ -81,9 +81,9 @@ def counted(path: str) -> str:
 class _Ledger:
     """Files of a command, identified by device and inode, and by their path without links."""
 
-    read: dict[Any, str] = field(default_factory=dict)  # place -> what it was read as
-    named: dict[Any, str] = field(default_factory=dict)  # place -> the option that names it as output
-    done: set[Any] = field(default_factory=set)  # written
+    read: dict[Any, str] = field(default_factory=dict)  # place -> name of the file in messages
+    named: dict[Any, str] = field(default_factory=dict)  # place -> option that names the file as output
+    written: set[Any] = field(default_factory=set)  # places
 
 
 _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
@@ -129,7 +129,7 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
-    if content is None:  # a file of the kernel's that would wait for more, such as /proc/kmsg
+    if content is None:  # A kernel file such as /proc/kmsg would block.
         raise InputError(f"{named}: has nothing to read, expected a file with content")
     if len(content) > most:
         raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
@@ -159,7 +159,7 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
         raise InputError(f"{named}: {error.strerror or error}{hint}") from None
     except InputError:
         raise
-    except ValueError as error:  # a name with a zero byte in it
+    except ValueError as error:  # The name contains a zero byte.
         raise InputError(f"{named}: {error}{hint}") from None
     with file:
         try:
@@ -185,7 +185,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{named}: not valid TOML: nested too deeply") from None
-    except ValueError as error:  # tomllib's own, and an integer of thousands of digits
+    except ValueError as error:  # also for an integer of thousands of digits
         raise InputError(f"{named}: not valid TOML: {error}") from None
 
 
@@ -194,13 +194,13 @@ def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
     try:
         with _opened(path, str(path)) as file, ZipFile(file) as archive:
             entries = archive.infolist()
-            size = sum(entry.file_size for entry in entries)  # zipfile unpacks no byte more
+            size = sum(entry.file_size for entry in entries)  # zipfile never unpacks more than this
             if size > _MOST_UNPACKED:
                 raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {_MOST_UNPACKED / 1e9:g} GB")
             return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
     except (MemoryError, InputError):
         raise
-    except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise whatever they come upon
+    except Exception as error:  # A damaged archive makes zipfile, zlib and NumPy raise many kinds of errors.
         raise InputError(f"{path}: not {expected} ({error})") from None
 
 
@@ -322,9 +322,9 @@ def _spare(path: Path) -> None:
         places = _places(path)
         if known := _met(places, ledger.read):
             raise InputError(f"cannot write {path}: it was read, as {known}")
-        if not places.isdisjoint(ledger.done) and (option := _met(places, ledger.named)):
+        if not places.isdisjoint(ledger.written) and (option := _met(places, ledger.named)):
             raise InputError(f"cannot write {path} twice: it is the file of {option}, and one of the command's own")
-        ledger.done |= places
+        ledger.written |= places
 
 
 def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> None:
@@ -371,7 +371,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # from_, for Python has its own `from`
+            part[one.name.removesuffix("_")] = plain(value)  # such as from_, because `from` is a keyword
     return part
 
 

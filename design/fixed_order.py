@@ -1,11 +1,11 @@
-"""State-space couplings of fixed order under Theorem 4: the procedure of Remark 5, its replacement and its reference.
+"""State-space couplings of fixed order under Theorem 4, by three methods.
 
-    complementarity   the cone-complementarity iteration as printed, with bisection on mu
+    complementarity   the procedure of Remark 5: cone complementarity as printed, with bisection on mu
     inner             inner convex approximation: feasible descent, no bisection (the default)
-    fixed-poles       one state per channel, diagonal; global for given poles, the poles by a simplex search
+    fixed-poles       one state per channel, diagonal; global for fixed poles, the poles by a simplex search
 
-All start from the structured spring-damper design and minimise ||W1 L W2||_inf (23). What is returned satisfies
-Theorem 4 on a refined sweep, judged from the coupling alone.
+All methods start from the structured spring-damper design and minimise ||W1 L W2||_inf (23). The returned coupling
+satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
-#: The methods of the search.
 _METHODS = ("complementarity", "inner", "fixed-poles")
-#: States per channel, each of which adds a row and a column to every cone; poles of the further states at the start.
-_MOST_STATES, _SPARE_POLE = 10, 0.5
+_MOST_STATES = 10  # per channel; each adds a row and a column to every cone
+_SPARE_POLE = 0.5  # initial pole of further states
 
 
 class _Units:
@@ -40,7 +39,7 @@ class _Units:
     def __init__(self, shaping: lmi.Shaping, phi: Array | None) -> None:
         loop, self.usable, self.T = shaping.loop, shaping.usable, shaping.loop.T
         names, none = loop.environment.contacts, (0,) * loop.channels
-        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # the condition holds for any
+        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # no effect on the condition
         self.loop = Loop(1.0, loop.theta, none, none, (1.0,) * loop.channels, anything)
         self.phi = None if phi is None else phi / self.usable
 
@@ -50,7 +49,7 @@ class _Units:
         return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
 
     def block(self, V: Lti) -> Lti:
-        """Return the block of Theorem 4, which is linear in the output of V; rows of a multiplier have unit size."""
+        """Return the block of Theorem 4, affine in V, with rows of the multiplier scaled to unit size."""
         demand = any_environment_demand(V, self.loop, self.phi)
         block, one = demand.gain + demand.free, np.ones(V.inputs)
         scale = np.diag(np.append(one, 1 / np.sqrt(np.diag(block.D)[V.inputs :])))
@@ -60,9 +59,9 @@ class _Units:
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
 #
-# V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`): its static compliance is V1, and its quotient, which Theorem 4
-# asks for, is -F (zI - A)^-1 B. With F held fixed, V, this quotient and the loop (22) are all affine in (A, B, V1).
-# That loses nothing where F has full row rank: any such F is reached by a change of state.
+# V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`) has the static compliance V1 and the quotient -F (zI - A)^-1 B of
+# Theorem 4. With a fixed F, V, this quotient and the loop (22) are all affine in (A, B, V1). A fixed F of full row rank
+# loses no generality, because a change of state leads to any such F.
 
 
 class FixedOrder:
@@ -101,7 +100,7 @@ class FixedOrder:
         """Return p of a spring-damper. Each further state is driven by the one before, and no output reads it.
 
         All states are reachable, so the storage of the weighted loop is well conditioned. A state that is read but not
-        driven makes it singular, and rounding then decides whether the solver finishes the first step.
+        driven would make the storage singular, and rounding would decide whether the first step succeeds.
         """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)
@@ -128,14 +127,14 @@ class FixedOrder:
 
 
 def _passivity_storage(family: FixedOrder, p: Array) -> Array:
-    """Return P > 0 of the remedied (2) for the coupling p, as deep inside as possible. p must be strictly feasible."""
+    """Return the P > 0 of (2) with the largest margin for the coupling p, which must be strictly feasible."""
     G = family.block(p)
     zero = np.zeros_like(G.D)
     return _roomiest(lambda P: lmi.lemma1(lmi.Ports.same(G), P, zero, zero), G.order, "the storage of V-hat")
 
 
 def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
-    """Return U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, as deep inside as possible."""
+    """Return the U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the largest margin."""
     G = family.weighted_loop(p) * (1 / mu)
     S = lmi.reachability_scaled(G)
     n, m = S.shape[0], G.inputs
@@ -188,14 +187,14 @@ _System = tuple[Array, Array, Array, Array]  # A, B, C, D
 
 
 def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Array], _System]:
-    """Return p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
+    """Return the function p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
     n = L.shape[0]
 
-    def whole(p: Array) -> Array:
+    def stacked(p: Array) -> Array:
         G = system(at + p)
         return np.block([[np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B)], [G.C @ L, G.D]])
 
-    constant, *values = (whole(p) for p in np.eye(at.size + 1, at.size, k=-1))
+    constant, *values = (stacked(p) for p in np.eye(at.size + 1, at.size, k=-1))
     slopes = np.stack(values) - constant
 
     def matrices(p: Array) -> _System:
@@ -209,18 +208,15 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # Fixed-order couplings by inner convex approximation: descent on ||W1 L W2||_inf in which every step is feasible.
 #
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
-# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With that tangent for Y the set
-# shrinks to a convex part of itself that still holds the current coupling, so each SDP improves on the last, mu^2
-# enters linearly, and there is no bisection. In state coordinates where Q0 = I the tangent is 2I - Q.
+# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y the set
+# shrinks to a convex part of itself that still contains the current coupling. Each SDP therefore improves on the last
+# one, mu^2 enters linearly, and there is no bisection. In state coordinates with Q0 = I the tangent is 2I - Q.
 
 
 _Judge = Callable[[Array, float], bool]  # whether the coupling p is certified and its norm at most mu, from p alone
-#: Descent ends when a step improves the norm by less than this, relatively.
-_SETTLED = 1e-4
-#: Room above the start's norm for its first certificate, relatively.
-_FIRST_ROOM = 0.05
-#: Bounds on Q and U in coordinates where they were I: a state that little reaches leaves them free to degenerate.
-_LEAST, _MOST = 0.1, 1.99
+_SETTLED = 1e-4  # relative improvement of the norm by a step below which the descent ends
+_FIRST_ROOM = 0.05  # relative room above the initial norm for the first certificate
+_LEAST, _MOST = 0.1, 1.99  # bounds on Q and U in coordinates where they were I, because unexcited states may degenerate
 
 
 def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:

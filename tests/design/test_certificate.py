@@ -222,7 +222,7 @@ def test_repaired_digests_do_not_forge_a_proof():
     forged = change(forged, scenario=honest_digest, required=requirement.required, margin=1 / requirement.ratio)
     verdict = verify(Stored.of(starved, STIFF, sealed(forged)))
     assert not verdict.proved
-    assert verdict.reason == "the sweep asks 1.00239 times the available damping, whatever the matrices prove"
+    assert "1.00239 times the available damping" in (verdict.reason or "")
     claims = {
         "margin is": change(good.certificate, margin=2.0),
         "required is": change(good.certificate, required=(0.1, 0.1)),
@@ -361,7 +361,7 @@ def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
     monkeypatch.setattr(design_certificate, "required_damping", lambda *_: needs)
     claims = change(good.certificate, required=needs.required, margin=1 / ratio)
     reason = verify(change(good, certificate=sealed(claims))).reason
-    assert reason == f"the sweep asks {ratio:.6g} times the available damping, whatever the matrices prove"
+    assert f"{ratio:.6g} times the available damping" in (reason or "")
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_the_coupling_designed_with_the_block():
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
     refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,)))
     assert not refused.certified
-    assert "no multiplier c that was found proves it, whatever the damping" in str(refused.reason)
+    assert "no multiplier c was found" in str(refused.reason)
 
 
 @pytest.mark.parametrize(
