@@ -121,7 +121,7 @@ class Multiplied(Condition):
         ratio, w = search.swept(values)
         if np.isinf(ratio):
             names = ", ".join(each.name for each in unknowns)
-            reason = f"no multiplier {names} was found for which any damping is enough"
+            reason = f"no proof was found, for any damping and any multiplier {names}"
             return replace(refusal(self.name, delta, reason), multiplier=values)
         needed = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
         return replace(needed, multiplier=values, bound=bound and min(bound, ratio))

@@ -103,7 +103,7 @@ def test_the_coupling_designed_with_the_block():
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
     refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,)))
     assert not refused.certified
-    assert "no multiplier c was found" in str(refused.reason)
+    assert "any multiplier c" in str(refused.reason)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def tampered(stored, **fields):
     ("fields", "reason"),
     [
         ({"c": (0.5, 0.5)}, "limiter: required is"),
-        ({"c": (1.0, 1.0)}, "limiter: no multiplier c that was found"),
+        ({"c": (1.0, 1.0)}, "limiter: no proof was found"),
         ({"c": (0.3, 0.1, 0.6)}, "expected as many for each device"),
         ({"c": (-0.1, 0.7)}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
         ({"c": (0.3,)}, "expected as many for each device"),
