@@ -238,7 +238,7 @@ def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget:
         try:
             trial = next(steps, None)
         except DesignFailed:
-            break  # the solver's accuracy is exhausted: the last good step is kept
+            break  # The solver's accuracy is exhausted; the last good step is the result.
         if trial is None or not holds(trial, norm):
             break
         before, norm, p = norm, family.shaping.norm(family.coupling(trial))[0], trial
@@ -274,13 +274,12 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
 # ----------------------------------------------------------------------------------------------------
 # Fixed-order couplings by cone complementarity, as Remark 5 of the paper prints it (with the remedied inequalities).
 #
-# For a given mu the inversions Y = Q^-1 and X = U^-1 are relaxed to [[Y, I], [I, Q]] >= 0 and [[X, I], [I, U]] >= 0,
-# and tr(QY) + tr(UX), which reaches its least value only where they hold, is linearised and minimised again and
-# again; mu is found by bisection. The sequence stalls far from the optimum, which is why `descend` exists.
+# For fixed mu the inversions Y = Q^-1 and X = U^-1 are relaxed to [[Y, I], [I, Q]] >= 0 and [[X, I], [I, U]] >= 0.
+# tr(QY) + tr(UX), which reaches its minimum only if the inversions hold, is linearised and minimised repeatedly. mu is
+# determined by bisection. The sequence stalls far from the optimum, so that `descend` is the default.
 
 
-#: Relative width at which bisection ends.
-_WIDTH = 5e-3
+_WIDTH = 5e-3  # relative width at which the bisection ends
 
 
 def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
@@ -316,7 +315,7 @@ def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> 
     blocks = [*lemmas.inequalities(parts, every), *(Inequality.of(pair(i), every) for i in (0, 2))]
     Q, Y, U, X = map(np.eye, sizes)
     for spent in range(1, patience + 1):
-        # the slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X)
+        # The slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X).
         both = [(2 * M - np.diag(np.diag(M)))[np.triu_indices(len(M))] for M in (Y, Q, X, U)]
         try:
             x = ConeProgram(np.concatenate([np.zeros(lemmas.at.size), *both]), blocks).solve(
@@ -331,18 +330,17 @@ def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> 
 
 
 # ----------------------------------------------------------------------------------------------------
-# Diagonal couplings with given poles: one convex problem, globally optimal for those poles.
+# Diagonal couplings with fixed poles: one convex problem, globally optimal for these poles.
 #
 # V_i = v_i + sum_j f_ij (1 - z)/(z - a_ij). With the poles fixed, Lemma 1 is linear in the storage P and in (v, f),
 # and W1 L W2 is affine in (v, f): its norm is bounded at sampled frequencies, with cutting planes.
 
 
-#: Relative gap between the norm on a refined sweep and the bound at the sampled frequencies.
-_GAP = 1e-5
+_GAP = 1e-5  # relative gap between the norm on a refined sweep and the bound at the sampled frequencies
 
 
 class FixedPoles:
-    """The problem for one loop; frequencies that were binding are kept from one set of poles to the next."""
+    """The problem for one loop; binding frequencies are reused for the next poles."""
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None) -> None:
         self.shaping, self.phi, self.units = shaping, phi, _Units(shaping, phi)
@@ -399,14 +397,13 @@ class FixedPoles:
         w = np.array(self.frequencies)
         left, right, late = self.shaping.parts(w)
         slopes = np.stack([left @ self.units.si(unit(e)).at(on_circle(w)) @ right for e in np.eye(gains)])
-        # [[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies; t is the last unknown
+        # [[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies; t is the last unknown.
         base = np.eye(N, dtype=np.complex128) * np.ones((w.size, 1, 1))
         cuts = lmi.gain_block([*range(gains), len(every)], late @ right, slopes, base, 0 * slopes[:, :, :N])
         blocks = [Inequality.of(passive, every), Inequality.of(storage, every), cuts]
 
-        def certified(
-            x: Array,
-        ) -> bool:  # else a solver's tolerance could hide a violation
+        def certified(x: Array) -> bool:
+            """Return whether the coupling is certified, because a solver's tolerance could hide a violation."""
             return any_environment(self.units.si(unit(x)), self.shaping.loop, self.phi).certified
 
         x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)
@@ -414,8 +411,7 @@ class FixedPoles:
         return self.units.si(unit(x)), float(np.sqrt(x[-1]))
 
 
-#: The start is designed for this much less damping, so that it is strictly feasible.
-_START_ROOM = 1e-3
+_START_ROOM = 1e-3  # relative reduction of the damping for the start, so that it is strictly feasible
 
 
 def design(

@@ -1,11 +1,11 @@
 """The block of a condition, composed from one hands' side and the facts of the environment's side.
 
 Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
-them. The **hands' side** is a lower bound of the energy that every passive hand and the devices take, whatever forces
-act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. A **fact** of the
-environment's side describes the forces; it adds inputs, a row for each, and multipliers. The quadratic form is
+them. The **hands' side** is a lower bound of the energy that every passive hand and the devices dissipate, whatever
+forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. A **fact**
+of the environment's side describes the forces; it adds inputs, a row for each, and multipliers. The quadratic form is
 
-    sum over ticks of f'(displacement that f multiplies) + energy taken by the damping + terms of the multipliers,
+    sum over ticks of f'(displacement that f multiplies) + energy of the damping + terms of the multipliers,
 
 and its block must be strictly positive real, with its pole at z = 1 split off. `Collected` collects the entries of both
 sides and builds the block in any arithmetic.
@@ -100,9 +100,9 @@ class Input:
 
     name: str
     channel: int
-    moved: Weights = (1,)  # w_0 + w_1 z + ..: its weights in the displacement that the force f[k] multiplies
-    follows: int = 1  # 1 if the environment follows it, 0 for a speed
-    slips: bool = True  # whether the limiter's slip is subtracted from it
+    moved: Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
+    follows: int = 1  # 1 if the input is a displacement of the environment, 0 for a speed
+    slips: bool = True  # whether the limiter's slip is subtracted from the input
 
 
 class Collected(Generic[AnyBlock]):
@@ -111,10 +111,10 @@ class Collected(Generic[AnyBlock]):
     def __init__(
         self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
     ) -> None:
-        """Enter the rows of the hands' inputs.
+        """Add the rows of the hands' inputs.
 
-        With `any_object` the energy of a passive object behind the forces as they leave is subtracted: the factor of
-        f_e[k] is the displacement without x[k] - x[k-1] (docs/theory.md, "any environment").
+        With `any_object` the energy of a passive object behind the sent forces is subtracted: the factor of f_e[k] is
+        the displacement without x[k] - x[k-1] (docs/theory.md, "any environment").
         """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
@@ -143,7 +143,7 @@ class Collected(Generic[AnyBlock]):
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Enter the quadratic form of the hands' side, in displacements without subtracted slip."""
+        """Add the quadratic form of the hands' side, in displacements without the slip."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -177,7 +177,7 @@ class Collected(Generic[AnyBlock]):
         return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
 
     def slipping(self, channel: int) -> tuple[int, int]:
-        """Return the displacement off which the limiter's slip is taken, and the slip."""
+        """Return the numbers of the displacement from which the limiter's slip is subtracted, and of the slip."""
         (own,) = (self.places[i.name, channel] for i in self.hands if i.channel == channel and i.slips)
         return own, self.slip(channel)
 
@@ -198,11 +198,11 @@ class Collected(Generic[AnyBlock]):
     # -- terms of rows
 
     def sums(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
-        """Add the weighted force as it leaves to a row; as the sum of its steps it has a pole at z = 1."""
+        """Add the weighted sent force to a row; as the sum of its steps it has a pole at z = 1."""
         self._sums.append((row, channel, weights, scale))
 
     def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
-        """Add the weighted steps of the force as it leaves to a row."""
+        """Add the weighted steps of the sent force to a row."""
         self._steps.append((row, channel, weights, scale))
 
     def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
@@ -255,13 +255,13 @@ class Collected(Generic[AnyBlock]):
         return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
 
     def _bank(self, reads: Sequence[tuple[int, Weights]]) -> Lti:
-        """Return the block from forces as they leave (m,) to the weighted forces, with one delay line per channel."""
+        """Return the block from sent forces (m,) to the weighted forces, with one delay line per channel."""
         order = sorted(range(len(reads)), key=lambda r: reads[r][0])
         parts = [_taps([w for c, w in reads if c == channel], self.T) for channel in range(self.channels)]
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return the block from inputs to (x, p, added steps of forces, previous inputs), and which are the last."""
+        """Return (the block from inputs to x, p, added steps of forces and previous inputs; the previous inputs)."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -271,15 +271,15 @@ class Collected(Generic[AnyBlock]):
     def build(self, G: AnyBlock | None) -> tuple[Array, AnyBlock, Any]:
         """Return (residue at z = 1 (n, n), block without its pole, matrix that the damping multiplies).
 
-        G maps [x; p], displacements and wall forces, to [f_e; y], forces as they leave and ways into walls. With None
-        the steps of the forces are inputs instead (`force`).
+        G maps [x; p], displacements and wall forces, to [f_e; y], sent forces and ways into walls. With None the steps
+        of the forces are inputs instead (`force`).
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
         rows, reads = self._reads()
         bank = self._bank(reads)
         follows = len(reads)
-        # signals: weighted forces, ways into walls, inputs of the previous tick
+        # The signals are weighted forces, ways into walls, and inputs of the previous tick.
         inner = m + w  # outputs of G
         rest = m + len(late)  # outputs of the filter that bypass G
         mix: Any = numbers(np.zeros((m + w + len(late), inner + rest), dtype=int), T) + 0
@@ -300,7 +300,8 @@ class Collected(Generic[AnyBlock]):
         if isinstance(signals, Lti) and signals.is_exact:
             require_size(signals.order)
         static, regular = signals.over_z_minus_one()
-        sums: Any = numbers(np.zeros((n, signals_of(signals)), dtype=int), T) + 0
+        count = signals.G.shape[-2] if isinstance(signals, Sampled) else signals.outputs
+        sums: Any = numbers(np.zeros((n, count), dtype=int), T) + 0
         steps: Any = sums + 0
         for r, (row, scale, summed) in enumerate(rows):
             target = sums if summed else steps
@@ -313,10 +314,6 @@ class Collected(Generic[AnyBlock]):
             steps[row, place] = steps[row, place] + weight
         free = np.hstack([sums, steps]) @ vstack(regular, signals) + self._matrix(self._terms)
         return sums @ static, free, self.gain()
-
-
-def signals_of(signals: Any) -> int:
-    return signals.G.shape[-2] if isinstance(signals, Sampled) else signals.outputs
 
 
 def _taps(rows: Sequence[Weights], T: Number) -> Lti:

@@ -1,4 +1,4 @@
-"""Suprema over frequency, found on a grid that knows the poles and refined between its points."""
+"""Suprema over frequency, on a grid that is dense near poles, with refinement between its points."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 
 # ----------------------------------------------------------------------------------------------------
-# Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.
+# Integrals over frequency, by Gauss's rule on intervals that are halved until the result settles.
 
 
-_ERROR = 1e-6  # relative, of the sum
-_ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
+_ERROR = 1e-6  # relative error of an integral
+_ROUNDING = 1e-20  # least mean that counts: the squared difference of two responses that agree to ten digits
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
 def integral(response: Callable[[Array], Array], grid: Array, error: float = _ERROR) -> float:
     """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
-    Three points of Gauss in each interval of the grid, against the same in its halves: an interval whose two figures
-    differ by more than its share of `error`, relative to the whole, gives way to its halves. What differs by rounding
-    alone would do so without end: hence the least mean that counts, and the worst intervals only where there are many.
+    Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval is halved if
+    the two results differ by more than its share of `error`, relative to the integral. Rounding would cause halving
+    without end, so there is a least mean that counts, and only the worst intervals are halved if there are many.
     """
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
@@ -60,7 +60,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 
 
 _PEAKS = 3  # highest local maxima of a row that are refined
-_POINTS, _ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
+_POINTS, _ROUNDS = 17, 8  # A round narrows a bracket by (_POINTS - 1)/2, so eight locate a smooth peak to rounding.
 
 _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
 
@@ -96,25 +96,24 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
 
 
 def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
-    """Return the frequencies (n, peaks) of the grid below and above `at`; a grid may have some twice."""
+    """Return the frequencies (n, peaks) of the grid below and above `at`; a grid may contain a frequency twice."""
     room = 1e-12 * grid[:, -1:]
     below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
     above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
     return below, above
 
 
-#: [rad/sample] a figure is even at 0, so that 1e-4 stands for it up to 1e-8; what bends it nearer to 0, as slow poles
-#: of a model that is wrong do, is asked for at a few frequencies below
+#: [rad/sample] responses are even in w, so that 1e-4 stands for 0 to 1e-8; lower frequencies catch slow poles
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
-_EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
-_PER_LOBE = 24
+_EVEN = 192  # least number of even frequencies, and number of frequencies even in the logarithm
+_PER_LOBE = 24  # even frequencies for each lobe that a delay makes
 _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
-    """Return frequencies for many systems: those common to all (k,), and those around the poles (n, p) of each (n, j).
+    """Return frequencies for n systems: common ones (k,), and those around the poles (n, p) of each system, (n, j).
 
-    `delay` [samples] is the longest of the loop, which makes so many lobes.
+    `delay` [samples] is the longest delay of the loop, which is the number of lobes in its response.
     """
     even = np.linspace(_LOWEST, np.pi, max(_EVEN, _PER_LOBE * (delay + 1)))
     common = np.unique(np.concatenate([_BELOW, even, np.geomspace(_LOWEST, np.pi, _EVEN)]))
@@ -123,19 +122,19 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
     return common, np.clip(near, _LOWEST, np.pi)
 
 
-_POINTS_SWEPT = 3000  # in the grid and its refinement, about
+_POINTS_SWEPT = 3000  # approximate number of points in a grid and its refinement
 _RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: a point's response per inputs x states^2, a Schur form per states^3
-_POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep, beside its response
+_POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep
 
 
 def _sweep_cost(G: Lti) -> float:
-    """Return the work of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
+    """Return the approximate time of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
 
 def too_long(G: Lti, sweeps: int = 1) -> str | None:
-    """Return why this many sweeps of G, or of a system of its size, are refused, or None."""
+    """Return the reason why this many sweeps of G, or of a system of its size, are refused, or None."""
     seconds, how = sweeps * _sweep_cost(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
     if seconds <= budgets.SWEEPS:
         return None
@@ -147,7 +146,7 @@ def too_long(G: Lti, sweeps: int = 1) -> str | None:
 
 
 def sweeping() -> AbstractContextManager[None]:
-    """Return the budget of a search by sweeps, within which TooLong is raised once it is spent."""
+    """Return a context with the budget of a search by sweeps; TooLong is raised in it when the budget is spent."""
     return within(budgets.SWEEPS, "a search by sweeps", "many states or channels")
 
 
@@ -157,9 +156,8 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
     """Return sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
 
-    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. One that
-    repeats counts once: of points that rounding alone holds apart the wrong one may be the higher, and hide the peak
-    beside the other.
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. A repeated pole
+    counts once, because two points that differ by rounding only could hide the peak beside them.
     """
     even = np.linspace(low, high, points)
     logarithmic = np.geomspace(low, high, points)
@@ -168,18 +166,18 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     offsets = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
     offsets = np.concatenate([-offsets, offsets])
     around = (np.abs(np.angle(poles))[:, None] + width[:, None] * offsets).ravel()
-    grid = np.sort(np.concatenate([even, logarithmic, around]))  # np.unique would import numpy.ma, at 6 ms
+    grid = np.sort(np.concatenate([even, logarithmic, around]))  # np.unique would import numpy.ma, which takes 6 ms.
     return grid[(grid >= low) & (grid <= high) & np.append(True, grid[1:] != grid[:-1])]
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
-    """Bound how much rounding changes an entry of the response of y = C x + D u, x+ = A x + B u, at each z (k,).
+    """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
-    A tick in double precision is one of a system whose coefficients are off by (2n + 8) u relatively, entry by entry
-    (n states, u the unit), and by what they miss of a system `meant` with the same states. With R = (zI - A)^-1 errors
-    dA, dB, dC, dD move the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|: much where big terms
-    cancel. The difference of both responses would say less: beside a sharp resonance it is large as soon as the peak
-    moves by its width, which the Schur form of badly scaled states does by itself.
+    A tick in double precision is a tick of a system whose coefficients have relative errors of (2n + 8) u (n states, u
+    the unit), plus their differences to a system `meant` with the same states. With R = (zI - A)^-1 the errors dA, dB,
+    dC, dD change the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|, which is large if big terms
+    cancel. The difference of both responses would be less useful: beside a sharp resonance it is large as soon as the
+    peak moves by its width, which already the Schur form of badly scaled states does.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -194,19 +192,19 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return one of each group of poles that lie within a hundredth of their distance to the circle."""
-    poles_kept = np.zeros(0, dtype=np.complex128)
+    distinct = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
-        if not (np.abs(poles_kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
-            poles_kept = np.append(poles_kept, pole)
-    return poles_kept
+        if not (np.abs(distinct - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
+            distinct = np.append(distinct, pole)
+    return distinct
 
 
 def supremum(response: Response, grid: Array) -> tuple[float, float]:
     """Return the largest `response` over [grid[0], grid[-1]], refined between grid points, and its frequency.
 
-    The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their
-    neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
-    located to rounding. A bracket whose peak cannot reach the largest any more is left.
+    The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The
+    brackets are narrowed by a factor of 8, ten times or until two rounds gain nothing, which locates a smooth peak to
+    rounding. A bracket whose peak cannot reach the largest any more is dropped.
     """
     spend(_POINT * grid.size)
     values = response(grid)
@@ -229,9 +227,9 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
 
 
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
-    """Return where (peaks,) the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`.
+    """Return the frequencies (peaks,) of the 32 highest local maxima of `response` on the grid that exceed `above`.
 
-    Of those only that come as `near` to the highest, relatively.
+    Maxima that are lower than the highest by more than the share `near` are left out.
     """
     spend(_POINT * grid.size)
     values = response(grid)
@@ -252,10 +250,10 @@ def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
 
 
 def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
-    """Return the best of 17 points in each bracket: value, place, bracket of its neighbours, and its possible gain.
+    """Return the best of 17 points in each bracket: value, frequency, bracket of its neighbours, and largest peak.
 
-    Between three points of a parabola it rises by at most a quarter of the drop to the lower neighbour; four times
-    that are allowed.
+    Between its three points a parabola rises by at most a quarter of the drop to the lower neighbour. The largest
+    possible peak is taken as four times that rise above the value.
     """
     trial = np.linspace(left, right, 17)
     spend(_POINT * trial.size)
@@ -263,7 +261,7 @@ def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Arr
     at, column = np.argmax(values, axis=0), np.arange(left.size)
     below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), values[at, column]
     lower = np.minimum(values[below, column], values[above, column])
-    # where all are infinite nothing drops
+    # The condition `where` avoids inf - inf.
     reach = best + np.subtract(best, lower, out=np.zeros_like(best), where=lower < best)
     return best, trial[at, column], (trial[below, column], trial[above, column]), reach
 
@@ -292,8 +290,9 @@ def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
 def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
     """Return the least eigenvalues (k,) of Hermitian matrices (k, m, m) and their unit eigenvectors (k, m).
 
-    Of many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. The shift is off by 1e-13 of
-    the largest entry, which multiplies the share of every other eigenvector by at most that over their distance.
+    For many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. The shift differs from the
+    eigenvalue by 1e-13 of the largest entry, so that the share of every other eigenvector is multiplied by at most this
+    difference over the distance of both eigenvalues.
     """
     m = H.shape[-1]
     if m <= _ROWS_AT_ONCE:
@@ -301,9 +300,9 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
         return values[:, 0].astype(np.float64), vectors[:, :, 0]
     least = np.linalg.eigvalsh(H)[:, 0].astype(np.float64)
     shift = least - 1e-13 * np.abs(H).max(axis=(1, 2), initial=1e-300)
-    start = np.sin(1.0 + np.arange(m)).astype(np.complex128)  # of no symmetry, to which no eigenvector is orthogonal
+    start = np.sin(1.0 + np.arange(m)).astype(np.complex128)  # without symmetry, so not orthogonal to an eigenvector
     v = np.linalg.solve(H - shift[:, None, None] * np.eye(m), start[:, None])[..., 0]
     return least, v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-_ROWS_AT_ONCE = 12
+_ROWS_AT_ONCE = 12  # rows up to which all eigenvectors are faster

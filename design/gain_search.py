@@ -41,7 +41,7 @@ _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
 _STUCK = 1e-3  # violation at the end of a search from which there is no feasible point nearby
 FEW = 12  # largest number of devices for which steps are cheap
 _ROUGH = 0.01  # violation that further steps can remove
-_DIFFERENCE = 1e-7
+_DIFFERENCE = 1e-7  # step of finite differences in x
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
@@ -87,7 +87,7 @@ class SampledLoop:
         self._impose(frequencies(self.E, low=1e-3, points=80))
 
     def fresh(self) -> Self:
-        """Return a copy to which another search may add frequencies: responses that both share are sampled once."""
+        """Return a copy to which another search may add frequencies; shared responses are sampled once."""
         other = copy(self)
         other._known, other._delayed, other._rate = {}, dict(self._delayed), dict(self._rate)
         return other
@@ -264,7 +264,7 @@ class SampledLoop:
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """Return each device's first channel and the mean over its axes (m, m): axes of a device share a multiplier."""
+    """Return each device's first channel, and the mean over its axes (m, m), because its axes share a multiplier."""
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
 
@@ -431,8 +431,8 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop, of which every start gets its own copy. For more than FEW devices, for which starts hardly
-    matter and steps are expensive, the first optimum is returned (`likeliest_first`).
+    `sampled` makes the loop, and every start gets its own copy. For more than FEW devices the first optimum is returned
+    (`likeliest_first`), because steps are expensive and the start hardly matters.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None

@@ -26,7 +26,7 @@ CAVEATS = (
 
 @dataclass(frozen=True)
 class EncoderSteps:
-    """Whether declared Coulomb friction dissipates the work of encoder steps."""
+    """Comparison of declared Coulomb friction with the friction that dissipates the work of encoder steps."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound

@@ -1,15 +1,15 @@
-"""Count what is known of a device: the mass of its motor, and a transmission that loses energy. Theorem B.
+"""Conditions for devices with a known motor mass and a known lossy transmission (Theorem B).
 
-this-environment charges the virtual damping against a hand of any stiffness at the motor's shaft. Behind a transmission
-(a spring of at most k and a damper of at least b, in parallel) no hand is stiffer than the transmission, and the mass
-of the motor keeps its speed from changing at once. With P = k^2/b and any beta > 0 [s] the motor, its transmission and
-every passive hand behind it satisfy, over each period in which the force f is held,
+this-environment assumes a hand of any stiffness at the motor's shaft. Behind a transmission (a spring of at most k and
+a damper of at least b, in parallel) no hand is stiffer than the transmission, and the mass of the motor keeps its speed
+continuous. With P = k^2/b and any beta > 0 [s] the motor, its transmission and every passive hand behind it satisfy,
+over each period in which the force f is held,
 
     sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
 
 with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx and the speeds v, v+ at both ends.
-docs/theory.md has the proof. The blocks below say that the environment's side gives back less than L. design.necessary
-has what no condition for these devices can undercut.
+docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
+design.necessary has a lower bound for all conditions on these devices.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ from haptic_loop.design.result import (
 
 
 def shortest_period(loop: Loop) -> float | None:
-    """The shortest period [s] of the loop; None where periods vary and no shortest one is declared."""
+    """Return the shortest period [s] of the loop; None if periods vary and no shortest one is declared."""
     if loop.T_min is not None:
         return loop.T_min
     return loop.T if loop.T_max in (None, loop.T) else None
 
 
 class _Known(NamedTuple):
-    """What is known of the devices, (m,) each, in one arithmetic."""
+    """The bounds of the devices, (m,) each, in one arithmetic."""
 
     P: Any  # [N/(m s)] largest k^2/b of the transmission
-    damping: Any  # [N s/m] its largest damping
+    damping: Any  # [N s/m] largest damping of the transmission
     mass: Any  # [kg] least mass of the motor
 
 
@@ -71,7 +71,7 @@ def _known(loop: Loop, T: Number) -> _Known:
     return _in_arithmetic(loop.known_devices or (), T)
 
 
-@lru_cache(maxsize=64, typed=True)  # typed: the period's type decides the arithmetic
+@lru_cache(maxsize=64, typed=True)  # typed, because the type of T decides the arithmetic
 def _in_arithmetic(devices: tuple[DeviceBounds, ...], T: Number) -> _Known:
     stiffness, least = (
         numbers([getattr(device, f"transmission_{name}") for device in devices], T)
@@ -87,26 +87,26 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """The beta (m,) [s] at which c0 or c2 vanishes for devices of damping `share` Delta."""
+    """Return the beta (m,) [s] at which c0 or c2 vanishes for devices of damping `share` Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
 
 def _shortfall(y: Array) -> Array:
-    """1 - tanh(y)/y, (m,), to full relative precision also for small y."""
+    """Return 1 - tanh(y)/y, (m,), to full relative precision also for small y."""
     small = np.minimum(y, _SERIES) ** 2
     series = small * (1 / 3 - small * (2 / 15 - small * (17 / 315 - small * 62 / 2835)))
     return np.where(y < _SERIES, series, 1 - np.tanh(y) / np.maximum(y, _SERIES))
 
 
-_SERIES = 0.03  # below it the next term of the series is 2e-14 of the value, above it cancellation costs 4e-13
+_SERIES = 0.03  # Below it the truncated series has the error 2e-14, above it cancellation has 4e-13.
 
 
 def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
-    """The least cost of a period for devices of damping `share` Delta, (..., m) in floating point.
+    """Return the least cost of a period for devices of damping `share` Delta, (..., m) in floating point.
 
-    Where periods lie in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2).
-    Entries are NaN where beta is too large for this damping.
+    For periods in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2). Entries are
+    nan if beta is too large for this damping.
     """
     longest, shortest = loop.T_max or loop.T, shortest_period(loop) or loop.T
     c0, c2 = _rates(_known(loop, loop.T), np.asarray(share)[..., None] * np.array(loop.delta), beta)
@@ -118,12 +118,12 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
         return PeriodCost(move, move * q, move * q * longest, c2 / q_long)
 
 
-_BITS = 320  # of the balls in which q is enclosed
-_MOST_ULPS = 8  # between q and its bounds: the midpoint of a ball is rounded once
+_BITS = 320  # precision of the balls (intervals) that enclose q
+_MOST_ULPS = 8  # largest distance of q from its bounds; rounding the midpoint of a ball needs one
 
 
 def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Decimals [s] below q of the shortest and above q of the longest period, channel by channel.
+    """Return decimals [s] below q of the shortest period and above q of the longest period, (m,) each.
 
     q = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the damping of the loop. Raises NotProved for a beta that is too large.
     """
@@ -138,7 +138,7 @@ def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], t
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """The nearest double whose shortest decimal lies beyond the ball."""
+    """Return the nearest double whose shortest decimal lies beyond the ball."""
     import flint
 
     value = float(ball.mid())
@@ -165,7 +165,7 @@ def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], abo
 
 
 def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
-    """q of the shortest and of the longest period as balls, channel by channel. Raises NotProved."""
+    """Return q of the shortest and of the longest period as balls, for each channel. Raises NotProved."""
     import flint
 
     exact = loop.period(True)
@@ -180,7 +180,7 @@ def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
 
 
 def _checked_rates(loop: Loop, beta: Sequence[Fraction]) -> tuple[Any, Any]:
-    """c0 and c2 over Fractions, positive. Raises NotProved."""
+    """Return c0 and c2 over Fractions. Raises NotProved unless they are positive."""
     exact = loop.period(True)
     c0, c2 = _rates(_known(loop, exact), numbers(loop.delta, exact), _row(beta))
     if not ((c0 > 0).all() and (c2 > 0).all() and all(b > 0 for b in beta)):
@@ -201,7 +201,7 @@ def _fmpq(value: Fraction) -> Any:
 def exact_cost(
     loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]
 ) -> PeriodCost:
-    """A rational bound below the cost at the loop's damping, from bounds of q that `check_q` has checked."""
+    """Return a rational lower bound of the cost at the loop's damping, from bounds of q that `check_q` accepts."""
     exact = loop.period(True)
     c0, c2 = _checked_rates(loop, beta)
     longest = rational(loop.T_max) if loop.T_max else exact
@@ -213,35 +213,35 @@ def exact_cost(
 # ----------------------------------------------------------------------------------------------------
 # The required damping s Delta: the least s for which some beta and multipliers satisfy the block with the same bounds.
 #
-# L is the least value of an integral that is linear in c0 and c2, and both are concave in (s, beta): so L is concave.
-# The other entries are affine in beta and in the multipliers, once delays that switch are weighed by 1/alpha. A tangent
-# of a concave block bounds it from above. Tangents at the frequencies that bind make a linear matrix inequality, whose
-# least s bounds the required s from below.
+# L is the least value of an integral that is linear in c0 and c2. Both are concave in (s, beta), so L is concave. The
+# other entries are affine in beta and in the multipliers if switching delays are weighed by 1/alpha. A tangent of a
+# concave block bounds it from above. Tangents at the binding frequencies make a linear matrix inequality, whose least s
+# bounds the required s from below.
 
-_LARGEST_ETA = 0.9999  # of the largest beta, at which c0 or c2 would be zero
-_LEAST_ETA = 1e-5  # where this-environment asks as much to five digits
-_BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
-_TOGETHER = 100  # matrices that take hardly longer together than one alone: few frequencies get several halvings
+_LARGEST_ETA = 0.9999  # largest share of the largest beta, at which c0 or c2 would be zero
+_LEAST_ETA = 1e-5  # least share, at which this-environment requires the same damping to five digits
+_BISECTIONS = 52  # of an interval of shares, to 2e-16 of its length
+_TOGETHER = 100  # matrices that take hardly longer together than one, so that few frequencies get several halvings
 _WORST, _IN_A_CUT = 6, 28  # frequencies at which the least share is located, and bisections of each
 _VIOLATED = 3  # frequencies of a round at which tangents are added
-_DIFFERENCE = 1e-5  # relative, of the central differences of a tangent
+_DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
 _GAP = 3e-6  # relative gap between the best share and the bound at which the search ends
-_WEIGHTS = 1e4  # of 1/alpha in its unit, up or down
-_DIGITS = 7  # of beta and multipliers, which the exact proof takes as they are printed
+_WEIGHTS = 1e4  # largest factor or divisor of 1/alpha against its unit
+_DIGITS = 7  # digits of beta and multipliers, which the exact proof uses as they are printed
 
 
 class Best(NamedTuple):
     """The least share of the damping that a form of Theorem B needs."""
 
-    share: float  # inf where no beta was found that needs less than the share allowed
-    w: float  # where it binds [rad/sample]
+    share: float  # inf if no beta needs less than the allowed share
+    w: float  # binding frequency [rad/sample]
     beta: tuple[float, ...]  # (m,) [s]
     values: tuple[float, ...] = ()  # the multipliers of the facts
-    bound: float = 0.0  # no beta and no multipliers need less at the frequencies of the search
+    bound: float = 0.0  # lower bound of the share over all beta and multipliers, at the frequencies of the search
 
 
 class Sweep:
-    """The block of Theorem B in the environments of a loop, without L, on which the share of the damping acts.
+    """The block of Theorem B in the environments of a loop, without L, which contains the share of the damping.
 
     Args:
         loop: The loop.
@@ -259,10 +259,10 @@ class Sweep:
     ) -> None:
         self.loop, self.maps, self.form, self.unknowns = loop, maps, form, unknowns
         known, m = _known(loop, loop.T), loop.channels
-        self.P, self.highest = known.P, 4 * known.mass / known.damping  # [s] where c2 = 0
+        self.P, self.highest = known.P, 4 * known.mass / known.damping  # beta [s] at which c2 = 0
         self.usual = tuple(v for each in unknowns for v in (each.units if each.start is None else each.start))
         self.grids = [np.concatenate([[0.0], frequencies(self.idle(i, np.zeros(m)).free)]) for i in range(len(maps))]
-        limited = any(each.name == "c" for each in unknowns)  # dx is then the sum of two inputs
+        limited = any(each.name == "c" for each in unknowns)  # With a limiter dx is the sum of two inputs.
         self.moves = [np.arange(m), 2 * m + np.arange(m)] if limited else [np.arange(m)]
 
     def idle(self, environment: int, beta: Any, values: Sequence[float] | None = None) -> Demand[Lti]:
@@ -271,7 +271,7 @@ class Sweep:
         return self.form(self.maps[environment], named, KnownMotor(PeriodCost(*np.zeros((4, len(beta)))), beta))
 
     def floor(self, beta: Array) -> float:
-        """Return the share at which beta is the largest that is tried; inf where no damping allows it."""
+        """Return the least share for which beta is allowed; inf if no damping allows it."""
         if not ((beta > 0) & (beta <= _LARGEST_ETA * self.highest)).all():
             return np.inf
         return float((beta**2 * self.P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
@@ -281,7 +281,7 @@ class Sweep:
         return positive(with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
     def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
-        """Return the least share (k,) up to `high` at each frequency, inf where `high` is too little."""
+        """Return the least share (k,) up to `high` at each frequency; inf if `high` is not enough."""
         k, low = z.size, self.floor(beta)
         if not low < high:
             return np.full(k, np.inf)
@@ -309,7 +309,7 @@ class Sweep:
         return shares
 
     def required(self, beta: Array, high: float, values: Sequence[float] | None = None) -> tuple[float, float]:
-        """Return the least share up to `high` (inf if there is none) by a refined sweep, and where it binds."""
+        """Return the least share up to `high` (inf if there is none) by a refined sweep, and its frequency."""
         if not self.floor(beta) < high:
             return np.inf, 0.0
         return max(supremum(self.response(i, beta, values, high), grid) for i, grid in enumerate(self.grids))
@@ -320,7 +320,7 @@ class Sweep:
 
 
 class _Search:
-    """The search for beta and multipliers: x = (beta [s], multipliers in their units, or 1/alpha in its, share)."""
+    """The search for beta and multipliers, x = (beta [s], multipliers in units, or 1/alpha in its unit; share)."""
 
     def __init__(self, sweep: Sweep, high: float) -> None:
         self.sweep, self.high, self.m = sweep, high, sweep.loop.channels
@@ -335,17 +335,17 @@ class _Search:
         self.tangents: list[tuple[Complex, Complex]] = []
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,), and the block (1 + m + q, k, n, n) at no beta and no multipliers, and what each adds."""
+        """Return z (k,), and (1 + m + q, k, n, n): the block for zero beta and multipliers, then the slope of each."""
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(m)
         each = [(no_beta, none), *((beta, none) for beta in np.eye(m))]
         each += [(no_beta, none + self.units * (np.arange(self.units.size) == i)) for i in self.searched]
         demands = [self.sweep.idle(environment, beta, tuple(values)) for beta, values in each]
-        found = np.array([hermitian(demand.free.at(z)) for demand in demands])
-        found[1:] -= found[0]
+        blocks = np.array([hermitian(demand.free.at(z)) for demand in demands])
+        blocks[1:] -= blocks[0]
         if (spare := demands[0].spare) is not None:
-            found[0] -= np.diag(spare)
-        return z, found
+            blocks[0] -= np.diag(spare)
+        return z, blocks
 
     def weights(self, x: Array) -> Array:
         """Return the multipliers of x in their units."""
@@ -361,7 +361,7 @@ class _Search:
     def idle(self, z: Complex, parts: Complex, x: Array) -> Complex:
         """Return the block (k, n, n) without L at beta and multipliers of x.
 
-        alpha weighs dx + beta (v+ - v): where delays switch, the block is not affine in (alpha, beta).
+        alpha weighs dx + beta (v+ - v), so for switching delays the block is not affine in (alpha, beta).
         """
         m, weights = self.m, self.weights(x)
         block = parts[0] + np.tensordot(np.concatenate([x[:m], weights]), parts[1:], axes=1)
@@ -375,7 +375,7 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n), with inputs w in units in which it is concave, those of alpha in `at`."""
+        """Return the block (k, n, n) as a concave function of x, with inputs w scaled by 1/alpha over that in `at`."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), x[: self.m])
         block, ratio = with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:
@@ -387,7 +387,7 @@ class _Search:
         """Return constant and slopes of the tangent at x = `at`, scaled to entries of about one."""
         value, slopes = self.concave(z, parts, at, at), np.concatenate([parts[1:], 0 * parts[:1]])
         inverse = np.concatenate([np.zeros(self.m, dtype=bool), self.inverse, [False]])
-        curved = np.where(np.append(False, inverse[:-1])[:, None, None, None], parts, 0.0)  # what is not affine
+        curved = np.where(np.append(False, inverse[:-1])[:, None, None, None], parts, 0.0)  # terms that are not affine
         for a in np.flatnonzero(inverse | (np.arange(at.size) < self.m) | (np.arange(at.size) == at.size - 1)):
             step, of = _DIFFERENCE * at[a] * (np.arange(at.size) == a), parts if inverse[a] else curved
             after, before = (self.concave(z, of, at + sign * step, at) for sign in (1, -1))
@@ -400,9 +400,9 @@ class _Search:
         return root * constant, root * slopes
 
     def least(self, x: Array, most: float) -> tuple[float, tuple[int, int] | None]:
-        """Return the least share below `most` at beta and multipliers of x (inf if none), and where it binds.
+        """Return the least share below `most` at beta and multipliers of x (inf if none), and its binding place.
 
-        That is (environment, place of the frequency), or None.
+        The place is (environment, index of the frequency), or None.
         """
         beta, share, binding = x[: self.m], self.sweep.floor(x[: self.m]), None
         for e, (z, parts) in enumerate(self.sampled):
@@ -430,7 +430,7 @@ class _Search:
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
     def run(self) -> Best:
-        """Return the best of all beta and multipliers that were tried."""
+        """Return the best of all beta and multipliers that the search tries."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [
             np.concatenate([eta * largest_beta(self.sweep.loop, self.high), start, [self.high]]) for eta in _ETAS
@@ -446,11 +446,11 @@ class _Search:
             if least - bound <= _GAP * least:
                 if candidate is None:
                     break
-                best = min(best, found := self.swept(candidate))
-                if found.share <= least * (1 + _BETWEEN):
+                best = min(best, refined := self.swept(candidate))
+                if refined.share <= least * (1 + _BETWEEN):
                     candidate = None
                     break
-                self.add(found.w)
+                self.add(refined.w)
                 candidate, least = None, best.share
                 continue
             self.cut(x)
@@ -473,13 +473,13 @@ class _Search:
         return Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
 
     def add(self, w: float) -> None:
-        """Add a frequency [rad/sample], between those of the grid, to those that are sampled."""
+        """Add a frequency [rad/sample] to the sampled ones."""
         for i, (z, parts) in enumerate(self.sampled):
             more_z, more = self.parts(i, np.array([w]))
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
 
     def cut(self, x: Array, binding: tuple[int, int] | None = None) -> None:
-        """Add tangents at x, at the frequency given or at those of least room."""
+        """Add tangents at x, at the `binding` place or at the frequencies of least room."""
         places = [binding] if binding else self.lowest(x)
         for e, at in places:
             z, parts = self.sampled[e]
@@ -487,12 +487,12 @@ class _Search:
 
     def lowest(self, x: Array) -> list[tuple[int, int]]:
         """Return (environment, place of the frequency) of the least local minima of the room."""
-        found = []
+        minima = []
         for e, (z, parts) in enumerate(self.sampled):
             room = self.room(z, parts, self.idle(z, parts, x), x)
             beside = np.concatenate([[np.inf], room, [np.inf]])
-            found += [(room[at], e, at) for at in np.flatnonzero((room <= beside[:-2]) & (room < beside[2:]))]
-        return [(e, int(at)) for _, e, at in sorted(found)[:_VIOLATED]]
+            minima += [(room[at], e, at) for at in np.flatnonzero((room <= beside[:-2]) & (room < beside[2:]))]
+        return [(e, int(at)) for _, e, at in sorted(minima)[:_VIOLATED]]
 
     def solved(self, least: float) -> Array:
         """Return the x of least share under the tangents. Raises DesignFailed."""
@@ -507,20 +507,20 @@ class _Search:
         for sign, ends in ((1, low / unit[:last]), (-1, -top / unit[:last])):
             rows = sign * np.eye(last, unit.size)[:, :, None, None].swapaxes(0, 1)
             blocks.append(Inequality(-ends[:, None, None], rows, range(unit.size)))
-        # c0 >= 0, with s in units of `least` and beta in units of the largest for it
+        # c0 >= 0, with s in units of `least` and beta in units of the largest beta for that share.
         root = np.array([[0.0, 1.0], [1.0, 0.0]]) / _LARGEST_ETA
         blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
-        # the point that needs `least` satisfies all tangents
+        # The point with the share `least` satisfies all tangents.
         x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, (*SETTINGS, INTERIOR))
         slack = np.linalg.eigvalsh(blocks[0].at(x))[:, 0]
         self.tangents = [one for one, left in zip(self.tangents, slack, strict=True) if left < _SLACK]
         return unit * x
 
 
-_ETAS = (0.03, 0.3, 0.1, 0.9)  # of the largest beta, where tangents are taken first; a search begins at the second
-_SLACK = 0.002  # least eigenvalue of a tangent, of entries of about one, from which it is dropped
-_BETWEEN = 1e-4  # relative: a share that is larger by more between the frequencies of the grid adds one
+_ETAS = (0.03, 0.3, 0.1, 0.9)  # shares of the largest beta for the first tangents; the search begins at the second
+_SLACK = 0.002  # least eigenvalue of a tangent, with entries of about one, from which it is dropped
+_BETWEEN = 1e-4  # relative excess of the share between the sampled frequencies at which a frequency is added
 
 
 def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
@@ -561,20 +561,20 @@ def positive(H: Complex) -> NDArray[np.bool_]:
 
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "periods up to T_max need a shortest one, T_min, for a known device"
-_LATE = "latency: Theorem B holds a force for the whole period, and a force that latches inside it is none"
-_MOST_SHARE = 1e3  # of the damping, up to which a beta on file is swept
+_LATE = "latency: Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
+_MOST_SHARE = 1e3  # largest share of the damping to which a beta on file is swept
 
 
 class KnownDevice(Condition):
-    """Safe in the environment of the loop for every passive hand, on devices within their guaranteed bounds.
+    """Stability in the environment of the loop for every passive hand, on devices within their guaranteed bounds.
 
-    The multiplier holds beta, and bounds of q below and above, one number each per channel, and then the multipliers of
-    the facts; the first three are 0 where the condition that knows nothing of the device asks less.
+    The multiplier has beta, a lower and an upper bound of q, one number each per channel, and then the multipliers of
+    the facts. The first three are 0 if the condition without these bounds, `plain`, requires less damping.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
     covers = ("psi", "T_max", "varying_delay", "walls", "ranges")
-    plain: Multiplied = THIS_ENVIRONMENT  # as beta -> 0, with the same facts
+    plain: Multiplied = THIS_ENVIRONMENT  # the limit for beta -> 0, with the same facts
 
     def beyond(self, loop: Loop) -> str | None:
         if not loop.known_devices:
@@ -593,7 +593,7 @@ class KnownDevice(Condition):
         return tuple(each for fact in self.facts(loop) for each in fact.unknowns(loop))
 
     def without(self, coupling: Coupling) -> str | None:
-        """Return why the condition says nothing of this coupling, or None."""
+        """Return the reason why the condition does not apply to this coupling, or None."""
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
@@ -607,7 +607,7 @@ class KnownDevice(Condition):
         return Sweep(one, maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop))
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block at the loop's own damping, which does not scale it."""
+        """Return the block at the loop's own damping; it does not scale with s."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m = loop.channels
@@ -630,9 +630,9 @@ class KnownDevice(Condition):
         return self.form(G, loop, values, hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the least damping over beta and the facts' multipliers, or that of those given.
+        """Return the requirement with the best beta and multipliers, or with `multiplier`.
 
-        Of several members one beta and one set of multipliers serve all.
+        One beta and one set of multipliers serve all members of ranges.
         """
         if reason := self.beyond(loop) or self.without(coupling):
             return refusal(self.name, loop.delta, reason)
@@ -657,19 +657,19 @@ class KnownDevice(Condition):
         return replace(requirement, multiplier=(*best.beta, *bounds, *best.values))
 
     def _at(self, loop: Loop, coupling: Coupling, multiplier: tuple[float, ...]) -> Requirement:
-        """Return the requirement at the beta and multipliers given."""
+        """Return the requirement with the beta and multipliers in `multiplier`."""
         m = loop.channels
         beta, own, sweep = np.array(multiplier[:m]), multiplier[3 * m :], self.sweep(loop, coupling)
         for i, each in enumerate(self._loops(loop)):
-            asked = sweep.idle(i, beta, own)
-            if reason := unsound(asked.free, loop.delta) or self.plain.unsound_static(sweep.maps[i], each, asked):
+            demand = sweep.idle(i, beta, own)
+            if reason := unsound(demand.free, loop.delta) or self.plain.unsound_static(sweep.maps[i], each, demand):
                 return replace(refusal(self.name, loop.delta, reason), multiplier=multiplier)
         share, w = sweep.required(beta, _MOST_SHARE, own)
         if not np.isfinite(share):
             reason = f"beta = {beta.tolist()} s proves nothing for these devices, whatever the damping"
             return replace(refusal(self.name, loop.delta, reason), multiplier=multiplier)
-        found = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
-        return replace(found, multiplier=multiplier)
+        requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
+        return replace(requirement, multiplier=multiplier)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         if self.unknowns(loop):
@@ -691,8 +691,8 @@ class KnownDevice(Condition):
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Return the required share of the damping for a stack of couplings, (n,), to three hundredths, on a grid.
 
-        Between _LEAST_DRAWN and what the plain condition asks each share is tried with _DRAWN values of beta, the same
-        part of the largest one on every channel: a map asks for thousands of couplings.
+        Shares between _LEAST_DRAWN and that of the plain condition are tried with the betas of _DRAWN, the same part of
+        the largest beta on every channel. The grid is coarse because a map needs thousands of couplings.
         """
         plain = self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):
@@ -707,7 +707,7 @@ class KnownDevice(Condition):
         return np.minimum(np.where(enough, high, plain), plain)
 
     def _drawn(self, loop: Loop, coupling: Coupling, n: int) -> Callable[[Array], NDArray[np.bool_]]:
-        """Return the function from shares (n,) to whether some beta serves each coupling, at frequencies of a map."""
+        """Return the function from shares (n,) to whether a beta of _DRAWN serves each coupling, (n,)."""
         half, m = _DRAWN_POINTS // 2, loop.channels
         w = np.sort(np.concatenate([np.geomspace(1e-3, np.pi, half), np.linspace(0.011, np.pi, half)]))
         z, none = on_circle(w), PeriodCost(*np.zeros((4, m)))
@@ -715,7 +715,7 @@ class KnownDevice(Condition):
         each = [self.form(G, loop, {}, KnownMotor(none, beta)).free.G for beta in (np.zeros(m), *np.eye(m))]
         shape = n, w.size, *each[0].shape[-2:]
         idle, *by = (hermitian(np.broadcast_to(part, shape)) for part in each)
-        last = np.zeros(n, dtype=int)  # the beta that has served a coupling before is tried first
+        last = np.zeros(n, dtype=int)  # The beta that last served a coupling is tried first.
         known, delta = _known(loop, loop.T), np.array(loop.delta)
 
         def holds(share: Array) -> NDArray[np.bool_]:
@@ -767,15 +767,15 @@ class LimitedKnownDevice(KnownDevice):
         return self.limiter.parameters(loop)
 
 
-class KnownDeviceAny(KnownDevice):
-    """Safe around every passive environment for every passive hand, on devices within their guaranteed bounds."""
+class _KnownDeviceAny(KnownDevice):
+    """Stability in every passive environment for every passive hand, on devices within their guaranteed bounds."""
 
     name, covers = "known-device-any", ("T_max", "varying_delay", "walls", "ranges")
     plain: Multiplied = ANY_ENVIRONMENT
 
     def without(self, coupling: Coupling) -> str | None:
         if coupling.compliance(1.0) is None:
-            return "the coupling has no compliance V(z) that knows nothing of the environment"
+            return "the coupling has no compliance V(z) that is independent of the environment"
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
@@ -794,21 +794,21 @@ class KnownDeviceAny(KnownDevice):
         return "any passive environment"
 
 
-_LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # shares of the damping between which a map tells them apart
-_DRAWN_STEPS = 10  # of halving their logarithm: to 0.6 %
+_LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of shares of the damping in a map
+_DRAWN_STEPS = 10  # halvings of the logarithm of this range, to 0.6 %
 _DRAWN = np.concatenate([np.geomspace(0.003, 0.5, 18), [0.62, 0.74, 0.85, 0.93, 0.98, 0.9995]])
 _DRAWN_POINTS = 240  # even frequencies, and even in their logarithm
 
 
 def described(loop: Loop) -> str:
-    """The devices of a loop in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 N s/m'."""
-    said = []
+    """Return the devices in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 N s/m'."""
+    words = []
     for device in dict.fromkeys(loop.known_devices or ()):
         mass, k = f"{1e3 * device.motor_mass_min:.4g} g", f"{device.transmission_stiffness_max:.6g} N/m"
         least, most = device.transmission_damping_min, device.transmission_damping_max
         losses = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
-        said.append(f"at least {mass} behind at most {k} and {losses} N s/m")
-    return f"devices with {' or '.join(said)}"
+        words.append(f"at least {mass} behind at most {k} and {losses} N s/m")
+    return f"devices with {' or '.join(words)}"
 
 
-KNOWN_DEVICE, KNOWN_DEVICE_ANY = KnownDevice(), KnownDeviceAny()
+KNOWN_DEVICE, KNOWN_DEVICE_ANY = KnownDevice(), _KnownDeviceAny()

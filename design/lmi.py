@@ -4,10 +4,10 @@ Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every functi
 be positive (semi)definite; its arguments are numbers or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
-  E-hat = z/(z-1) Psi E has a pole at z = 1 wherever E has static stiffness, and A'PA - P < 0 excludes it (15), (17).
+  E-hat = z/(z-1) Psi E has a pole at z = 1 if E has static stiffness, and A'PA - P < 0 excludes such a pole (15), (17).
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so E-hat without its pole plus
       E(1)/2 satisfies the same condition and is stable (`design.conditions.delayed_environment_demand`).
-  V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) asks 0 > 0.
+  V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) would be 0 > 0.
       Remedy: divide by |1 - 1/z|^2 (`design.conditions.v_hat`).
 """
 
@@ -52,8 +52,7 @@ from haptic_loop.design.result import (
     refusal,
 )
 
-#: share of the damping that designs do not use, so that the rounded coupling is certified
-RESERVE = 1e-4
+RESERVE = 1e-4  # share of the damping that designs do not use, so that the rounded coupling is certified
 
 
 def usable(loop: Loop) -> Array:
@@ -93,8 +92,8 @@ Complex = NDArray[np.complex128]
 class Shaping:
     """L (22) of a loop, evaluated fast for many couplings.
 
-    W1 and W2, diagonal, weigh it from the left and from the right; the identity and `_low_pass` if they are None.
-    Raises ValueError for weights that do not fit, and for an environment that is active.
+    W1 weighs L from the left and the diagonal W2 from the right; the defaults are the identity and `_low_pass`. Raises
+    ValueError for weights that do not fit, and for an environment that is active.
     """
 
     def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
@@ -159,8 +158,8 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
 def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
     """Return a stable G with equal diagonal Gramians, by the square-root method.
 
-    States with a Hankel value below `negligible` times the largest are dropped. No input reaches them or no output
-    shows them to rounding, so the response does not change.
+    States with a Hankel value below `negligible` times the largest are dropped. They are unreachable or unobservable to
+    rounding, so the response does not change.
     """
     import scipy
 
@@ -241,7 +240,7 @@ _MOST_STATES = 30  # states of E-hat up to which the least trace is computed: 42
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return the diagonal Phi (N,) [N s/m] with E-hat + Phi passive and Phi < Delta_D; of least trace for few states.
+    """Return a diagonal Phi (N,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, with least trace for few states.
 
     Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
@@ -286,7 +285,7 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
 
 
 class _AnyEnvironment(Multiplied):
-    """Theorem 4 of the paper: stability before every passive environment; with psi >= 1 before this one.
+    """Theorem 4 of the paper: stability in every passive environment; for psi >= 1 in the loop's environment only.
 
     For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only;
     latency and switching delays use the block of design.facts.compose_any.
@@ -338,8 +337,8 @@ class _AnyEnvironment(Multiplied):
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
         if _in_frame(loop) and any(loop.psi):
-            what = "a latency" if loop.latency else "delays that switch"
-            return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"
+            obstacle = "a latency" if loop.latency else "delays that switch"
+            return f"with delay in the environment its multiplier is of whole, constant samples: no {obstacle}"
         return None if any(loop.psi) else loop.environment.active(loop.T)
 
     def not_varied(self, loop: Loop) -> str | None:
@@ -374,7 +373,7 @@ class _AnyEnvironment(Multiplied):
         return "without a coupling there is nothing that Theorem 4 could use"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement; without `multiplier` by the least one, if one is needed."""
+        """Return the requirement with `multiplier`, or with the least multiplier if one is needed."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling))
@@ -412,8 +411,8 @@ class _AnyEnvironment(Multiplied):
         ratio, w = supremum(partial(conditions.least_scale, demand), np.concatenate([[0.0], frequencies(V)]))
         return from_ratio(self.name, ratio, loop.delta, w / (2 * np.pi * loop.T))
 
-    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
-        return asymmetric(asked.static["V(1)"])
+    def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
+        return asymmetric(demand.static["V(1)"])
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -445,9 +444,9 @@ ANY_ENVIRONMENT = _AnyEnvironment()
 
 
 def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
-    """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling before any environment.
+    """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling for any environment.
 
-    It minimises the mean of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), vt the mean window (docs/theory.md).
+    It minimises the mean of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha) with the mean window vt (docs/theory.md).
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)
@@ -484,7 +483,7 @@ class Ports(NamedTuple):
 
 
 def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
-    """Return the negative of (2), x'Px - x+'Px+ + supply as a quadratic form of (x, u); it and P must be > 0."""
+    """Return the negative of (2), x'Px - x+'Px+ + supply as a quadratic form of (x, u); both this and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
     state = P - A.T @ P @ A - C1.T @ Delta @ C1
@@ -493,9 +492,9 @@ def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
 
 
 def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
-    """Return [[Y, R'], [R, S]] of (3); with Q > 0, Y = Q^-1 and Sigma = Delta^-1 it is Lemma 1 (Sigma None: Delta = 0).
+    """Return [[Y, R'], [R, S]] of (3), which is affine in A, B, C, D, so that these may be unknowns.
 
-    Affine in A, B, C, D, which may therefore be unknowns.
+    With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is Lemma 1 (Sigma None: Delta = 0).
     """
     A, B, C2, D2, C1, D1 = G
     n = Q.shape[0]
@@ -524,7 +523,7 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
-    """Return the block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
+    """Return the block matrix without empty blocks, exactly symmetric; an array if every block is an array."""
     blocks = [[block for block in row if 0 not in block.shape] for row in rows]
     blocks = [row for row in blocks if row]
     numbers = all(isinstance(block, np.ndarray) for row in blocks for block in row)

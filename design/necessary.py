@@ -1,10 +1,10 @@
-"""What no condition for devices of known motor and transmission can undercut (Theorem A), by a sweep.
+"""The necessary damping of devices with known motor and transmission (Theorem A), by a sweep.
 
-For one linear motor (mass m, damping delta) behind a spring k and a damper b the sampled response to a held force
-fills a disk as the passive hand varies: at each alias w_n = (w + 2 pi n)/T the hand may answer as it likes. The loop
-is stable for every passive hand if no response in the disk closes it and it is stable with the far end of the
-transmission held. With one channel, or channels with equal devices, some lossless hand attains every point of the
-disk. The member of the class is the one with the least mass and damping, the stiffest spring and the least damper.
+Let a linear motor (mass m, damping delta) stand before a spring k and a damper b. As the passive hand varies, the
+sampled response to a held force fills a disk, because the hand's response at each alias w_n = (w + 2 pi n)/T is
+arbitrary. The loop is stable for every passive hand if no response in the disk makes it singular, and if it is stable
+with the far end of the transmission held. With one channel, or channels with equal devices, some lossless hand attains
+every point of the disk. The considered device has the least mass and damping, the stiffest spring and the least damper.
 Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the
 proof.
 """
@@ -26,7 +26,7 @@ from haptic_loop.design.result import Requirement
 
 
 def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
-    """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m], in closed form.
+    """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m].
 
     sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n), S2 = sum g_n conj(a_n)/(w_n^2 c_n), a_n = delta + j m w_n,
     g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. Both are rational in W = w_n^2 with the denominator
@@ -52,23 +52,23 @@ def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: flo
     return turn * S0.real, turn * S2
 
 
-class Necessary(NamedTuple):
+class _Necessary(NamedTuple):
     """The least share of the damping for which Theorem A holds."""
 
     share: float
-    w: float  # where it binds [rad/sample]
+    w: float  # binding frequency [rad/sample]
     held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
 
 
-_LOWEST = 1e-4  # [rad/sample]: at z = 1 the disk touches the point that it must not contain
-_SMALL, _LARGE = 1e-6, 1e3  # shares of the damping between which the least one is searched
+_LOWEST = 1e-4  # [rad/sample]; at z = 1 the disk touches the point that it must not contain
+_SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the damping
 
 
-def necessary_share(F: Lti, loop: Loop) -> Necessary:
+def necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand destabilises linear motors, by a refined sweep.
 
-    It is a lower bound for every condition of this class of devices where the loop has one channel or equal devices;
-    otherwise it is sufficient, and close.
+    For one channel or equal devices the share is a lower bound for every condition on these devices. Otherwise it is
+    sufficient, and close to that bound.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels
@@ -91,26 +91,31 @@ def necessary_share(F: Lti, loop: Loop) -> Necessary:
         response = F.at(on_circle(w))
         least, most = np.full(w.size, _SMALL), np.full(w.size, _LARGE)
         plenty = holds(w, response, most)
-        for _ in range(52):  # to 2e-16 of the interval's length
+        for _ in range(52):  # bisections to 2e-16 of the interval's length
             middle = (least + most) / 2
             enough = holds(w, response, middle)
             least, most = np.where(enough, least, middle), np.where(enough, middle, most)
         return np.where(plenty, most, np.inf)
 
     share, w = supremum(shares, frequencies(F, low=_LOWEST))
-    return Necessary(share, w, bool(np.isfinite(share)) and _stable_with_held_ends(F, loop, share * (1 + 1e-6)))
+    return _Necessary(share, w, bool(np.isfinite(share)) and _stable_with_held_ends(F, loop, share * (1 + 1e-6)))
 
 
 @dataclass(frozen=True)
 class LeftOver:
-    """What Theorem A asks of linear motors beside what is proved: how much a better proof could still gain."""
+    """The necessary damping of Theorem A beside the proved one; the difference is the possible gain of better proofs.
 
-    required_damping: tuple[
-        float, ...
-    ]  # (m,) [N s/m], by a sweep; no condition for these devices asks less if `attained`
+    Attributes:
+        required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less.
+        frequency_hz: The binding frequency.
+        attained: Whether some lossless hand destabilises the loop at any smaller damping (one channel, equal devices).
+        proved_damping: (m,) [N s/m] by known-device; None if it is infinite.
+    """
+
+    required_damping: tuple[float, ...]
     frequency_hz: float
-    attained: bool  # one channel, or equal devices: some lossless hand destabilises the loop at any smaller damping
-    proved_damping: tuple[float, ...] | None  # (m,) [N s/m] by known-device; None where it certifies nothing
+    attained: bool
+    proved_damping: tuple[float, ...] | None
 
     @property
     def words(self) -> str:
@@ -119,21 +124,21 @@ class LeftOver:
         exact = "no proof for every passive hand can ask less" if self.attained else "that is enough, by a sweep"
         if self.proved_damping is None:
             return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
-        given = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
-        said = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
-        return f"{said}; the proof gives away {given} N s/m"
+        excess = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
+        necessary = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
+        return f"{necessary}; the proof gives away {excess} N s/m"
 
 
 def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
-    """Return what Theorem A asks of this loop; None where it says nothing of it or finds no damping that is enough.
+    """Return the necessary damping of this loop; None if Theorem A does not apply or no damping is enough.
 
-    `proved` is what known-device asks, if it has been asked already.
+    `proved` is the requirement of known-device, if it is known already.
     """
     if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
         return None
     equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
     if walls and not equal:
-        return None  # touched walls give a lower bound, unlike devices a sufficient figure: together neither
+        return None  # Walls give a lower bound, and unlike devices a sufficient figure; together they give neither.
     try:
         maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]
     except SingularLoop:
@@ -150,7 +155,7 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
 
 def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:
-    """Whether the loop is stable at `share` of the damping with the far end of every transmission held."""
+    """Return whether the loop is stable at `share` of the damping with the far end of every transmission held."""
     import scipy
 
     m, known = loop.channels, loop.known_devices or ()

@@ -128,7 +128,7 @@ def design(
     if exactly := search.nothing():
         return exactly
     best: Optimal | None = None
-    better: list[Optimal] = []  # each than the one before
+    better: list[Optimal] = []  # successive best results
     results: list[_BasisResult] = []
     hurried, floor, gained = False, _felt(min(search.simple, 1.0)), np.inf
     for taps, poles in options.bases:

@@ -21,10 +21,10 @@ _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 
 
 def named(option: str, text: str) -> Any:
-    """Return the object that FILE.py:NAME names: the one place where a user's own code is loaded.
+    """Return the object that FILE.py:NAME names. No other function loads a user's own code.
 
-    What the file prints goes to standard error, since a report may go to standard output. The file's folder joins
-    sys.path, for modules beside it and for worker processes.
+    Output of the file goes to standard error, because a report may go to standard output. The file's folder is added to
+    sys.path, for modules in the same folder and for worker processes.
 
     Raises:
         InputError: `text` names no file or no object in it, or the file is no valid Python.
@@ -74,15 +74,15 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
 
 
 def reach(folder: str) -> None:
-    """Let modules in this folder be imported."""
+    """Add the folder to sys.path, so that its modules can be imported."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
 
 
-def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> _Made:
-    """Call a user's own class or function. Raises InputError if it does not accept the arguments."""
+def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:
+    """Call a user's own class or function. Raises InputError, beginning with `what`, if it refuses the arguments."""
     try:
-        return make(*given, **named)
+        return make(*args, **options)
     except Exception as error:
         if isinstance(error, InputError) or place_of(error):
             raise

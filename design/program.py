@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.design import budgets
 from haptic_loop.design.arguments import number, one_of
 from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
-from haptic_loop.design.conditions import Demand, even_damping, this_environment_demand
+from haptic_loop.design.conditions import even_damping, this_environment_demand
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks
 from haptic_loop.design.transparency import BAND_HZ
@@ -111,15 +111,11 @@ def this_environment(loop: Loop) -> _Constraint:
     """Return this-environment as a constraint with the share MARGIN of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
-        demand = _demand(loop, loop.late(G))
+        demand = this_environment_demand(loop.late(G), loop)
         return demand.free + demand.gain * (1 - MARGIN)
 
-    gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
+    gain = this_environment_demand(Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T), loop).gain
     return _Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)), through=loop.latency is None)
-
-
-def _demand(loop: Loop, F: Any) -> Demand[Any]:
-    return this_environment_demand(F, loop)
 
 
 def switching(loop: Loop, span: DelayRange) -> _Constraint:

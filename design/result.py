@@ -15,7 +15,7 @@ from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
-#: for which environments a certificate holds
+#: the environments of a certificate
 Environments = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the names of all conditions, in the order of tables
@@ -26,7 +26,7 @@ KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-d
 PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDITIONS)
 
 
-#: environments for which this-environment holds before walls
+#: the environments of this-environment in a loop with walls
 MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
@@ -52,12 +52,12 @@ class Requirement(Generic[C]):
 
     Attributes:
         condition: The name of the condition.
-        required: (m,) required damping [N s/m]; inf where no damping helps.
+        required: (m,) required damping [N s/m]; inf if no damping is enough.
         available: (m,) damping that the devices guarantee [N s/m].
-        frequency_hz: The frequency [Hz] at which the condition binds; None where there is none.
+        frequency_hz: The frequency [Hz] at which the condition binds, or None.
         reason: Why `required` is infinite.
-        proof: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
-        multiplier: The multiplier that the figure belongs to, for a condition that has one.
+        proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
+        multiplier: The multiplier of the figure, for a condition with multipliers.
         bound: Lower bound of the ratio over all multipliers, at the frequencies of the search.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter that the condition covers without further proof.
@@ -125,7 +125,7 @@ def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirem
 
 
 def finite(value: float) -> float | None:
-    """Return the value, or None for infinity and nan, which JSON has not."""
+    """Return the value, or None for infinity and nan, which JSON cannot express."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -135,9 +135,9 @@ def switching_guarantee(span: DelayRange) -> str:
 
 
 class NotProved(ValueError):
-    """No proof of the condition was found. `requirement` is that of the sweep, if there is one.
+    """No proof of the condition was found. `requirement` is the requirement by the sweep, or None.
 
-    `refuted` says that exact arithmetic contradicts the sweep, so that there is no proof.
+    `refuted` is True if exact arithmetic contradicts the sweep, so that no proof can exist.
     """
 
     def __init__(self, reason: str, requirement: Requirement | None = None, refuted: bool = False) -> None:
@@ -185,10 +185,10 @@ class Chosen:
         phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
         certificate: The Certificate of the file, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
-        own: The condition of the user's own (design.conditions.Condition), or None.
-        switching: The delays [samples] within which its file proves any switching, or None.
-        notes: Remarks on its origin, for reports.
-        certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
+        own: The user's own condition (design.conditions.Condition), or None.
+        switching: The delays [samples] within which the file of the coupling proves any switching, or None.
+        notes: Remarks on the origin of the coupling, for reports.
+        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
     """
 
     coupling: Coupling
@@ -204,7 +204,7 @@ class Chosen:
 
     @property
     def asked(self) -> Any:
-        """The condition of the user's own, or the name of the condition."""
+        """The user's own condition, or the name of the condition."""
         return self.own or self.condition
 
     def remarks(self, requirements: Mapping[str, Requirement]) -> tuple[str, ...]:
@@ -212,7 +212,7 @@ class Chosen:
         return (*self.notes, self.own.said(requirements[self.own.name])) if self.own else self.notes
 
     def fails(self, requirements: Mapping[str, Requirement]) -> bool:
-        """Return whether there is a condition of the user's own that does not hold."""
+        """Return whether there is a user's own condition that does not hold."""
         return bool(self.own) and not requirements[self.own.name].certified
 
 
@@ -224,7 +224,7 @@ class Design(Chosen):
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
         condition: The name of the condition that it was designed for.
         figure: The objective: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
-        objective: Its value for the coupling as returned; a ratio, or [N/m] for "stiffness".
+        objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep.
         sdps: The number of convex problems that were solved, or of runs of a local search.
         wall_s: The duration of the design [s].
@@ -235,10 +235,10 @@ class Design(Chosen):
         phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
         certificate: The Certificate, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
-        own: The condition of the user's own (design.conditions.Condition), or None.
+        own: The user's own condition (design.conditions.Condition), or None.
         switching: The delays [samples] within which any switching is proved, or None.
-        notes: Remarks on its origin, for reports.
-        certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
+        notes: Remarks on the origin of the coupling, for reports.
+        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
     """
 
     figure: str

@@ -28,21 +28,21 @@ class Robustness:
 
     percent: float
     required_over_available: float  # damping, in the worst environment
-    where: str  # the parameter that differs there, with its sign
-    certified: bool  # whether the condition holds there
+    where: str  # the parameter that differs in the worst environment, with its sign
+    certified: bool  # whether the condition holds in the worst environment
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A design that holds at all `vertices`, too. It is made with a small budget, so its price is an upper bound."""
+    """A design that is safe at all `vertices`, too. The search has a small budget, so its price is an upper bound."""
 
     mismatch_db: float  # in the nominal environment
     price_db: float  # mismatch less that of the nominal design
-    g: float  # share of the stiffness that is rendered
+    g: float  # rendered share of the stiffness
     worst: float  # largest required over available damping at the vertices
     states: int  # of the loop
-    environments: int  # number of vertices, the nominal environment included
-    proved: int  # of these in exact arithmetic; the others are swept once the budget for proofs is used up
+    environments: int  # number of vertices, including the nominal environment
+    proved: int  # environments with an exact proof; the others, beyond the budget for proofs, are swept
     reason: str | None = None  # why the next environment is not proved
 
 
@@ -60,9 +60,9 @@ def at(loop: Loop, network: Network) -> Loop:
 
 
 def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
-    """Return networks with every spring, all springs at once, and every mass this much more or less, by name.
+    """Return networks by name, each with one spring, all springs or one mass changed by plus or minus `percent`.
 
-    Raises InputError where a stiffness or a mass would then be above the largest that a network may have.
+    Raises InputError if a changed stiffness or mass would exceed the largest that a network may have.
     """
     try:
         return _vertices(network, percent)
@@ -98,7 +98,7 @@ def robustness(
 ) -> Robustness:
     """Return the worst requirement of a coupling over `vertices`, by the refined sweep of the condition.
 
-    Where there are many vertices, a coarse sweep first finds those that come near the worst.
+    For many vertices a coarse sweep first finds the candidates near the worst one.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network, percent)}
     loops = {name: at(loop, one) for name, one in networks.items()}
