@@ -1,6 +1,7 @@
-"""Spring-damper couplings (26): the best under either condition, the stiffest, and the moving average.
+"""Designs of couplings: the spring-damper (26) of least objective or of largest stiffness, and the moving average.
 
-any-environment has a convex set of gains, described here; design.gain_search searches gains for one environment.
+The gains that any-environment certifies form a convex set, described here. design.gain_search searches gains for one
+environment.
 
 Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (gain_set).
 """
@@ -189,10 +190,8 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
-#: relative improvement of the norm at which the sequence stops
-_SETTLED = 1e-6
-#: dampers below this share of the device's damping become 0: solvers leave 1e-9 instead of zero
-_NEGLIGIBLE = 1e-6
+_SETTLED = 1e-6  # the sequence stops where a step improves the norm by less, relative to the norm
+_NEGLIGIBLE = 1e-6  # smaller dampers, relative to the usable damping, become 0: solvers return 1e-9 instead of zero
 
 
 def design(
@@ -205,14 +204,25 @@ def design(
     W1: Lti | None = None,
     W2: Lti | None = None,
 ) -> Design:
-    """Return the best spring-damper under `condition`. Starts need not be feasible; there are default ones.
+    """Return the spring-damper of least objective that `condition` certifies.
 
-    any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
-    this-environment: finds local optima of the rms mismatch over `band_hz` [Hz] from every start. With `switching` =
-    (lo, hi) [samples] the coupling is safe under any switching of the forces' delays, with `limiter` also while forces
-    are limited (any-environment always covers this).
+    any-environment minimises ||W1 L W2||_inf (23) over the exact set of gains, so the result does not depend on the
+    start. this-environment takes the lowest of the local minima of the rms mismatch that are reached from the starts.
 
-    Raises Infeasible if Theorem 4 admits no gains, DesignFailed if the search finds none for this-environment.
+    Args:
+        loop: The devices, their delays and the environment.
+        condition: The name of a condition.
+        starts: Gains at which a search starts. They need not be feasible, and there are default ones.
+        switching: The least and largest delays (lo, hi) [samples] of the forces, if the delays switch.
+        limiter: Whether the proof covers limited forces too; that of any-environment always does.
+        band_hz: The band of the rms mismatch [Hz].
+        W1: The output weight of (23).
+        W2: The input weight of (23).
+
+    Raises:
+        Infeasible: Theorem 4 admits no gains.
+        DesignFailed: The search for this-environment or known-device found no gains.
+        ValueError: The condition does not cover an argument.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if switching or limiter:
@@ -227,11 +237,9 @@ def design(
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-#: digits of gains in a loop of many devices, finer than RESERVE: with all digits exact proofs take minutes
-_DIGITS = 5
-_SWEEPS = 150  # cost of a search for gains in this environment, in sweeps
-#: largest number of devices whose search ends within half a minute
-_MOST_ANY, _MOST_LIMITED = 48, 32
+_DIGITS = 5  # digits of the gains of many devices, finer than RESERVE: with all digits exact proofs take minutes
+_SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
+_MOST_ANY, _MOST_LIMITED = 48, 32  # largest number of devices whose search ends within half a minute
 
 
 def _require_few(loop: Loop, most: int, what: str) -> None:
@@ -240,11 +248,12 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
 
 
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """Return a spring-damper; it covers limited forces if `limiter` is True, or None and such a coupling is found.
+    """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
 
-    Raises DesignFailed at once if the number of devices would make the search take minutes.
+    `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if so many
+    devices would make the search take minutes.
     """
-    if not named(condition).extensible:  # It covers limited forces with rho = 0.
+    if not named(condition).extensible:  # Limited forces are covered with rho = 0.
         if limiter and named(condition) is KNOWN_DEVICE:
             raise ValueError("limiter: forces that are limited are not covered by known-device, ask this-environment")
         _require_few(
@@ -342,9 +351,10 @@ def _for_this_environment(
 
 
 def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
-    """Return the spring-damper of least rms mismatch under known-device or this-environment.
+    """Return the spring-damper of least rms mismatch that known-device certifies.
 
-    Raises DesignFailed if neither certifies one, or if known-device does not cover the loop.
+    The search also starts from the result for this-environment, which is returned unless a better one is found. Raises
+    DesignFailed if neither search finds a coupling, or if known-device does not cover the loop.
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
@@ -370,12 +380,15 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
 
-_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # shares of the largest beta
+_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried shares of largest beta
 _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
-    """l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n], n = theta + 1: what V must exceed, (k, m) [m/N]."""
+    """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and device.
+
+    It is l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
     window = np.stack([sum(z**i for i in range(each)) for each in n], axis=1)
@@ -407,7 +420,7 @@ def _stiffest_known(loop: Loop) -> Design:
 
 
 def _stiffest_channel(loop: Loop) -> tuple[float, float]:
-    """Return K [N/m] and B [N s/m] of the stiffest spring-damper before any environment, with a design's reserve."""
+    """Return K [N/m] and B [N s/m] of the stiffest spring-damper for any environment, with a design's reserve."""
     from scipy.optimize import minimize_scalar  # slow to load
 
     z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))
@@ -496,7 +509,7 @@ _STIFF_DIGITS = 6
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
-    """Return starts around 2 d/(n T), the largest stiffness of a linear coupling before any passive environment.
+    """Return starts around 2 d/(n T), the largest stiffness of a linear coupling for any passive environment.
 
     With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency;
     the last start has the environment's stiffness at half the sampling rate.
@@ -510,11 +523,11 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-_SPARE_OF_SLOW_WORLDS = 0.25  # the force rings with 0.5 (theta = 1) or 0.55 (theta = 2) of itself from tick to tick
+_SPARE_OF_SLOW_WORLDS = 0.25  # then ringing decays by a factor of 0.5 (theta = 1) or 0.55 (theta = 2) from tick to tick
 
 
 def _spare(loop: Loop) -> float:
-    """Return e of moving_average: a reserve, or what damps the force before a world that stands still between steps."""
+    """Return e of `moving_average`: a rounding reserve, or more where the world stands still between its steps."""
     world = loop.environment.world
     return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
 
@@ -522,10 +535,10 @@ def _spare(loop: Loop) -> float:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
-    V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
-    added, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere. The zeros of the sum lie
-    on the unit circle, so that the force rings for ever before an object that stands still. A world that steps every
-    n ticks stands still in between: e is larger there.
+    V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. With the constant
+    e n^2 T/(2 delta) added, n = theta + 1, it requires delta/(1 + e) where the sum is largest, and less elsewhere. The
+    zeros of the sum lie on the unit circle, so without e the force against an object at rest rings without decay. A
+    world that steps at every n-th tick is at rest in between, so e is larger for it.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -582,7 +595,7 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window."""
+    """Return chi_k of |v|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), where v is the mean window, h half its range."""
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
     window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)
@@ -596,7 +609,7 @@ def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _best_charge(loop: Loop, i: int, theta: int) -> Array:
-    """Return Q (2, 2) [1/s] of least trace of Q^-1 M, M the inner products of both windows."""
+    """Return the Q (2, 2) [1/s] that minimises trace(Q^-1 M), where M holds the inner products of both windows."""
     hands, scale = Latency(), 1 / loop.T
     root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))
     one = loop.channel(i)

@@ -61,10 +61,10 @@ def _listed(value: Any) -> Any:
 
 
 class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """What is guaranteed of a device's motor and transmission, `[device.guaranteed]` of a scenario.
+    """Guaranteed bounds of a device's motor and transmission, `[device.guaranteed]` of a scenario.
 
-    The bounds hold for the real device; what is simulated must lie within them. The known-device conditions rest on
-    them: everything but the motor is reached through a spring and a damper in parallel.
+    The bounds hold for the real device, and the simulated values must lie within them. The known-device conditions use
+    them: the transmission, a spring and a damper in parallel, joins the motor to everything else.
     """
 
     motor_mass_min: float  # [kg] of all that moves rigidly with the motor's shaft
@@ -85,7 +85,7 @@ class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_o
 
 
 class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """What both kinds of a device, which declare the fields, have."""
+    """Properties of both kinds of a device; the kinds declare the fields."""
 
     @property
     def passivity_level(self: Any) -> float:
@@ -103,13 +103,13 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
 
     @property
     def axis_names(self: Any) -> tuple[str, ...]:
-        """What follows the names of joints and contacts: ".x" and so on, or nothing where there is one axis."""
+        """The endings of the names of joints and contacts: ".x" and so on, or "" if the device has one axis."""
         return tuple(f".{AXES[i]}" for i in self.free) if self.axes > 1 else ("",)
 
     def matrix(self: Any, field: str) -> _Matrix:
-        """Return `damping`, or the guaranteed damping as `delta`, as a matrix over the free axes [N s/m].
+        """Return `damping`, or with field "delta" the guaranteed damping, as a matrix over the free axes [N s/m].
 
-        The clamped axes do not move, so that the form v' Delta v of the free ones is that of their own block.
+        Clamped axes do not move, so v' Delta v of the device is that of the block of the free axes.
         """
         value = self.passivity_level if field == "delta" else self.damping
         return symmetric(field, value, self.axes)[np.ix_(self.free, self.free)]
@@ -140,8 +140,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
 class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
     """A motor with encoder, joined to the handle by a transmission spring.
 
-    Whatever hangs on the transmission, the port at motor and encoder dissipates at least `damping`: it is the
-    output-strict-passivity level of the device.
+    `damping` is the output-strict-passivity level of the port at motor and encoder, for every load at the transmission.
     """
 
     motor_mass: float = 0.06  # [kg] assumed, with handle_mass: 0.25 kg in total
@@ -152,12 +151,12 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
-    friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
+    friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
-    credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `most_credible_force`
-    credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
-    # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
-    guaranteed: Guaranteed | None = None  # bounds of motor and transmission that the known-device conditions rest on
+    credible_force: float | None = None  # [N] in the transmission, up to which its model is trusted
+    credible_speed: float = 2.0  # [m/s] of the handle, up to which the model is trusted. Assumed: three times 0.7 m/s,
+    # which masters of teleoperation exceed in a fifth of the fast part of a tapping task (abstract of a study)
+    guaranteed: Guaranteed | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
@@ -165,7 +164,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     @property
     def bodies(self) -> dict[str, float]:
-        """Its masses by name [kg]; the last one is what a hand holds."""
+        """The masses [kg] by the names of the bodies; a hand holds the last one."""
         return {"motor": self.motor_mass, "handle": self.handle_mass}
 
     @property
@@ -175,10 +174,10 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     @property
     def most_credible_force(self) -> float:
-        """What the transmission may carry [N] before the linear model of it is doubted.
+        """The transmission force [N] up to which its linear model is trusted: `credible_force` or an assumption.
 
-        The force at which a cable slips on its capstan is not published. Where a device declares none, it is three
-        times what its motor can push, because a transmission that is made for a motor need not hold more.
+        The force at which a cable slips on its capstan is not published. The assumption is three times the motor's
+        force limit, since a transmission is made for its motor.
         """
         return 3.0 * float(np.max(self.force_limit)) if self.credible_force is None else self.credible_force
 
@@ -204,10 +203,10 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it, axis by axis
-    friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
+    friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping
-    credible_speed: float = 2.0  # [m/s] as of a compliant device
-    guaranteed: Guaranteed | None = None  # refused: there is no transmission to guarantee
+    credible_speed: float = 2.0  # [m/s] as for a compliant device
+    guaranteed: Guaranteed | None = None  # refused, since a rigid device has no transmission
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
@@ -217,7 +216,7 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
 
     @property
     def bodies(self) -> dict[str, float]:
-        """Its mass by name [kg]; the hand holds the motor itself."""
+        """The mass [kg] of the only body, the motor, which the hand holds."""
         return {"motor": self.mass}
 
     def __post_init__(self) -> None:
@@ -241,9 +240,9 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def within(cls, device: Device, u: NDArray[np.float64]) -> Mechanics:
         """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
 
-        A negative entry of u stands for the bound itself, near which the worst device is. Positive ones reach, evenly
-        in logarithms, ten times the least motor mass, a hundredth of the handle mass (of which nothing is guaranteed),
-        a tenth of the largest stiffness, and the largest damping.
+        A negative entry of u selects the bound itself, because the worst devices lie near the bounds. A positive entry
+        moves the logarithm of its value evenly away from the bound. At 1 the values are ten times the least motor mass,
+        a hundredth of the handle mass (which has no bound), a tenth of the largest stiffness, and the largest damping.
         """
         known = device.guaranteed
         assert known is not None  # the caller draws only where every device has bounds
@@ -334,13 +333,13 @@ def _check_damping(self: Any) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Devices that can be bought or built: what is published of each, and by whom. No certificate rests on a number that is
-# not known: a scenario that names a device gives those itself, measured by `python -m hw.identify` for example.
+# Published parameters of devices that can be bought or built, with their sources. A scenario that names a device must
+# give the parameters that nobody publishes, for example as measured by `python -m hw.identify`.
 
 
 @dataclass(frozen=True)
 class _Known:
-    """A published number, or the kind of a model, with its source."""
+    """A published number, or the published kind of a device's model, with its source."""
 
     value: float | str
     source: str
@@ -365,12 +364,12 @@ class Listed:
     force_limit: _Known | None = None  # [N]
     encoder_step: _Known | None = None  # [m] at the handle
     friction: _Known | None = None  # [N] Coulomb, at most
-    stiffness: _Known | None = None  # [N/m] the most that a framework lets a programmer ask for
-    framework_damping: _Known | None = None  # [N s/m] likewise
+    stiffness: _Known | None = None  # [N/m] largest stiffness that a programming framework admits
+    framework_damping: _Known | None = None  # [N s/m] largest damping that a programming framework admits
 
     @property
     def known(self) -> dict[str, _Known]:
-        """The published fields of a RigidDevice. Of friction an upper bound is published, which is no `friction`."""
+        """The published fields of a RigidDevice. A published friction is an upper bound, hence `friction_max`."""
         fields = ("kind", "damping", "mass", "force_limit", "encoder_step")
         facts = {name: fact for name in fields if (fact := getattr(self, name))}
         return facts | ({"friction_max": self.friction} if self.friction else {})
@@ -380,7 +379,7 @@ _IDENTIFIED = "section 6 of the paper: a first-order model identified on an Omeg
 
 
 def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> Listed:
-    """Return the translation of a device in CHAI3D's table, whose wrist and gripper are left out."""
+    """Return a device of CHAI3D's table without its wrist and gripper."""
     limits = {"force_limit": force, "stiffness": stiffness, "framework_damping": 30.0}
     return Listed(f"Force Dimension {title}", **{name: _Known(value, _DELTA) for name, value in limits.items()}, **more)
 
@@ -422,11 +421,11 @@ CATALOGUE: Mapping[str, Listed] = {
     "hapkit": Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
-_NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
+_NEEDED = ("damping", "force_limit")  # fields for which a RigidDevice must not use its assumed default
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
-    """Return the catalogue's device of a name, and its spelling there. Raises ValueError that lists the names."""
+    """Return a device's name in the catalogue and its entry. Raises ValueError for an unknown name."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
         close = difflib.get_close_matches(key, CATALOGUE, n=1)
@@ -435,18 +434,18 @@ def listed_device(name: str) -> tuple[str, Listed]:
     return key, CATALOGUE[key]
 
 
-def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a catalogue device as fields of a scenario's [[device]]; given numbers replace those of the catalogue.
+def fields_of(name: str, own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a scenario's [[device]]: those of the catalogue, replaced and completed by its `own`.
 
-    Raises ValueError for an unknown name, and where a number is neither published nor given.
+    Raises ValueError for an unknown name, or for a required number that neither has.
     """
     key, device = listed_device(name)
     fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}
-    if given.get("kind") == "compliant":  # its mass is divided between motor and handle
+    if own.get("kind") == "compliant":  # a compliant device has motor_mass and handle_mass instead of mass
         fields.pop("mass", None)
-    if "friction" in given:  # measured, so that the published bound says nothing more
+    if "friction" in own:  # a measured friction replaces the published bound
         fields.pop("friction_max", None)
-    fields |= given
+    fields |= own
     if missing := [field for field in _NEEDED if field not in fields]:
         unknown = " and ".join(f"{field} [{'N' if field == 'force_limit' else 'N s/m'}]" for field in missing)
         raise ValueError(f"nobody publishes {unknown} of {key}: give it beside `device`, as measured by hw.identify")

@@ -4,7 +4,7 @@ Any object with the two methods of `Hand` can hold a device. Its `port()` descri
 feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). A `Port` checks that it is passive when it is
 built, so every human in a simulation is passive.
 
-On a device with several axes a port of one axis acts alike in every direction: `Port.in_space`.
+On a device with several axes a port of one axis acts in the same way along each of them (`Port.in_space`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _Array = NDArray[np.floating[Any]]
 _Range = tuple[float, float]
 _Amount = float | tuple[float | tuple[float, ...], ...]
 
-_ROUNDING = 1e-9  # of the mean of |Z|, by which rounding may make Re Z of a passive impedance negative
+_ROUNDING = 1e-9  # negative Re Z that is attributed to rounding, relative to the mean of |Z|
 
 # ----------------------------------------------------------------------------------------------------
 # Ports: the mechanics that a handle feels.
@@ -59,7 +59,10 @@ class Impedance:
             _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
 
     def changed(self, change: Callable[[_Array], _Array]) -> Impedance:
-        """Apply an indexing or repetition along the leading axes to A, B, C and D. It keeps passivity: no new check."""
+        """Return a copy with `change`, an indexing or a repetition along the leading axes, applied to A, B, C and D.
+
+        Passivity is not checked again, because `change` preserves it.
+        """
         changed = object.__new__(Impedance)
         for name in "ABCD":
             _freeze(changed, name, change(getattr(self, name)))
@@ -83,20 +86,21 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
         raise ValueError(f"impedance: passivity cannot be decided, the margin is too small near {hertz}; add damping")
 
 
-_FIRST, _EVALUATIONS = 64, 1 << 15  # intervals of the circle, and how many are looked at in all
-_REACH = 0.5  # a bound holds on an interval of at most this part of the distance that the resolvent tells
+_FIRST, _EVALUATIONS = 64, 1 << 15  # number of intervals at the start, and of all intervals that are evaluated
+_REACH = 0.5  # largest half-width of an interval, in units of the reciprocal norm of the resolvent
 _UNIT = 2.0**-53
 
 
 def _real_part(A: _Array, B: _Array, C: _Array, D: _Array) -> tuple[float, float, float, float]:
-    """Bound Re Z from below at all frequencies, between those of any grid, too.
+    """Bound Re Z from below at all frequencies, not only at those of a grid.
 
-    With w = a tan(t/2) Z is a block G on the unit circle, z = e^jt. On an interval of half-width h around t0 its real
-    part is at least that of its tangent less h^2/2 max |G''|, and |G''| follows from R = (zI - A)^-1 at t0: it is large
-    around a narrow resonance, where intervals are halved. A bound of rounding is subtracted.
+    The substitution w = a tan(t/2) turns Z into a function G(z) on the unit circle, z = e^jt. On an interval of
+    half-width h around t0 Re G is at least its tangent less h^2/2 max |G''|. |G''| is bounded by means of
+    R = (zI - A)^-1 at t0. It is large near a narrow resonance, where intervals are halved. A bound on the rounding
+    errors is subtracted.
 
     Returns:
-        The lower bound, the least value met [N s/m], its frequency [rad/s] and the mean of |Z| [N s/m].
+        The lower bound, the least computed value [N s/m], its frequency [rad/s] and the mean of |Z| [N s/m].
     """
     import scipy
 
@@ -110,7 +114,7 @@ def _real_part(A: _Array, B: _Array, C: _Array, D: _Array) -> tuple[float, float
         states.append(np.linalg.cholesky(scipy.linalg.solve_continuous_lyapunov(A, -noise)))
     speed = np.exp(np.log(np.abs(np.linalg.eigvals(A))).mean())
     into = np.linalg.inv(speed * one - A)
-    lost = 16 * (n + 1) * _UNIT * (1 + np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # of A, by rounding
+    lost = 16 * (n + 1) * _UNIT * (1 + np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # rounding error of A
     A, B = (speed * one + A) @ into, into @ B
     C, D = C @ (one + A), D + C @ B
     half = np.full(_FIRST, np.pi / _FIRST / 2)
@@ -146,12 +150,12 @@ def _real_part(A: _Array, B: _Array, C: _Array, D: _Array) -> tuple[float, float
 
 @dataclass(frozen=True, eq=False)
 class Port:
-    """A passive human at its handles: masses, the spring-dampers between them, and optionally an impedance.
+    """The passive mechanics of a human at the handles: masses, spring-dampers, and optionally an impedance.
 
-    The points are the handles (one, or several of a person), then the human's own masses, then the base, which is
-    ground or the body of the person to whom this arm belongs. Row i of `across` holds the derivatives of the length of
-    spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers for a lever.
-    In space every point and the base have `axes` coordinates, which are neighbouring columns of `across`.
+    The points are the handles (several if a person holds several devices), followed by the human's own masses. The
+    base is ground, or the body of the person to whom this arm belongs. Row i of `across` holds the derivatives of the
+    length of spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers for a
+    lever. With several axes every point and the base have `axes` neighbouring columns of `across`.
     The port is passive because no parameter is negative and the impedance is passive. Arrays with a leading axis hold
     many humans of the same structure.
 
@@ -165,7 +169,7 @@ class Port:
     stiffness: _Array  # (..., springs) [N/m]
     impedance: Impedance | None = None  # between the (only) handle and the base, on every axis
     handles: int = 1
-    pull: int = -1  # the spring-damper that the voluntary force contracts; in space the group of `axes` of them
+    pull: int = -1  # spring-damper that the voluntary force contracts, or a group of `axes` spring-dampers
     axes: int = 1
 
     def __post_init__(self) -> None:
@@ -209,10 +213,10 @@ class Port:
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
-        """Return this port on a device with so many axes: itself if it has them, or one of one axis, alike on all.
+        """Return this port on a device with `axes` axes. A port of one axis is repeated on each of them.
 
         Raises:
-            ValueError: It has another number of axes.
+            ValueError: The port has several axes, but another number of them.
         """
         if self.axes == axes:
             return self
@@ -255,8 +259,8 @@ class Port:
         if any(port.layout != first.layout for port in ports):
             raise ValueError("ports: expected humans with the same points and the same spring-dampers between them")
         mass, damping, stiffness = (np.stack([getattr(p, n) for p in ports]) for n in ("mass", "damping", "stiffness"))
-        some = [port.impedance for port in ports if port.impedance]
-        impedance = Impedance(*(np.stack([getattr(z, name) for z in some]) for name in "ABCD")) if some else None
+        own = [port.impedance for port in ports if port.impedance]
+        impedance = Impedance(*(np.stack([getattr(z, name) for z in own]) for name in "ABCD")) if own else None
         return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull, first.axes)
 
     def of(self, i: int) -> Self:
@@ -273,9 +277,9 @@ class Port:
 
 
 def directions(axes: int) -> _Array:
-    """Return the directions (axes^2, axes) of springs whose sums are all diagonally dominant matrices.
+    """Return directions (axes^2, axes) of springs: e_i + e_j and e_i - e_j for every two axes, then the axes.
 
-    These are e_i + e_j and e_i - e_j for every two axes, then the axes themselves.
+    The stiffness matrices of such springs together are exactly the diagonally dominant ones.
     """
     unit = np.eye(axes)
     skew = [unit[i] + sign * unit[j] for i in range(axes) for j in range(i + 1, axes) for sign in (1, -1)]
@@ -283,7 +287,10 @@ def directions(axes: int) -> _Array:
 
 
 def _amounts_along(field: str, value: Any, axes: int) -> _Array:
-    """Return a number, a list or a matrix as amounts along `directions`, (axes^2,). Raises ValueError for others."""
+    """Return the amounts (axes^2,) along `directions` that add up to a number, a list or a matrix.
+
+    Raises ValueError if the matrix is not diagonally dominant.
+    """
     matrix = symmetric(field, value, axes)
     pairs = [matrix[i, j] for i in range(axes) for j in range(i + 1, axes)]
     skew = [max(0.0, sign * each) for each in pairs for sign in (1, -1)]
@@ -297,7 +304,7 @@ def _amounts_along(field: str, value: Any, axes: int) -> _Array:
 def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
     """Return the port of a hand of `mass` [kg] and impedance C (s I - A)^-1 B + D, from velocity [m/s] to force [N].
 
-    A may have one eigenvalue at zero: the hand's static stiffness k. Its part k/s of the impedance becomes a spring.
+    A may have one eigenvalue at zero. It adds k/s to the impedance, and becomes a spring of the stiffness k.
 
     Raises:
         ValueError: The hand is not passive, or A has a double eigenvalue at zero.
@@ -346,9 +353,10 @@ def _freeze(record: object, name: str, values: Any) -> None:
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A mass and the spring-damper behind it, which ends at the next mass or at the moving equilibrium.
+    """A mass and the spring-damper from it to the next mass, or to the moving equilibrium.
 
-    In space damping and stiffness are numbers, the same in every direction, one number per axis, or symmetric matrices.
+    On a device with several axes damping and stiffness are one number for all directions, one number per axis, or
+    symmetric matrices.
     """
 
     mass: float  # [kg]
@@ -371,7 +379,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
     @property
     def axes(self) -> int:
-        """How many axes a device must have; 1 where the link is alike in every direction."""
+        """The number of axes that the device must have; 1 if the link is the same in every direction."""
         return max(len(value) if isinstance(value, tuple) else 1 for value in (self.damping, self.stiffness))
 
 
@@ -382,7 +390,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
     frequency: float  # [Hz]
     phase: float = 0.0  # [rad]
     ease: float = 1.0  # [s]
-    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction; the first axis unless given
+    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction; by default the first axis
 
     def __post_init__(self) -> None:
         if self.along and not 1e-9 < float(np.linalg.norm(self.along)) < np.inf:
@@ -404,7 +412,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         return force
 
 
-_MOST_LINKS = 500  # of one hand: the eigenvalues of a loop around so many take five seconds, of 1000 half a minute
+_MOST_LINKS = 500  # of one hand: the eigenvalues of its loop take five seconds, those for 1000 links half a minute
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
@@ -431,7 +439,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
 
     @property
     def axes(self) -> int | None:
-        """How many free axes a device must have; None where nothing of the hand has a direction."""
+        """The number of free axes that the device must have; None if no part of the hand has a direction."""
         along = self.voluntary.along if self.voluntary else None
         most = max(link.axes for link in self.links)
         return len(along) if along else most if most > 1 else None
@@ -467,9 +475,9 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
 
 
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
+    """A hand as a transfer function from velocity to force, `mass` s + C (s I - A)^-1 B + D.
 
-    It has no bodies. The MuJoCo engines integrate its state beside those of the scene (sim.engines).
+    The hand has no bodies. The MuJoCo engines integrate its state beside those of the scene (sim.engines).
     """
 
     A: tuple[tuple[float, ...], ...]

@@ -34,9 +34,9 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
 #
-# Only this file knows the names of joints. Every body slides along x, or along the axes of its device that are not
-# clamped; then its joints are called motor.x, motor.y and so on. The order of the joints is motors, handles of
-# compliant devices, further masses of the humans, bodies of persons. So the first m positions are the encoders':
+# Only this file uses the names of joints. A body slides along x, or along the free axes of its device; then its joints
+# are called motor.x, motor.y and so on. The order of the joints is motors, handles of compliant devices, further masses
+# of the humans, bodies of persons. The encoders measure the first m positions:
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
@@ -56,9 +56,9 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 
 _Array = NDArray[np.floating[Any]]
 
-#: MuJoCo's friction constraint creeps while it sticks. With these parameters a device of 0.25 kg stops within 1.5e-6 m
-#: of the point given by Coulomb's law and creeps at 1e-7 m/s under half the friction force. MuJoCo's defaults give
-#: 7e-5 m and 6e-4 m/s.
+#: A device creeps while MuJoCo's friction holds it. With these parameters a device of 0.25 kg stops within 1.5e-6 m of
+#: the point that follows from Coulomb's law, and creeps at 1e-7 m/s under half the friction force. With MuJoCo's
+#: defaults it stops within 7e-5 m and creeps at 6e-4 m/s.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
@@ -111,7 +111,7 @@ class Plant:
 
 @contextmanager
 def quiet_warnings() -> Iterator[None]:
-    """Keep MuJoCo from printing its warnings and from writing them to a file: reports count or name them."""
+    """Suppress MuJoCo's warnings on the screen and in a file, because reports state them."""
     import mujoco
 
     previous = mujoco.get_mju_user_warning()
@@ -153,7 +153,7 @@ def plant(model: mujoco.MjModel) -> Plant:
 
 
 class _Felt(NamedTuple):
-    """An impedance and its place: its input is `row` times the joint velocities, its force acts along `row`."""
+    """An impedance between joints: its input is `row` times the joint velocities, and its force acts along `row`."""
 
     row: _Array  # (n,)
     Z: Impedance
@@ -203,7 +203,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     """Return the port of a hand written in MJCF: bodies that slide along x, with springs and dampers between them.
 
     The body `handle` is the part of the hand that moves with the handle, and the world is the base. The voluntary force
-    contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are ignored.
+    contracts the joint or tendon named `pull`, by default the last spring-damper. Gravity and shapes are ignored.
 
     Raises:
         ValueError: The model is not a network of masses, springs and dampers along x.
@@ -288,7 +288,7 @@ def _actuation(model: mujoco.MjModel) -> _Array:
     return columns
 
 
-def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
+def _disable_unused_physics(spec: mujoco.MjSpec, friction: bool) -> None:
     import mujoco
 
     off = mujoco.mjtDisableBit
@@ -300,7 +300,7 @@ def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
 
 
 def _joints(body: str, device: Device) -> tuple[str, ...]:
-    """Return the joints of a body on the axes of a device; a joint of a device with one axis is called as its body."""
+    """Return the names of a body's joints, one per free axis; with one axis the joint has the name of the body."""
     return tuple(body + axis for axis in device.axis_names)
 
 
@@ -317,7 +317,7 @@ class _Placed(NamedTuple):
 
     port: Port
     joints: tuple[str, ...]  # joint of each coordinate of the points
-    base: tuple[str, ...]  # joints of the body that it ends on; none for ground
+    base: tuple[str, ...]  # joints of the body on which the port ends; none for ground
     springs: tuple[str, ...]  # the tendon or joint that carries each spring-damper
 
     @property
@@ -374,19 +374,19 @@ def _place(port: Port, joints: tuple[str, ...], base: tuple[str, ...], name: str
 
 
 class _Amounts(NamedTuple):
-    """Mass, damping and stiffness by the name of a joint or a tendon; arrays where there are many humans."""
+    """Mass, damping and stiffness by the name of a joint or a tendon; arrays over the sets of many humans."""
 
     mass: dict[str, Any]  # joints in their order
     damping: dict[str, Any]
     stiffness: dict[str, Any]
 
 
-#: the mechanics of every device in every set of humans; () where the devices are those of the scenario
+#: the mechanics of every device in every set of humans; () if the devices have those of the scenario
 _Drawn = tuple[tuple[Mechanics, ...], ...]
 
 
 def _mechanics(device: Device, drawn: Sequence[Mechanics]) -> tuple[dict[str, Any], tuple[Any, Any] | None]:
-    """Return bodies and transmission of a device, as arrays over the sets where they are drawn."""
+    """Return bodies and transmission of a device, as arrays over the sets if the mechanics are drawn."""
     if not drawn:
         return dict(device.bodies), device.transmission
     rows = [(d.motor_mass, d.handle_mass, d.transmission_damping, d.transmission_stiffness) for d in drawn]
@@ -436,14 +436,14 @@ def _per_channel(device: Device, name: str) -> list[float]:
 
 
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], drawn: bool = True) -> Scene:
-    """Compile the scene; without `drawn` it has no MJCF, which takes half of the time."""
+    """Compile the scene; without `drawn` its MJCF is empty, which saves half of the time."""
     import mujoco
 
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
     spec.add_texture(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, **_SKY)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
-    _only_what_the_loop_needs(spec, friction=any(np.any(device.friction) for device in devices))
+    _disable_unused_physics(spec, friction=any(np.any(device.friction) for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
     own = [joint for part in placed for joint in part.joints[part.handles :]]
     order = [name for name in mass if name not in own] + own
@@ -518,7 +518,7 @@ def written(spec: mujoco.MjSpec) -> str:
 
 
 def _axis(joint: str) -> list[float]:
-    """Return the direction in which a joint slides: x, unless its name says otherwise."""
+    """Return the direction in which a joint slides: the axis after the dot in its name, or x."""
     _, _, axis = joint.partition(".")
     return [float(name == (axis or "x")) for name in AXES]
 
@@ -537,7 +537,7 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
 
 
 def _free_axes(spec: mujoco.MjSpec, i: int, device: Device) -> None:
-    """Replace the slides of device i along x, and its transmission, by one for each free axis."""
+    """Replace the slides and the transmission of device i along x by one for each free axis."""
     import mujoco
 
     for name in device.bodies:
@@ -615,17 +615,17 @@ def _motors(model: mujoco.MjModel) -> int:
 class Crowd:
     """Sets of humans, one per device, all with the same number of links and without voluntary motion.
 
-    `holds` lists the devices of each person with several. Their bodies and cross springs are in `bodies`. A link with
-    three numbers is alike in every direction. On devices with several axes it may have an amount of damping and one of
-    stiffness along each of `models.human.directions`.
+    `holds` lists the devices of each person with several devices, and `bodies` the bodies and cross springs of these
+    persons. A link with three numbers is the same in every direction. On devices with several axes it may have an
+    amount of damping and one of stiffness along each of `models.human.directions`.
     """
 
     links: _Array  # (nsim, devices, links, 3 or more): mass [kg], dampings [N s/m], stiffnesses [N/m]
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) of links with amounts along directions; a link has 1 + 2 axes^2 numbers
-    mechanics: _Drawn = ()  # (nsim, devices) where the devices are drawn within their guaranteed bounds
+    axes: tuple[int, ...] = ()  # (devices,) if links have amounts along directions, with 1 + 2 axes^2 numbers each
+    mechanics: _Drawn = ()  # (nsim, devices) if the devices are drawn within their guaranteed bounds
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
@@ -670,7 +670,7 @@ class Crowd:
 
 
 def _link(row: _Array, axes: int) -> Link:
-    """Return a link from its row in Crowd, on a device with so many axes."""
+    """Return a link from its row in Crowd, on a device with `axes` axes."""
     if axes == 1:
         return Link(*row[:3].tolist())
     along, count = directions(axes), axes**2
@@ -685,9 +685,10 @@ MIXED = 0  # a number of links: half of the humans have one link and half have t
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
     """Draw the links (devices, links, 3) of the humans with this index, one per device, as in Crowd.
 
-    They depend on (seed, index) and the population only. With `links` = MIXED the number of links is 1 or 2. With
-    `axes` the damping and the stiffness of a link are sums over `directions`, each within the population's range when
-    all have the same number, so that no direction has more than the range's upper end or less than its lower one.
+    The links depend on (seed, index) and the population only. With `links` = MIXED there are 1 or 2 of them. With
+    `axes` the damping and the stiffness of a link are sums of random amounts along `directions`, with weights whose sum
+    has the same effect in every direction. So the damping and the stiffness in any direction lie within the
+    population's ranges.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     count = int(rng.integers(1, 3)) if links == MIXED else links
@@ -728,9 +729,9 @@ def crowds(
 
 
 def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int]) -> _Drawn:
-    """Draw devices within their guaranteed bounds for the humans of these indices; () unless all devices have some.
+    """Draw devices within their guaranteed bounds for the humans of these indices; () unless all devices have bounds.
 
-    They come from a random stream of their own, so that the humans do not depend on them.
+    The devices have a random stream of their own, so that the humans do not depend on them.
     """
     if not (devices and all(device.guaranteed for device in devices)):
         return ()
@@ -741,7 +742,7 @@ def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int])
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
     """Draw the bodies (persons, 5) of the persons with this index who hold several devices, as in Crowd.
 
-    They come from the same ranges and from a random stream of their own, so that the links do not depend on them.
+    The bodies have the ranges of the links but a random stream of their own, so that the links do not depend on them.
     """
     if not persons:
         return np.zeros((0, 5))
@@ -802,12 +803,12 @@ class Variants:
         return self.taken(np.repeat(np.arange(len(self)), times))
 
     def taken(self, sets: NDArray[np.intp]) -> Variants:
-        """Return these sets of humans, by their numbers and in this order."""
+        """Return the variants of the sets with these numbers, in this order."""
         felt = tuple(_Felt(row, z.changed(lambda part: part[sets])) for row, z in self.impedances)
         return Variants(self.scene, {name: rows[sets] for name, rows in self.fields.items()}, felt)
 
     def plants(self) -> Plant:
-        """Return all plants, A (nsim, 2n, 2n) and B (nsim, 2n, inputs), equal to the plant of each model."""
+        """Return the plants of all models, with A (nsim, 2n, 2n) and B (nsim, 2n, inputs)."""
         model = self.scene.model
         across, mass = _tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
 

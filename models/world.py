@@ -1,15 +1,14 @@
 """MuJoCo scenes as environments: devices touch bodies of a scene, and scene and coupling are solved in one step.
 
-A device touches a contact: a body of the scene that is a child of the world body and has no joint. Any coupling with
-the direct part D_V answers within the tick, u = u0 - D_V f, where u0 is where the contact would be without force. So
-all that the scene feels of device, delays and coupling is one spring G = D_V^-1 from the contact to the point u0. The
-program gives the contact slides along its directions and this spring, and steps with MuJoCo's `discrete` integrator,
-which solves
+A device touches a contact: a body of the scene that is a child of the world body and has no joint. A coupling with
+the direct part D_V responds within the tick, u = u0 - D_V f, where u0 is the contact's position without force. For the
+scene, device, delays and coupling are therefore one spring G = D_V^-1 from the contact to the point u0. The program
+adds this spring, and slides along the contact's directions. It steps with MuJoCo's `discrete` integrator, which solves
 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
 
-This file knows no coupling and no device: it takes G and u0 as numbers. What a scene may give is counted elsewhere
-(controller.budget.Shell); docs/theory.md, "MuJoCo worlds", proves why an ordinary scene gives nothing.
+This file takes G and u0 as numbers, without a coupling or a device. controller.budget.Shell measures and limits the
+energy that a scene generates; docs/theory.md, "MuJoCo worlds", proves that ordinary scenes generate none.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ from haptic_loop.models.scene import quiet_warnings
 
 Array = NDArray[np.floating[Any]]
 
-PROXY_MASS = 0.03  # [kg] of a contact for which the scene gives no mass
+_CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
 ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
 MOST_REPETITIONS = 8  # of a step whose forces are limited
-_LIMIT_SLACK = 1e-9  # of a limit, relatively: a force that is this near counts as limited by it
-_DIRECTION_SLACK = 1e-6  # of a limit: a repetition that turns a limited force by less is the last one
+_LIMIT_SLACK = 1e-9  # a force that is nearer to its limit counts as limited; relative to the limit
+_DIRECTION_SLACK = 1e-6  # repetitions end where they change limited forces by less; relative to the limit
 _TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
 
 
@@ -57,7 +56,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Part:
-    """One kind of part of a scene, and what is known of the energy that it gives at the contacts."""
+    """One kind of part of a scene, and which bound holds for the energy that it generates at the contacts."""
 
     what: str
     count: int
@@ -71,7 +70,7 @@ class Part:
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
-    A mesh that several folders hold is listed from each. Raises ValueError where a file cannot be read or is no XML.
+    A mesh that exists in several folders is listed with each. Raises ValueError if a file cannot be read or is no XML.
     """
     files: dict[Path, None] = {}
     folders: list[Path] = []
@@ -98,14 +97,15 @@ def files_of(path: Path) -> list[Path]:
 
     visit(path, path.parent)
     for name in assets:
-        places = [folder / part for folder in folders for part in (name, Path(name).name)]  # the latter by strippath
+        # with the compiler's option strippath only the last part of a name counts
+        places = [folder / part for folder in folders for part in (name, Path(name).name)]
         files.update(dict.fromkeys(place for place in places if place.is_file()))
     return list(files)
 
 
 def _xml(file: Path, world: Path) -> ElementTree.Element:
     try:
-        if file.exists() and not (file.is_file() and file.stat().st_size):  # a pipe or a file of the kernel's may wait
+        if file.exists() and not (file.is_file() and file.stat().st_size):  # reading a pipe or device could block
             raise ValueError(f"world {file}: is empty or not a regular file, expected an MJCF file")
         if file.stat().st_size > _TOO_LARGE:
             raise ValueError(f"world {world}: {file.name} is larger than {_TOO_LARGE // 1_000_000} MB")
@@ -117,7 +117,10 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 digest of the contents of all files of a scene, whatever their folder. Raises ValueError."""
+    """Return the SHA-256 digest of the names and contents of all files of a scene, without their folders.
+
+    Raises the errors of `files_of`.
+    """
     total = hashlib.sha256()
     for file in files_of(path):
         content = file.read_bytes()
@@ -126,12 +129,12 @@ def digest_of(path: Path) -> str:
 
 
 def check_contacts(path: Path, bodies: Sequence[str]) -> None:
-    """Raise a one-line ValueError for a file that MuJoCo refuses, or a body that cannot be a contact."""
+    """Raise ValueError for a file that MuJoCo refuses, or for a body that cannot be a contact."""
     World(path, [Contact(body) for body in bodies], [np.eye(1)] * len(bodies), 1e-3)
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of bodies that may be contacts, in the order of the file. Raises ValueError."""
+    """Return the names of bodies that may be contacts, in the order of the file. Raises the errors of `files_of`."""
     return _without_joints(_spec(path))
 
 
@@ -157,15 +160,15 @@ class World:
         """Compile the scene.
 
         Args:
-            path: MJCF file.
-            contacts: one per device.
+            path: The MJCF file.
+            contacts: One contact per device.
             stiffness: G of each device, (axes, axes), symmetric and positive definite [N/m].
-            T: period of the loop [s].
-            every: the scene steps at every so many ticks, by as many periods.
+            T: The period of the loop [s].
+            every: The number of ticks for each step of the scene, whose length is as many periods.
             gravity: False switches the scene's gravity off.
 
         Raises:
-            ValueError: in one line, for a file that MuJoCo refuses, or a contact that cannot be one.
+            ValueError: MuJoCo refuses the file, or a body cannot be a contact.
         """
         self.path, self.contacts, self.T, self.every = Path(path), tuple(contacts), T, every
         if every < 1:
@@ -174,12 +177,12 @@ class World:
             self._compile(stiffness, gravity)
 
     def _compile(self, stiffness: Sequence[Array], gravity: bool) -> None:
-        """Build the model, and where the slides are in it."""
+        """Build the model, and store the indices of its slides."""
         spec = _spec(self.path)
         base = _compiled(spec, self.path)
         self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
         rotations, springs, names = [], [], [contact.body for contact in self.contacts]
-        bodies = [_touchable(spec, name, names) for name in names]  # all of them before one gets a joint
+        bodies = [_touchable(spec, name, names) for name in names]  # checked before the first one gets a joint
         for contact, body, G in zip(self.contacts, bodies, stiffness, strict=True):
             values, Q = _principal(np.atleast_2d(np.asarray(G, dtype=float)), contact)
             _slide(spec, body, contact, Q, values, base.body(contact.body).quat)
@@ -198,7 +201,7 @@ class World:
         self._joint = np.array([joint.id for joint in joints])
         weightless = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         carried = 0.0 if weightless else self.model.body_gravcomp * ~_lifted_by_actuators(self.model)
-        self._afloat = self.model.body_mass * carried  # (nbody,) [kg] whose weight a passive force carries
+        self._afloat = self.model.body_mass * carried  # (nbody,) [kg] mass without weight, by gravity compensation
 
     @property
     def channels(self) -> int:
@@ -206,30 +209,32 @@ class World:
 
     @property
     def h(self) -> float:
-        """[s] of one step of the scene."""
+        """The length of one step of the scene [s]."""
         return self.model.opt.timestep
 
     def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> Port:
-        """Simulate the scene from its initial pose; its contacts feel at most the given forces (m,) [N].
+        """Return a simulation of the scene from its initial pose, with force limits (m,) [N] at the contacts.
 
-        The limit of a contact whose channels are one of the `balls` bounds the length of its force, elsewhere it bounds
-        each component.
+        A limit bounds each component of a contact's force. If the contact's channels are one of the `balls`, it bounds
+        the length of the force.
         """
         limits = np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float)
         return Port(self, limits, balls)
 
     def linear(self, pose: Array | str | None = None, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
-        """Linearise the scene near a pose, without the springs G: A, B, C, D from forces on the contacts [N] to u [m].
+        """Linearise the scene near a pose, without the springs G, by centred differences of one step.
 
-        Centred differences of one step of the scene. A is over (q, h v). What it
-        neglects: everything that is not linear, above all contacts that open or close and joints that turn far.
+        The model neglects every nonlinearity, above all contacts that open or close, and large turns of joints.
 
         Args:
-            pose: positions (nq,) of this model, the name of a keyframe of the MJCF file, or None for the initial pose.
-            step: by how much each position is moved [m, rad]; speeds and forces move it as much within one step.
+            pose: Positions (nq,) of this model, the name of a keyframe of the MJCF file, or None for the initial pose.
+            step: The displacement of each position [m, rad]; speeds and forces cause the same displacement in one step.
+
+        Returns:
+            A, B, C, D from forces on the contacts [N] to u [m], with the state (q, h v).
 
         Raises:
-            ValueError: for an unknown keyframe, or a pose of another length.
+            ValueError: The keyframe is unknown, or the pose has another length.
         """
         model, data = self.model, mujoco.MjData(self.model)
         q0, nv = self._pose(pose), model.nv
@@ -253,7 +258,7 @@ class World:
             columns = [(after(row) - after(-row)) / (2 * move) for row, move in zip(np.diag(moves), moves, strict=True)]
         finally:
             model.jnt_stiffness[self._joint] = stiffness
-        scale = np.repeat([1.0, self.h], nv)  # of the states, so that all are lengths: inverses lose fewer digits
+        scale = np.repeat([1.0, self.h], nv)  # makes every state a length, so that inverses lose fewer digits
         A, B = np.hsplit(scale[:, None] * np.array(columns).T, [2 * nv])
         A = A / scale
         rows = self._Q @ np.eye(2 * nv)[self._dof]
@@ -272,16 +277,14 @@ class World:
             raise ValueError(f"pose has the shape {qpos.shape}, expected ({self.model.nq},) positions")
         return qpos
 
-    # -------------------------------------------------------------------------------------------- what is in it
-
     def settings(self) -> str:
-        """Return in one line the settings that the program forces on the scene."""
+        """Return one line with the settings that the program imposes on the scene."""
         slow = f" = {self.every} ticks" if self.every > 1 else ""
         solver = f"Newton, {ITERATIONS} iterations, tolerance {TOLERANCE:g}, no noslip"
         return f"integrator discrete, timestep {self.h:g} s{slow}, elliptic cones, {solver}"
 
     def outside_the_lemma(self) -> list[str]:
-        """Return one text for each actuator, plugin and callback of the scene: only the energy account covers them."""
+        """Return a name for each actuator, plugin and callback of the scene, which only the energy budget covers."""
         m = self.model
         listed = [f"actuator {m.actuator(i).name or i}" for i in range(m.nu)]
         listed += [f"plugin {m.plugin(i).name or i}" for i in range(m.nplugin)]
@@ -293,7 +296,7 @@ class World:
         return listed
 
     def parts(self) -> list[Part]:
-        """Return the kinds of parts in the scene, and what is known of each at the contacts (docs/worlds.md)."""
+        """Return the kinds of parts in the scene, with the bound on the energy of each (docs/worlds.md)."""
         return list(_parts(self.model, set(self._joint.tolist())))
 
 
@@ -307,10 +310,10 @@ def _lifted_by_actuators(m: mujoco.MjModel) -> NDArray[np.bool_]:
 
 
 def _spec(path: Path) -> Any:
-    files_of(path)  # raises ValueError with the name of a file that is missing
+    files_of(path)  # raises ValueError with the name of a missing file
     with _refused(path):
         spec = mujoco.MjSpec.from_file(str(path))
-    spec.compiler.fusestatic = False  # which would take the contacts away
+    spec.compiler.fusestatic = False  # fusing would remove the contacts
     return spec
 
 
@@ -323,7 +326,7 @@ def _compiled(spec: Any, path: Path) -> mujoco.MjModel:
 
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
-    """Raise ValueError in one line for what MuJoCo refuses."""
+    """Turn MuJoCo's errors into a ValueError of one line."""
     try:
         yield
     except (ValueError, mujoco.FatalError) as error:
@@ -338,7 +341,7 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
     """Return the body of a contact. Raises ValueError for a body that cannot be one."""
     body = spec.body(name) if name else None
     free = _without_joints(spec)
-    if body is None or body.parent is None:  # the latter is the world body
+    if body is None or body.parent is None:  # only the world body has no parent
         named = ", ".join(free) or "none"
         raise ValueError(f"contact {name!r}: the world has no such body; bodies without a joint: {named}")
     if body.parent.name != "world":
@@ -380,7 +383,7 @@ def _name(contact: Contact, axis: int) -> str:
 
 
 def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
-    """Give a body its slides, springs, mass and no weight; no default of the scene reaches them."""
+    """Add a contact's slides and springs, set its mass, and compensate its weight, whatever the scene's defaults."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))
     directions = Q.T @ np.array(contact.along) @ rotation.reshape(3, 3)  # in the frame of the body
@@ -395,10 +398,10 @@ def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, t
         joint.limited = joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         joint.actgravcomp = 0
     if not body.explicitinertial and all(np.isnan(geom.mass) for geom in body.geoms):
-        body.explicitinertial, body.mass, body.inertia = True, PROXY_MASS, [1e-5] * 3
+        body.explicitinertial, body.mass, body.inertia = True, _CONTACT_MASS, [1e-5] * 3
         body.ipos = [0.0, 0.0, 0.0]
-        for geom in body.geoms:  # compiler inertiafromgeom="true" takes masses from here
-            geom.mass = PROXY_MASS / len(body.geoms)
+        for geom in body.geoms:  # the compiler reads these masses if inertiafromgeom is "true"
+            geom.mass = _CONTACT_MASS / len(body.geoms)
     for part in _fixed_to(body):
         part.gravcomp = 1.0
 
@@ -447,18 +450,21 @@ def _blockdiag(blocks: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A simulation of it
+# The simulation of a scene
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # rows of equalities and friction are not above it
+_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # the last of the types of equalities and friction
 
 
 class Port:
-    """One simulation of a world, a tick at a time, and what it has given so far."""
+    """One simulation of a world, tick by tick, with the energy that the scene has generated."""
 
     def __init__(self, world: World, force_limit: Array, balls: Sequence[slice] = ()) -> None:
-        """`force_limit` (m,) [N], inf where there is none, and how it limits each contact. Raises ValueError."""
+        """Start a simulation with `force_limit` (m,) [N], inf for none, and `balls` as in World.port.
+
+        Raises ValueError for a limit that is not positive, or a ball whose channels have different limits.
+        """
         if force_limit.shape != (world.channels,) or not (force_limit > 0).all():
             raise ValueError(f"force_limit is {force_limit.tolist()}, expected {world.channels} positive forces in N")
         self.world, self.data = world, mujoco.MjData(world.model)
@@ -474,20 +480,20 @@ class Port:
         any_limit = bool((force_limit < np.inf).any())
         self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if any_limit else None
         self.ticks = 0
-        self.created = 0.0  # [J] what contacts have created, D2 of the lemma
+        self.created = 0.0  # [J] energy that contacts have created, D2 of the lemma
         self.unsettled = 0  # ticks in which the limited channels still changed after MOST_REPETITIONS
         self._at_first = self._potential()
-        self.released = 0.0  # [J] the most that gravity and the scene's springs have given up so far
+        self.released = 0.0  # [J] largest energy that gravity and the scene's springs have released so far
 
     def step(self, u0: Array) -> Array:
-        """Step the scene; return the forces (m,) [N] of contacts whose places without force are u0 (m,) [m].
+        """Step the scene; return the forces (m,) [N] of contacts whose positions without force are u0 (m,) [m].
 
-        Forces are within the limits. They are not finite where MuJoCo's numbers are not. Raises ValueError in one line
-        where MuJoCo cannot step.
+        Forces are within the limits, but not finite if MuJoCo's state is not finite. Raises ValueError if MuJoCo
+        cannot step.
         """
         world = self.world
         goal = world._Q.T @ u0
-        # between its steps the scene stands still and does no work
+        # between its steps the scene is at rest and does no work
         force = self._within(self._spring(goal)) if self.ticks % world.every else self._stepped(goal)
         self.ticks += 1
         return force
@@ -498,7 +504,7 @@ class Port:
         return world._Q @ (world._g * (goal - self.data.qpos[world._qpos]))
 
     def _used(self, force: Array) -> Array:
-        """Return the share of its limit (contacts,) that each contact's force takes."""
+        """Return the force of each contact (contacts,) relative to its limit."""
         share = np.abs(force) / self._limits
         most = np.maximum.reduceat(share, self._first)
         return (
@@ -508,7 +514,7 @@ class Port:
         )
 
     def _within(self, force: Array) -> Array:
-        """Return the force that the motors give in place of `force` (m,) [N]."""
+        """Return `force` (m,) [N] after the motors' limits."""
         if self._radial.any():
             force = force / np.repeat(np.where(self._radial, np.maximum(self._used(force), 1.0), 1.0), self._axes)
         return np.clip(force, -self._limits, self._limits)
@@ -520,7 +526,7 @@ class Port:
 
     @property
     def warnings(self) -> list[str]:
-        """MuJoCo's warnings of this simulation in its own words: numbers that are not finite, contacts left out."""
+        """MuJoCo's warnings of this simulation, such as numbers that are not finite, or omitted contacts."""
         kinds = enumerate(self.data.warning)
         return [mujoco.mju_warningText(kind, each.lastinfo) for kind, each in kinds if each.number]
 
@@ -541,7 +547,10 @@ class Port:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Step until the contacts whose force is limited agree with it; on these the force acts, not the spring."""
+        """Repeat the step until the same contacts are limited before and after it.
+
+        On a limited contact the limited force acts instead of the spring.
+        """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)
         pushed, push = np.zeros(len(self._axes), dtype=bool), np.zeros(world.channels)
@@ -566,7 +575,10 @@ class Port:
         return self._within(np.where(held, push, free))
 
     def _potential(self) -> float:
-        """Return U [J] of gravity and the scene's own springs at the present positions, without the springs G."""
+        """Return the energy [J] of gravity and the scene's own springs at the present positions, without the springs G.
+
+        Weights that gravity compensation carries are left out.
+        """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -575,19 +587,19 @@ class Port:
         if model.ntendon:
             mujoco.mj_tendon(model, data)
         at = data.qpos[world._qpos]
-        model.qpos_spring[world._qpos] = at  # so that the springs G hold no energy
+        model.qpos_spring[world._qpos] = at  # so that the springs G store no energy
         mujoco.mj_energyPos(model, data)
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return the energy [J] that contacts of the last step gave beyond what they stored: the lemma's left side."""
+        """Return the energy [J] that contacts created in the last step, the left side of the lemma."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The constraint rows of the step that was just made, and to which contact or other constraint each belongs."""
+    """The constraint rows of the last step, and the contact or other constraint to which each belongs."""
 
     force: Array  # (rows,) [N]
     before: Array  # (rows,) w, the speed before the step [m/s]
@@ -597,11 +609,11 @@ class Rows:
     K: Array  # (rows,) reference stiffness [1/s^2]
     b: Array  # (rows,) reference damping [1/s]
     first: NDArray[np.intp]  # the first row of each contact or other constraint
-    one_sided: NDArray[np.bool_]  # (rows,) whether phi is that of a contact or limit; equalities store on both sides
+    one_sided: NDArray[np.bool_]  # (rows,) False for equalities and friction, whose phi stores energy on both sides
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Rows:
-        """Read them from a step of the discrete integrator, whose efc_D is D (1 + b h + K h^2)."""
+        """Read the rows from a step of the discrete integrator, whose efc_D is D (1 + b h + K h^2)."""
         n, h = data.nefc, model.opt.timestep
         after = np.empty(n)
         mujoco.mj_mulJacVec(model, data, after, data.qvel)
@@ -620,7 +632,7 @@ class Rows:
         return self.D * self.K * inside**2 / 2
 
     def excess(self, h: float) -> Array:
-        """Return h f'w+ + phi(r + h w+) - phi(r) [J], the energy that each contact or other constraint creates."""
+        """Return the energy [J] that each contact or other constraint creates: h f'w+ + phi(r + h w+) - phi(r)."""
         rows = h * self.force * self.after + self._stored(self.depth + h * self.after) - self._stored(self.depth)
         return np.add.reduceat(rows, self.first)
 
@@ -630,7 +642,7 @@ class Rows:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a scene is made of
+# The parts of a scene and the bounds on their energy
 
 
 _NONE = "no energy (lemma)"
