@@ -1,1 +1,1 @@
-"""The discrete world: what runs every T seconds. It knows neither MuJoCo nor the human."""
+"""The discrete-time part of the loop, which runs every T seconds. It uses neither MuJoCo nor the human."""

@@ -1,4 +1,4 @@
-"""Numbers and matrices in either arithmetic, floats or Fractions, and the counted work that searches may take."""
+"""Numbers and matrices as floats or as Fractions, and budgets of counted work."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ class SingularLoop(ValueError):
 
 
 class TooLong(ValueError):
-    """Work was given up because its budget is spent."""
+    """A computation ended without a result because its budget of work is spent."""
 
 
 # ----------------------------------------------------------------------------------------------------
-# Counted work. Searches and exact arithmetic count what they do, from the sizes of their matrices and numbers, and end
-# when a budget is spent. No clock takes part: a busy or a slow machine gets the same result as an idle one.
+# Counted work. Searches and exact arithmetic count their operations from the sizes of their matrices and numbers, and
+# end when a budget is spent. They read no clock, so that a busy or slow machine gets the same result as an idle one.
 #
-# One unit is about one second of one core at 2.4 GHz, which the factors below were measured on, to a factor of two.
+# One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured there.
 
 
 _PARTS = 10**12
 
 
 class _Counter(threading.local):
-    """The work of this thread since it began, the total at which the budget is spent, and a user's own clock."""
+    """The work of this thread since it began, the total at which the budget is spent, and a user's time limit."""
 
-    done = 0  # of 1/_PARTS of a unit: whole numbers, so that what was counted before rounds nothing
+    done = 0  # in 1/_PARTS of a unit; an integer, so that earlier work causes no rounding
     most: float = math.inf
-    words = ""
+    message = ""
     over: Callable[[], bool] | None = None
 
 
@@ -48,10 +48,10 @@ _counter = _Counter()
 
 
 def spend(units: float) -> None:
-    """Count this much work. Raises TooLong if the budget of `within` is spent, or its clock is over."""
+    """Count work. Raises TooLong if the budget of `within` is spent, or its time limit is over."""
     _counter.done += round(_PARTS * units)
     if _counter.done > _counter.most or (_counter.over is not None and _counter.over()):
-        raise TooLong(_counter.words)
+        raise TooLong(_counter.message)
 
 
 def spent() -> int:
@@ -60,7 +60,7 @@ def spent() -> int:
 
 
 def spent_after(units: float) -> int:
-    """Return what `spent` will be after this much more work."""
+    """Return the value of `spent` after `units` more work."""
     return _counter.done + round(_PARTS * units)
 
 
@@ -76,32 +76,32 @@ def within(
     why: str = "too many digits over many states",
     clock: Callable[[], bool] | None = None,
 ) -> Iterator[None]:
-    """Allow this much counted work, or what is left of a budget around it; more raises TooLong.
+    """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
 
-    `clock` tells whether the time that a user has asked for is over, which raises TooLong, too.
+    More work raises TooLong, and so does work after `clock` returns True: the time limit of a user is over then.
     """
-    before = _counter.most, _counter.words, _counter.over
+    before = _counter.most, _counter.message, _counter.over
     if units < math.inf and spent_after(units) < _counter.most:
-        words = f"{what} was given up after the work of {units:g} s: these are {why}"
-        _counter.most, _counter.words = spent_after(units), words
+        message = f"{what} was given up after the work of {units:g} s: these are {why}"
+        _counter.most, _counter.message = spent_after(units), message
     _counter.over = clock or _counter.over
     try:
         yield
     finally:
-        _counter.most, _counter.words, _counter.over = before
+        _counter.most, _counter.message, _counter.over = before
 
 
-#: [units] a product and sum of integers of up to 64 bits, a fraction's product and difference; measured up to 5000 bits
-_PRODUCT, _DIFFERENCE = 5e-8, 2e-6
+_PRODUCT = 5e-8  # [units] a product and a sum of integers of up to 64 bits; measured up to 5000 bits
+_DIFFERENCE = 2e-6  # [units] a product and a difference of fractions
 
 
 def _spend_on_products(count: int, bits: int) -> None:
-    """Count products of integers that have this many bits together."""
+    """Count products of integers whose lengths add up to `bits`."""
     spend(_PRODUCT * count * (1 + bits / 64))
 
 
 def _spend_on_differences(count: int, factor: Fraction) -> None:
-    """Count differences of fractions; those that are taken have about the digits of `factor`."""
+    """Count differences of fractions with about as many digits as `factor`."""
     spend(_DIFFERENCE * count * (1 + factor.denominator.bit_length() / 80))
 
 
@@ -138,7 +138,7 @@ def eye(n: int, T: Number) -> Array:
 
 
 def inverse(M: Array) -> Array:
-    """Return M^-1 in its own arithmetic. Raises SingularLoop."""
+    """Return M^-1 in the arithmetic of M. Raises SingularLoop if M is singular or too ill-conditioned."""
     if M.dtype == object:
         return solve(M, fractions(np.eye(M.shape[-1])))
     if M.size and np.max(np.linalg.cond(M)) > 1e12:
@@ -148,7 +148,7 @@ def inverse(M: Array) -> Array:
 
 
 def positive_definite(M: Any) -> bool:
-    """Return whether a symmetric matrix of Fractions is positive definite: all pivots of its elimination are."""
+    """Return whether a symmetric matrix of Fractions is positive definite, from the pivots of its elimination."""
     left = M.copy()
     for i in range(len(left)):
         if left[i, i] <= 0:
@@ -158,10 +158,10 @@ def positive_definite(M: Any) -> bool:
 
 
 def times(left: Array, right: Array) -> Array:
-    """Return left @ right; Fractions are multiplied only where they are not zero, since most are.
+    """Return left @ right. Fractions are multiplied only where they are not zero, because most entries are zero.
 
-    Rows of the left one and columns of the right one become integers over a common denominator each, so that a sum
-    needs no common divisors but one at its end.
+    Each row of `left` and each column of `right` becomes integers over a common denominator. A sum of products then
+    needs one greatest common divisor instead of one per term.
     """
     if left.ndim != 2 or right.ndim != 2 or object not in (left.dtype, right.dtype):
         return left @ right
@@ -195,7 +195,7 @@ def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
 
 
 def solve(M: Array, right: Array) -> Array:
-    """Return M^-1 right in their own arithmetic. Raises SingularLoop."""
+    """Return M^-1 right in the arithmetic of M. Raises SingularLoop."""
     if M.dtype != object:
         try:
             return np.linalg.solve(M, right)
@@ -207,8 +207,8 @@ def solve(M: Array, right: Array) -> Array:
 def _solve_exactly(M: Any, right: Any) -> Any:
     """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
-    The models here are series of small blocks, triangular when read in the right order: the next pivot is in the row
-    with the fewest entries, and there in the column with the fewest (Markowitz), so next to nothing fills in.
+    The matrices come from series of small blocks and are triangular after a permutation. The next pivot is in the row
+    with the fewest entries, and there in the column with the fewest (Markowitz), so that few entries fill in.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]
@@ -249,7 +249,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
 def _subtract(
     row: dict[int, Fraction], other: dict[int, Fraction], factor: Fraction, columns: Any = None, r: int = 0
 ) -> None:
-    """Take factor times `other` off a sparse row; `columns` are the rows of each column, kept up to date."""
+    """Subtract factor times `other` from a sparse row r, and update `columns`, the rows of each column."""
     for c, v in other.items():
         entry = row.get(c, _ZERO) - factor * v
         if entry:

@@ -1,38 +1,34 @@
-"""Energy budgets: forces are scaled so that no passive hand can be given more energy than was set aside for it.
-
-Three nets that stand under any controller, linear or not, proved or not, and two classics to compare them with:
+"""Energy budgets: forces are scaled so that a passive hand receives at most a chosen energy, for any controller.
 
     EnergyBudget        before the delays, at the port of the devices
     Shell               at the port of the environment, behind a coupling that is certified for any environment
-    PassivityControl    Hannaford & Ryu 2002, at each device: a baseline
-    EnergyBounding      Kim & Ryu 2010, per channel and for no delay: a baseline
 
 *The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where a[k] is
 the force that acts in [kT, (k+1)T) (the device feels -a) and dx[k] = x[k+1] - x[k]. With delta' = (1 - eps) delta
-the budget keeps
+the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
-For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. So
-if the forces on their way may lose at most R, and R <= W, then W stays nonnegative until they have acted. A packet
-is sent as s times the wanted force with the largest s in [0, 1] that keeps R <= W. With s = 0 the new R is the old one
-less what the last tick may have lost, which W lost at most: so there is always such an s, and W >= 0 for ever. Since
-the cap only lowers W, sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick: beyond what the devices
-dissipate, devices and hands receive at most W0; and sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
+For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. Let R
+be the sum of these losses for all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
+they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
+exists at every tick: with s = 0 the last tick lowers R by its largest loss, and W by at most this loss. So W >= 0
+always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the energy that
+the devices dissipate, devices and hands receive at most W0, and sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
 
-*Delays.* Tick t may use any packet of age lo to hi, and, where packets are lost, up to hold ticks older: then the
-device must drop its force to zero. So tick t may lose the largest r of these packets, channel by channel, and R is
-the sum over the ticks to come. Where delays do not vary the budget knows which force acted; else the device tells, and
-what it has not told yet is booked as the largest loss.
+*Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost; after that the
+device must set its force to zero. The largest loss of tick t is the largest r of these packets, channel by channel, and
+R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
+it, and a tick without a report counts with its largest loss.
 
-*Encoder steps.* Positions rounded to steps q err by e, |e| <= q/2. Summed by parts, sum a'de costs at most q/2 for
-every newton by which the acting force changes, and |dx| is at least the measured one less q. So a tick with the
-measured dx is worth a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel, and loses r(a) +
-2 q |a| at most: the same argument with these two. A force that is held costs nothing, wherever the encoder dithers.
+*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. After summation by parts sum a'de is at most
+q/2 for every newton by which the acting force changes, and |dx| is at least the measured one less q. So a tick with the
+measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel. Its largest loss is
+r(a) + 2 q |a|, and the argument above holds with these two. A constant force costs nothing if the encoder dithers.
 
-Not covered: a device whose damping is less than delta, a hand that works. A period that varies is covered with T the
-largest period. docs/energy-budget.md has the proofs, and says when the budget never acts. The arrays are (m, nsim):
-channels and simulations.
+Not covered are devices whose damping is less than delta, and hands that are not passive. Periods that vary are covered
+with T as the largest one. docs/energy-budget.md has the proofs, and conditions under which the budget never acts. The
+arrays are (m, nsim): channels and simulations.
 """
 
 from __future__ import annotations
@@ -48,14 +44,14 @@ from haptic_loop.controller.lti import Array, Lti
 
 START_J = 2e-3  # [J] W0 of a MuJoCo world, unless a run says otherwise
 EPS = 0.05  # share of the damping that a budget does not use
-_UNTOLD = 4096  # ticks that wait for the device's report; older ones stay booked with their largest loss
+_UNTOLD = 4096  # ticks that wait for the device's report; older ones keep their largest loss
 _HUGE = 1e12  # [N] larger forces count as errors
 _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetFigures:
-    """Figures of a net's action so far."""
+    """Counts of the ticks in which a net changed the force."""
 
     guarantee: str | None  # in one line
     ticks: int
@@ -64,7 +60,7 @@ class NetFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ShellFigures(NetFigures):
-    """Figures of a net that keeps an account of energy."""
+    """Figures of a net that computes an energy W."""
 
     start_J: float
     cap_J: float | None
@@ -79,8 +75,8 @@ class BudgetFigures(ShellFigures):
     eps: float = EPS
     reserved_J: float
     dropped_ticks: int = 0  # ticks in which a device dropped a force that was too old
-    surprises: int
-    idle: str | None = None  # reason why it never acts, if that is proved
+    surprises: int  # ticks with a reported force larger than any that could have been in use
+    idle: str | None = None  # reason why the budget never acts, if that is proved
 
 
 class _Acting:
@@ -95,12 +91,12 @@ class _Acting:
         self.limited += np.asarray(acted)
 
     def figures(self, guarantee: str | None = None) -> NetFigures:
-        """Return the figures of the simulation in which it acted most."""
+        """Return the figures of the simulation in which the net acted most."""
         return NetFigures(guarantee=guarantee, ticks=self.ticks, limited_ticks=int(self.limited.max()))
 
 
 class _Net(_Acting):
-    """Common part of budgets: W of every simulation, its cap, and the smallest scale of a force."""
+    """Common part of budgets: the energy W of every simulation, its cap, and the smallest scale of a force."""
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
         super().__init__(nsim)
@@ -150,10 +146,10 @@ def _principal(level: Array) -> tuple[Array, Array]:
 
 
 class EnergyBudget(_Net):
-    """Scales the forces that are sent to the devices, as described at the head of this file.
+    """Scales the forces that are sent to the devices; the module's docstring states the guarantee.
 
     A tick is one call of `limit`, which returns the force to send. With varying delays or lost packets the devices
-    report which forces acted: at once (`acted`), later (`tell`) or never, which is safe and conservative.
+    report which forces acted: at once (`acted`) or later (`tell`). Without a report the budget is conservative.
     """
 
     def __init__(
@@ -167,13 +163,21 @@ class EnergyBudget(_Net):
         cap: float = np.inf,
         nsim: int = 1,
     ) -> None:
-        """`delta` (m,) or Delta_D (m, m) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
+        """Start a budget for `nsim` simulations.
 
-        A matrix is diagonalised device by device: r(f) = T f' Delta^-1 f/4. The scale of forces is one number for all
-        axes; encoder errors are bounded in the principal axes.
+        Args:
+            delta: Damping (m,), or the matrix Delta_D (m, m), that the devices guarantee [N s/m]. A matrix is
+                diagonalised device by device, r(f) = T f' Delta^-1 f/4, and encoder errors are bounded in its principal
+                axes.
+            T: The largest period [s].
+            packets: The ages of the forces that a tick uses.
+            encoder_step: Steps (m,), or one for all, to which positions are rounded [m].
+            start: W0 [J].
+            cap: The largest W [J].
+            nsim: The number of simulations.
 
-        `encoder_step` (m,) or one for all [m]: positions are rounded to it. `start` and `cap` are W0 and the most that
-        W may be [J]. Raises ValueError for numbers out of range.
+        Raises:
+            ValueError: A number is out of range.
         """
         super().__init__(start, cap, nsim)
         delta = np.array(delta, dtype=float)
@@ -197,16 +201,16 @@ class EnergyBudget(_Net):
         damping = (1 - EPS) * delta[:, None]
         self._step, self._coarse = steps[:, None], bool(steps.any())
         self._damping, self._square = damping / T, T / (4 * damping)  # coefficients of dx^2 and of a^2
-        #: (depth, m, nsim) the most that this tick and those after it may lose [J], by the packets sent so far
+        #: (depth, m, nsim) largest loss [J] of this tick and of the next ones, for the packets sent so far
         self._reserve = np.zeros((int(oldest.max()) + 1, delta.size, nsim))
         ahead = np.arange(len(self._reserve))[:, None]
         self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) ticks that a packet sent now may reach
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
         self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
-        self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> dx and the booked loss
+        self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> dx and its largest loss
         self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick whose force is known, and that force
-        self.surprises = 0  # ticks with a reported force larger than any that could have been in use
+        self.surprises = 0  # as in BudgetFigures
 
     @property
     def reserved(self) -> Array:
@@ -220,9 +224,10 @@ class EnergyBudget(_Net):
     def limit(self, wanted: ArrayLike, dx: ArrayLike, acted: ArrayLike | None = None) -> Array:
         """Return the force to send now (m, nsim) [N]: s times `wanted`, with one s in [0, 1] for all channels.
 
-        `dx` [m] is the displacement since the last call and `acted` [N] the force that acted meanwhile (default: the
-        sent one for constant delays, else unknown). The first call ignores both. `wanted` must be clipped to forces
-        that the device can apply. A force that is nan or larger than _HUGE is sent as zero.
+        `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. By default
+        the latter is the sent force if the delays are constant, and unknown otherwise. The first call ignores both.
+        `wanted` must be clipped to forces that the device can apply. A force that is nan or larger than 1e12 N is sent
+        as zero.
         """
         if self.ticks:
             self._book(self._turned(dx), None if acted is None else self._turned(acted))
@@ -241,7 +246,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) that acted in a tick (counted from 0) that was booked with its largest loss."""
+        """Report the forces (m, nsim) that acted in a tick, counted from 0, whose force was unknown."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for the devices' word")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
@@ -261,13 +266,13 @@ class EnergyBudget(_Net):
         self._untold[tick] = dx.copy(), most
 
     def _settle(self, tick: int, acted: Array, dx: Array, most: Array) -> None:
-        """Replace a tick's largest loss by its real one."""
+        """Replace a tick's largest loss by its actual increment."""
         self.surprises += int((self._loss(acted) > most * (1 + 1e-9)).any())
         if not self._coarse:
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
             return
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
-        before = self._last[1] if self._last[0] == tick - 1 else -acted  # unknown: the most costly one
+        before = self._last[1] if self._last[0] == tick - 1 else -acted  # if unknown, the most costly force
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:
@@ -279,11 +284,11 @@ class EnergyBudget(_Net):
         return square + 2 * self._step * np.abs(force) if self._coarse else square
 
     def _scale(self, wanted: Array) -> Array:
-        """Return the largest s (nsim,) for which the energy covers the reserve with the packet s f.
+        """Return the largest s (nsim,) for which the energy is at least the reserve including the packet s f.
 
-        The ticks that the packet reaches then reserve max(M, s^2 r + s b) each, where M is their present reserve. Their
-        sum is within the energy if and only if sum (s^2 r + s b) <= room + sum M over every set of them; the deciding
-        sets have the ticks in which the packet overtakes M first.
+        Each tick that the packet reaches then reserves max(M, s^2 r + s b), where M is its present reserve. The sum of
+        the reserves is within the energy if and only if sum (s^2 r + s b) <= room + sum M for every set of these ticks.
+        Only sets of the ticks with the smallest s at which s^2 r + s b exceeds M need a check.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
         scale, now = np.ones_like(room), self._reserve[self._reached]  # (ticks that the packet reaches, nsim)
@@ -301,14 +306,14 @@ class EnergyBudget(_Net):
 class Shell(_Net):
     """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
-    W[k+1] = min(cap, W[k] + f'(u - u_-)) and f = s f_wanted with the largest s in [0, 1] that keeps it nonnegative. V
-    answers within the tick, u = u0 - D_V f, so that W is a concave parabola in s, nonnegative at 0: s is its upper
-    root. Then sum f'(u - u_-) >= -W0 at every tick: the environment is passive, and a coupling that is certified for
-    any environment with psi = 0 makes the loop safe with it. A tick is `free`, then `limit`.
+    W[k+1] = min(cap, W[k] + f'(u - u_-)), and f = s f_wanted with the largest s in [0, 1] for which W[k+1] >= 0. V
+    responds within the tick, u = u0 - D_V f, so that W[k+1] is a concave parabola in s, nonnegative at 0, and s is its
+    upper root. Then sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is
+    certified for any environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, cap: float = np.inf, nsim: int = 1) -> None:
-        """Raise ValueError if V is not square, or if its direct part could give energy."""
+        """Raise ValueError if V is not square, or if its direct part is not passive."""
         super().__init__(start, cap, nsim)
         if V.inputs != V.outputs:
             raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected as many")
@@ -327,15 +332,15 @@ class Shell(_Net):
     def credit(self, released: ArrayLike) -> None:
         """Credit the energy that gravity and springs have released so far, (nsim,) [J]; only increases count.
 
-        Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick: s = 0 is
-        admissible as before, since neither term falls.
+        Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick. s = 0
+        remains admissible, since a credit only raises W.
         """
         rise = np.maximum(np.asarray(released, dtype=float) - self._released, 0.0)
         self._released = self._released + rise
         self._earn(rise)
 
     def charge(self, given: float) -> None:
-        """Book an energy [J] >= 0 that reached the devices beside the port."""
+        """Subtract an energy [J] >= 0 that reached the devices on another way than through the port."""
         self._earn(np.full_like(self.energy, -given))
 
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
@@ -356,7 +361,7 @@ class Shell(_Net):
         return force, self.book(force)
 
     def book(self, force: Array) -> Array:
-        """Book a force (m, nsim) [N] that acts in this tick, whatever its cost; return the port's u [m]."""
+        """Update W for a force (m, nsim) [N] that acts in this tick without a limit; return the port's u [m]."""
         u = self._free - self._V.D @ force
         self._earn((force * (u - self._before)).sum(axis=0))
         self._state = self._V.A @ self._state + self._V.B @ force
@@ -370,7 +375,7 @@ class Shell(_Net):
         short = W + linear - square < 0
         W, b, c = W[short], linear[short], square[short]
         root = np.sqrt(b**2 + 4 * c * W)
-        gains = b > 0  # either form of the upper root, free of cancellation; where b > 0, so is c
+        gains = b > 0  # selects the form of the upper root that has no cancellation; b > 0 implies c > 0
         upper = np.divide(np.where(gains, b + root, 2 * W), np.where(gains, 2 * c, root - b), out=0 * W, where=root > 0)
         scale[short] = np.minimum(upper, 1.0) * _SHAVE
         return scale
