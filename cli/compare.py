@@ -86,7 +86,10 @@ def _nearest(couplings: Sequence[Alternative]) -> str:
         return "No coupling of the table has a guarantee."
     best = min(guaranteed, key=lambda each: math.inf if each.force_error_percent is None else each.force_error_percent)
     error = render.optional(best.force_error_percent, "{:.3g} % force error", "no force error was measured")
-    felt = f"{_share(best.dc_ratio, '-')} of the stiffness, {error}"
+    static = (
+        "no static stiffness to render" if best.dc_ratio is None else f"{_share(best.dc_ratio, '-')} of the stiffness"
+    )
+    felt = f"{static}, {error}"
     return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {felt}."
 
 

@@ -53,14 +53,11 @@ def main(argv: list[str]) -> int:
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    useless = (
-        f" [red]Useless[/] on {where}: it renders next to nothing there." if (where := _useless(assessment)) else ""
-    )
     slow = args.coupling == "optimal"  # The bound and the price of an optimal coupling take seconds.
     if slow:
-        render.announce(args, verdicts.verdict(assessment) + useless)
+        render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
-    said = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby) + useless
+    said = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby)
     lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
     render.publish(args, report, _tables(scenario, report), lines, verdict=said)
     return options.exit_code(assessment.holds, report.interrupted)
@@ -302,24 +299,15 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
 # The report as tables.
 
 
-_USELESS = f"{SOFTEST:g} N/m is the softest that the search tries, and it renders next to nothing"
-
-
-def _useless(assessment: Assessment) -> str:
-    """Return the contacts whose springs are at the soft end of the search, or an empty text."""
-    contacts, gains = assessment.loop.environment.contacts, assessment.gains.get("K", ())
-    soft = [K < 1.001 * SOFTEST for K in gains]
-    if soft and all(soft):
-        return "all contacts"
-    return ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
-
-
 def _assessment_rows(assessment: Assessment) -> render.Rows:
     gains, end = assessment.gains, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        yield "", f"useless on {where}: {_USELESS}" if (where := _useless(assessment)) else None
+        yield (
+            "",
+            f"{SOFTEST:g} N/m is the softest that the search tries" if min(gains["K"]) < verdicts.SOFT_END else None,
+        )
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)
@@ -353,7 +341,7 @@ class _Best:
         yield "bound", self.bound and self.bound.words
         share = finite(self.rendered_stiffness)  # a free mass has no static stiffness to render
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
-        tried = (f"{basis.mismatch_db:.2f}{_why_rejected(basis)}" for basis in self.bases)
+        tried = (f"{basis.mismatch_db:z.2f}{_why_rejected(basis)}" for basis in self.bases)
         yield "bases [dB]", ", ".join(tried) or None
         yield "ended by --seconds", "a larger basis may be better" if self.ended_by_seconds else None
         yield "last not taken", next((basis.rejected for basis in reversed(self.bases) if basis.rejected), None)
@@ -428,6 +416,6 @@ _OVER_RANGES: dict[str, str | Callable[[coverage.OverRanges], str]] = {
     "coupling": "{r.coupling}",
     "needs of its damping": _both("required_over_available", "{:.4f}"),
     "vertices violated": "{r.violated}",
-    "rms error": lambda row: _both("rms_mismatch_db", "{:.2f}")(row) + " dB",
-    "largest error": lambda row: _both("relative_mismatch_db", "{:.2f}")(row) + " dB",
+    "rms error": lambda row: _both("rms_mismatch_db", "{:z.2f}")(row) + " dB",
+    "largest error": lambda row: _both("relative_mismatch_db", "{:z.2f}")(row) + " dB",
 }

@@ -328,8 +328,10 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
         parts = [(parts[0][0], parts[1][0])]
     if any(len(part) != 2 for part in parts):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
-    if any(not 0 <= lo <= hi for lo, hi in parts):
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected 0 <= LO <= HI")
+    for i, (lo, hi) in enumerate(parts, start=1):
+        if not 0 <= lo <= hi:
+            channel = f" for channel {i}" if len(parts) > 1 else ""
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected 0 <= LO <= HI{channel}")
     return tuple((lo, hi) for lo, hi in parts)
 
 
@@ -409,9 +411,10 @@ def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> De
     if loop.axes and len(pairs) == len(loop.axes):
         pairs = loop.per_channel(pairs)
     lo, hi = zip(*per_channel("--varying-delay", pairs, loop.channels, "ranges"), strict=True)
-    if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
-        spans = ",".join(f"{a}-{b}" for a, b in pairs)
-        raise InputError(f"--varying-delay is {spans}, expected 0 <= LO <= HI <= {most} samples")
+    for i, (a, b) in enumerate(zip(lo, hi, strict=True), start=1):
+        if not 0 <= a <= b <= most:
+            spans = ",".join(f"{a}-{b}" for a, b in pairs)
+            raise InputError(f"--varying-delay is {spans}, expected 0 <= LO <= HI <= {most} samples for channel {i}")
     return DelayRange(lo, hi)
 
 

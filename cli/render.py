@@ -270,7 +270,7 @@ def optional(value: float | None, form: str, absent: str = "-") -> str:
 
 def transparency_error(figures: Transparency) -> str:
     """Return the mismatch M relative to the reference, in decibels, as a text."""
-    shown = (f"{db:.2f} dB" if math.isfinite(db) else "zero" for db in (figures.mismatch_db, figures.rms_mismatch_db))
+    shown = (f"{db:z.2f} dB" if math.isfinite(db) else "zero" for db in (figures.mismatch_db, figures.rms_mismatch_db))
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
 
@@ -295,7 +295,7 @@ def price_words(price: Spread) -> str:
     proved = f"proved in {price.proved} of {price.environments} environments"
     rest = ", swept in the others" if price.proved < price.environments else ""
     rest += f" ({price.reason})" if price.reason else ""
-    return f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
+    return f"{price.mismatch_db:z.2f} dB, {costs}: {proved}{rest}"
 
 
 def verdict(word: str | None) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from haptic_loop.cli import render
 from haptic_loop.controller.environment import RIGID_WALL, Environment
 from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult
+from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.guarantees import ANY, HERE, RANGES, EncoderSteps
 from haptic_loop.design.result import MAKING, Chosen, finite
 from haptic_loop.design.robustness import Nearby
@@ -90,7 +91,23 @@ def verdict(
         words.append("By a refined sweep, without an exact proof.")
     if encoder and not encoder.covered:
         words.append("Not covered: the encoder steps of the devices.")
-    return " ".join([*words, *filter(None, [lost(assessment, nearby)])])
+    return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
+
+
+SOFT_END = 1.001 * SOFTEST  # [N/m] a spring below is at the soft end of the search
+_NOTHING_DB, _NOTHING = -1.0, 0.01  # rms mismatch, and share of the stiffness, of a force that is as good as none
+
+
+def _useless(assessment: Assessment) -> str:
+    """Return a sentence on the contacts at which the coupling renders next to nothing, or ""."""
+    contacts, felt = assessment.loop.environment.contacts, assessment.transparency
+    soft = [K < SOFT_END for K in assessment.gains.get("K", ())]
+    where = ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
+    if soft and all(soft):
+        where = "all contacts"
+    if not where and felt and felt.rms_mismatch_db > _NOTHING_DB and not felt.dc_ratio > _NOTHING:
+        return "[red]Useless[/]: its force is about as wrong as no force."
+    return f"[red]Useless[/] on {where}: it renders next to nothing there." if where else ""
 
 
 def lost(assessment: Assessment, nearby: Nearby | None) -> str:

@@ -106,7 +106,7 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
             continue
         if needs[target].certified:
             error = decibels(transparency_of(loop, design).rms_mismatch)
-            designs.append((error, f"--coupling {other} --condition {target} ({error:.2f} dB rms)"))
+            designs.append((error, f"--coupling {other} --condition {target} ({error:z.2f} dB rms)"))
     return "certified instead: " + ", ".join(words for _, words in sorted(designs)) if designs else ""
 
 

@@ -470,10 +470,10 @@ class BoundBeside:
         """One line for a report."""
         if self.reason or self.rms_mismatch_db is None:
             return self.reason or ""
-        sup = f", nor than {self.relative_mismatch_db:.2f} dB at most" if self.relative_mismatch_db is not None else ""
+        sup = f", nor than {self.relative_mismatch_db:z.2f} dB at most" if self.relative_mismatch_db is not None else ""
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
-        left = f": {self.gap_db:.2f} dB left" if self.gap_db is not None else ""
-        rest = f"{self.rms_mismatch_db:.2f} dB rms{sup}{without}{left}"
+        left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
+        rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"
         if self.proved:
             return f"no linear coupling can be better than {rest}"
         rest = rest.replace(", nor than", " and", 1)

@@ -282,6 +282,8 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     A link stays a link: the file that it points to is written. Raises InputError if the file cannot be written, or if
     the command has read it or written it for another option.
     """
+    if "\0" in str(path):
+        raise InputError(f"cannot write {str(path)!r}: the name of a file has no null byte")
     try:
         place = _target(path)
         if place.exists() and not place.is_file():

@@ -226,9 +226,14 @@ def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
     """
     Q = np.linalg.inv(_passivity_storage(family, p))
     U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
-    while min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) > 0:
+    while not _singular(Q, U):
         p, Q, U = _step(_Lemmas(family, p, Q, U, norm))
         yield p
+
+
+def _singular(Q: Array, U: Array) -> bool:
+    """Return whether a storage is singular to rounding."""
+    return min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) <= 0
 
 
 def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
@@ -285,6 +290,8 @@ _WIDTH = 5e-3  # relative width at which the bisection ends
 def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
     """Return the best coupling and the number of SDPs; p is feasible for its norm."""
     Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
+    if _singular(Q, U):
+        return p, 0
     lemmas = _Lemmas(family, p, Q, U, norm)
     low, high, best, sdps = 0.5 * norm, norm, p, 0
     while high - low > _WIDTH * high and sdps < budget:
@@ -408,7 +415,7 @@ class FixedPoles:
 
         x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)
         self.sdps += 1
-        return self.units.si(unit(x)), float(np.sqrt(x[-1]))
+        return self.units.si(unit(x)), float(np.sqrt(max(x[-1], 0.0)))
 
 
 _START_ROOM = 1e-3  # relative reduction of the damping for the start, so that it is strictly feasible

@@ -13,6 +13,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -178,7 +179,14 @@ def reachability_scaled(G: Lti) -> Array:
     """Return S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
     import scipy
 
-    W = scipy.linalg.solve_discrete_lyapunov(G.A, G.B @ G.B.T)
+    A, W = G.A, G.B @ G.B.T
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
+        try:
+            W = scipy.linalg.solve_discrete_lyapunov(A, W)
+        except scipy.linalg.LinAlgWarning:  # a stiff block: the sum of A^k B B' A'^k, by doubling
+            while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
+                W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
     return scipy.linalg.cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
 

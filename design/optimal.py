@@ -101,7 +101,7 @@ def design_with(
     def reached(result: _BasisResult) -> None:
         nonlocal done
         done += 1
-        progress(f"{result.mismatch_db:.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
+        progress(f"{result.mismatch_db:z.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
 
     span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
     return design(loop.switching(span), chosen, progress=reached)

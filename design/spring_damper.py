@@ -375,8 +375,8 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
         raise DesignFailed(None, (), f"{line}, psi = {loop.psi}, delta = {loop.delta}")
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
     requirement, wall_s = KNOWN_DEVICE.judge(loop, coupling), time.perf_counter() - started
-    beside = f"{decibels(plain[1]):.2f} dB rms" if plain[0] else "no spring-damper"
-    note = f"known-device, {decibels(rms):.2f} dB rms; this-environment, for devices of which less is known: {beside}"
+    beside = f"{decibels(plain[1]):z.2f} dB rms" if plain[0] else "no spring-damper"
+    note = f"known-device, {decibels(rms):z.2f} dB rms; this-environment, for devices of which less is known: {beside}"
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
 

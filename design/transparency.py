@@ -39,8 +39,9 @@ class Transparency:
     band_hz: tuple[float, float]
 
     def __repr__(self) -> str:
-        mismatch = f"mismatch {self.rms_mismatch_db:.2f} dB rms, {self.mismatch_db:.2f} dB at most"
-        return f"Transparency({mismatch}, {100 * self.dc_ratio:.3g} % of the stiffness)"
+        mismatch = f"mismatch {self.rms_mismatch_db:z.2f} dB rms, {self.mismatch_db:z.2f} dB at most"
+        static = f"{100 * self.dc_ratio:.3g} % of the" if math.isfinite(self.dc_ratio) else "no static"
+        return f"Transparency({mismatch}, {static} stiffness)"
 
     @property
     def mismatch_db(self) -> float:

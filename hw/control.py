@@ -568,10 +568,10 @@ def certified_couplings(
 ) -> tuple[CertifiedCoupling, ...]:
     """Return the coupling for the measured delay and up to `spare` reserves, each certified for one tick more.
 
-    A reserve is softer than the previous coupling on every channel whose delay is longer, stiffer on none, and needs
-    less damping than the previous coupling would need with these delays. It has the same kind or file; where that is
-    not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is certified,
-    the list ends. Raises SafetyStop where the first coupling is not certified.
+    A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on none.
+    It needs less damping than the previous coupling would need with these delays. It has the same kind or file; where
+    that is not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is
+    certified, the list ends. Raises SafetyStop where the first coupling is not certified.
     """
     more: dict[str, Any] = {"limiter": limiter, "start": start, "behind": behind}
     candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
@@ -594,7 +594,7 @@ _EQUAL = 1e-6  # relative error of static stiffnesses: that at which the search 
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
-    """Return whether `reserve` is softer than `than` at longer delays, nowhere stiffer, and needs less damping.
+    """Return whether `reserve` is softer at rest than `than` at longer delays, nowhere stiffer, and needs less damping.
 
     Both couplings are compared in the loop with the reserve's delays. The stiffness is the coupling's K, or without
     one the static stiffness that the devices feel.

@@ -1,16 +1,20 @@
 """State-space couplings: the realisation, what each method reaches, and that every result stands on its own."""
 
+import warnings
+
 import msgspec
 import numpy as np
 import pytest
+import scipy.linalg
 from asked import any_environment, this_environment
 from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
+from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import fixed_order as ccl
-from haptic_loop.design import spring_damper
+from haptic_loop.design import lmi, spring_damper
 from haptic_loop.design.conditions import any_environment_demand
 from haptic_loop.design.fixed_order import _START_ROOM, FixedOrder, FixedPoles, descend
 from haptic_loop.design.lmi import RESERVE, Shaping
@@ -155,3 +159,33 @@ def test_as_printed_the_iteration_stalls_at_its_start():
 def test_a_bad_request_gets_one_line(options, message):
     with pytest.raises(ValueError, match=message):
         ccl.design(asked(), **options)
+
+
+@pytest.mark.parametrize("method", ["complementarity", "inner", "fixed-poles"])
+def test_a_free_mass_is_called_useless(method, tmp_path, capsys):
+    """It has no static stiffness to render, and its weighted loop is too stiff for SciPy's Lyapunov equation."""
+    scenario = tmp_path / "free.toml"
+    text = 'name = "free"\nT = 1e-3\nduration = 1.0\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\n'
+    scenario.write_text(text + 'damping = 1.37\n[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')
+    words = ["--scenario", str(scenario), "--coupling", "ccl", "--method", method, "--out", str(tmp_path / "c.json")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(words) == 0
+    shown = capsys.readouterr()
+    assert "Useless: its force is about as wrong as no force" in " ".join(shown.out.split())
+    assert not shown.err
+    assert "nan" not in shown.out
+
+
+def test_a_stiff_loop_has_its_reachability_gramian(monkeypatch):
+    """The Gramian by doubling is SciPy's where both are accurate."""
+    rng = np.random.default_rng(0)
+    A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    G = Lti(0.99 * A / np.abs(np.linalg.eigvals(A)).max(), B, np.eye(4), np.zeros((4, 2)), 1.0)
+    S = lmi.reachability_scaled(G)
+
+    def refused(A, Q):
+        raise scipy.linalg.LinAlgWarning
+
+    monkeypatch.setattr(scipy.linalg, "solve_discrete_lyapunov", refused)
+    assert lmi.reachability_scaled(G) == pytest.approx(S, rel=1e-8, abs=1e-8)

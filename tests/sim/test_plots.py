@@ -282,4 +282,6 @@ def test_a_picture_has_the_format_of_its_suffix(suffix, begin, tmp_path):
 def test_other_suffixes_of_pictures_are_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"the suffix is .*allowed are \.png, \.pdf, \.svg"):
         plots.save(plots.draw_run(trace(np.zeros((2000, 1))), "t", 8.0), tmp_path / name)
+    with pytest.raises(InputError, match="no null byte"):
+        plots.save(plots.draw_run(trace(np.zeros((2000, 1))), "t", 8.0), tmp_path / f"{name}\0.png")
     assert not list(tmp_path.iterdir())
