@@ -68,6 +68,8 @@ def main(argv: list[str]) -> int:
     limits = session_cli.limits_from(args, scenario)
     settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated hands never let go.
     session = session_for(scenario, settings, **limits)
+    below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
+    scenario = session.scenario
     session.record = recorder = Recorder(scenario.channels)
     out = options.out_folder(args, "bridge")
 
@@ -76,6 +78,9 @@ def main(argv: list[str]) -> int:
         choice = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
+        if below:
+            said = "· delta is a full matrix, of which a device states one number per axis below it"
+            render.console(args).print(f"{said}: {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)

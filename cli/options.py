@@ -94,7 +94,10 @@ class Parser(argparse.ArgumentParser):
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
             what = "option" if rest[0].startswith("-") else "word"
-            raise InputError(f"unknown {what} {rest[0]}{self._near(rest[0])} (--help lists the options)")
+            help_ = "--help lists the options"
+            if re.fullmatch(r"[\d.][\d.,e+-]*", rest[0]):
+                help_ = "several numbers are written with commas, as 1,2,3"
+            raise InputError(f"unknown {what} {rest[0]}{self._near(rest[0])} ({help_})")
         if "reference" in parsed:
             _translate(parsed)
         if ":" in (getattr(parsed, "condition", None) or ""):
@@ -397,11 +400,13 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
         raise InputError(f"{name}{text}") from None
 
 
-def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: str = "entries") -> tuple[_Given, ...]:
-    """Return one value for each channel; a single value is repeated. Raises InputError."""
+def per_channel(
+    option: str, values: tuple[_Given, ...], channels: int, what: str = "entries", each: str = "channel"
+) -> tuple[_Given, ...]:
+    """Return one value for each channel, or each device; a single value is repeated. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
-        expected = "one" if channels == 1 else f"{channels} (one per channel) or 1"
+        expected = "one" if channels == 1 else f"{channels} (one per {each}) or 1"
         raise InputError(f"{option} has {len(values)} {what}, expected {expected}")
     return values
 
@@ -439,13 +444,14 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     if args.environment is not None:
         scenario = with_environment(scenario, args.environment)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
+    each = "channel" if scenario.channels == len(scenario.device) else "device"
     values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     changes: dict[str, Any] = {
-        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device))
+        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device), each=each)
         for name, value in values.items()
     }
     if args.known_device:
-        bounds = per_channel("--known-device", args.known_device, len(scenario.device))
+        bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)
         with refused("--known-device: "):
             changes["device"] = tuple(map(_with_bounds, scenario.device, bounds))
     return scenario.replace(**changes) if changes else scenario

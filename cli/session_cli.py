@@ -31,7 +31,7 @@ from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Session
+from haptic_loop.hw.session import Session, axis_by_axis
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
@@ -311,7 +311,7 @@ def _rehearsed(
     """Run the session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     with options.refused("the scenario cannot stand behind a serial link: "):
-        emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
+        emulator = Emulator(axis_by_axis(alone or options.scenario_from(args)), faults, coulomb=coulomb)
     with progress("rehearsing") as move:
 
         def planned(ages: Ages) -> Sequence[Armable]:

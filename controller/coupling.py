@@ -337,8 +337,24 @@ class Compliance(Coupling):
     def at_period(self, T: float) -> Compliance:
         return Compliance(replace(self.V, T=T))
 
+    def turned(self, Q: Array) -> Compliance:
+        """Return Q V Q', rounded to decimals with a V(1) that is exactly symmetric."""
+        static, R = self.V._rest
+        A, B, R, static = (
+            numbers(_decimals(part, digits), Fraction(1))
+            for part, digits in ((self.V.A, 7), (self.V.B @ Q.T, 6), (Q @ R, 7), (Q @ static @ Q.T, 13))
+        )
+        V = Lti.with_rest(A, B, R, (static + static.T) / 2, Fraction(1))
+        A, B, C, D = (getattr(V, name).astype(float) for name in "ABCD")
+        return Compliance(Lti(A, B, C, D, self.V.T))
+
     def form(self) -> _ComplianceForm:
         return _ComplianceForm(*(_rows(getattr(self.V, name)) for name in "ABCD"))
+
+
+def _decimals(M: Array, digits: int) -> Array:
+    """Return M rounded to a decimal place, its largest entry to this many digits."""
+    return np.round(M, digits - 1 - int(np.floor(np.log10(np.abs(M).max(initial=1e-300)))))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

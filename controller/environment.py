@@ -46,9 +46,9 @@ _SAME_LENGTH = 1e-15  # relative: a direction that was normalised before is not 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
     """Return the direction with length 1. Raises ValueError where all its entries are zero."""
+    if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
+        raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9 that are not all 0")
     length = float(np.linalg.norm(direction))
-    if not 1e-9 < length < np.inf:
-        raise ValueError(f"{field} is {list(direction)}, expected a direction with finite entries that are not all 0")
     return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
 
 

@@ -89,10 +89,6 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     return H1, -regular
 
 
-#: reason of a refusal for devices whose levels Delta_i are not diagonal
-FULL_LEVELS = "is proved where every Delta_i is diagonal: give damping as one number for each axis"
-
-
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
     """Return the block of Theorem 4 for the damping s Delta_D, times s; psi >= 1 needs the multiplier phi (m,) [N s/m].
 

@@ -86,7 +86,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency or loop.levels):
+    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
         return KNOWN_DEVICE.name  # never worse than this-environment
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
     return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
@@ -147,7 +147,7 @@ def design_by_kind(
     made_for = able[condition_name]
     if loop.levels and (reason := made_for.beyond(loop)):
         raise ValueError(reason)
-    if loop.levels and kind != "moving-average":
+    if loop.levels and (kind != "moving-average" or made_for is KNOWN_DEVICE_ANY):
         return _in_principal_axes(loop, kind, own or made_for, progress, options)
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
@@ -210,30 +210,34 @@ def _in_principal_axes(
     and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError if the loop or the kind does not allow full levels,
     DesignFailed if the coupling is not certified.
     """
-    for name, present in (("environment.walls", loop.environment.walls), ("ranges", loop.ranges)):
-        if present:
-            why = f"a {kind} is designed in the principal axes of the damping, into which {name} are not turned"
-            raise ValueError(f"levels: {why}; a moving-average takes any")
-    if kind == "ccl":
-        able = "spring-damper, moving-average and optimal take any"
-        raise ValueError(f"levels: ccl is designed for devices whose Delta_i is diagonal; {able}")
+    if loop.ranges and kind == "optimal":
+        why = "an optimal coupling is designed in the principal axes of the damping, into which ranges are not turned"
+        raise ValueError(f"levels: {why}; a spring-damper or a moving-average takes any")
+    if loop.environment.walls and kind == "spring-damper":
+        if options.get("limiter") and (reason := LIMITER.not_designed(loop)):
+            raise ValueError(reason)
+        options = {**options, "limiter": False}
     Delta, Q = loop.Delta(), np.zeros((loop.channels,) * 2)
     for own in loop.devices:
         Q[own, own] = np.linalg.eigh(Delta[own, own])[1]
-    values = np.diag(Q.T @ Delta @ Q)
-    straight = msgspec.structs.replace(
-        loop,
-        environment=_Turned(loop.environment, Q),
-        delta=tuple(((1 - _ROUNDED) * values).tolist()),
-        levels=None,
-    )
-    design = design_by_kind(straight, kind, condition, progress, **options)
-    coupling = design.coupling.turned(Q)
-    requirement = condition.judge(loop, coupling)
-    if not requirement.certified:
-        why = f"the designed coupling is not certified by {condition.name}: {requirement.shortfall}"
+    values = (1 - _ROUNDED) * np.diag(Q.T @ Delta @ Q)
+
+    def made(part: Loop) -> Design:
+        """Return the design for the share of the damping that `part` has; all of its walls touch."""
+        delta = tuple((part.delta[0] / loop.delta[0] * values).tolist())
+        straight = {"environment": _Turned(loop.environment, Q), "delta": delta, "levels": None, "ranges": None}
+        design = design_by_kind(msgspec.structs.replace(part, **straight), kind, condition, progress, **options)
+        coupling = design.coupling.turned(Q)
+        requirement = condition.judge(loop.at(loop.environment), coupling)
+        return replace(design, coupling=coupling, requirement=requirement, certificate=None)
+
+    if loop.environment.walls and condition.guarantee(loop) != ANY:
+        return _with_less_damping(loop, made, condition)
+    design = made(loop)
+    if not design.requirement.certified:
+        why = f"the designed coupling is not certified by {condition.name}: {design.requirement.shortfall}"
         raise DesignFailed(None, (), why)
-    return replace(design, coupling=coupling, requirement=requirement, certificate=None)
+    return design
 
 
 def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
@@ -274,7 +278,7 @@ def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Co
     share, best, shortfall = 1.0, None, ""
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
-        part = msgspec.structs.replace(constant, latency=None, delta=tuple(share * d for d in loop.delta))
+        part = msgspec.structs.replace(constant, latency=None, **_scaled(loop, share))
         design = make(part)
         needs = condition.judge(loop.at(loop.environment), design.coupling)
         shortfall = needs.shortfall
@@ -290,6 +294,12 @@ def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Co
     if best is None:
         raise DesignFailed(None, (), f"no coupling was found for {condition.name}: {shortfall}")
     return best
+
+
+def _scaled(loop: Loop, share: float) -> dict[str, Any]:
+    """Return the fields of a loop with this share of the damping."""
+    levels = loop.levels and tuple(tuple(tuple(share * v for v in row) for row in level) for level in loop.levels)
+    return {"delta": tuple(share * d for d in loop.delta), "levels": levels}
 
 
 def nearby(

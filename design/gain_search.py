@@ -340,7 +340,7 @@ class LimiterLoop(SampledLoop):
 
 
 class KnownDeviceLoop(SampledLoop):
-    """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each channel).
+    """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each device).
 
     The condition is the Schur complement of the row of v, with M = -beta F/z + l21: He[F/(z-1)] + l11 - M*M/(4 l22).
     """
@@ -349,16 +349,17 @@ class KnownDeviceLoop(SampledLoop):
     _first = 0.35  # first value of the share; the default loops' optima are 0.29 to 0.47
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
-        self.active, self.share = np.arange(loop.channels), 1 - _SAMPLED_RESERVE
-        self.largest = largest_beta(loop, self.share)
+        self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE
+        self.device = np.array(loop.per_channel(range(len(loop.devices))))
+        self.largest = loop.per_device(largest_beta(loop, self.share))
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        return np.append(super().point(coupling), np.full(self.loop.channels, np.log(self._first)))
+        return np.append(super().point(coupling), np.full(self.active.size, np.log(self._first)))
 
     def beta(self, x: Array) -> Array:
         """Return beta (m,) [s] in x."""
-        return np.exp(x[2 * self.loop.channels :]) * self.largest
+        return (np.exp(x[2 * self.loop.channels :]) * self.largest)[self.device]
 
     def judged(self, x: Array) -> Requirement:
         bounds = (0.0,) * (2 * self.loop.channels)
@@ -399,7 +400,7 @@ class KnownDeviceLoop(SampledLoop):
         sent = np.einsum("kij,kj->ki", around.G, v)
         turned = np.einsum("ki,kij->kj", left * self._lines[:, :, 0], around.G) * sent
         slope = [*(turned * around.by).real]
-        for i in range(m):
+        for i in range(self.active.size):
             step = x.copy()
             step[2 * m + i] += _DIFFERENCE
             slope.append(((self._complement(step)[0] - room) / _DIFFERENCE)[:, None])

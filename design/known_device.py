@@ -21,16 +21,17 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.controller.arithmetic import Number, numbers, rational
+from haptic_loop.controller.arithmetic import Number, eye, inverse, numbers, rational, times
 from haptic_loop.controller.coupling import Coupling
-from haptic_loop.controller.loop import DeviceBounds, Loop
+from haptic_loop.controller.loop import DeviceBounds, Loop, Rows
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
-from haptic_loop.design.conditions import FULL_LEVELS, Condition, Demand, unsound
+from haptic_loop.design.conditions import Condition, Demand, unsound
 from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, LimitedForces, Multiplied, named_parts
 from haptic_loop.design.exact import require_size
@@ -118,6 +119,64 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
         return PeriodCost(move, move * q, move * q * longest, c2 / q_long)
 
 
+# ----------------------------------------------------------------------------------------------------
+# Full levels. Bounds of mass and transmission are numbers, so that no orthogonal Q_i of a device changes them: in
+# coordinates in which Delta is diagonal the theorem holds as it stands, with one beta for all axes of a device.
+
+_SKEW_BITS = 32  # fractional bits of a skew matrix: Q' Delta Q is then diagonal to about 1e-9 of the damping
+_JACOBI_SWEEPS = 12  # converges quadratically: 6 axes need about five
+_BELOW = 1e-11  # relative distance of decimals d below the exact diagonal
+
+
+def straightened(loop: Loop) -> Loop:
+    """Return the loop with the diagonal levels d that `principal_axes` finds; itself if its levels are diagonal."""
+    if loop.levels is None:
+        return loop
+    parts = [principal_axes(level) for level in loop.levels]
+    return msgspec.structs.replace(loop, delta=tuple(v for _, d in parts for v in d), levels=None)
+
+
+def _turned(G: Lti, loop: Loop) -> Lti:
+    """Return the map of `Multiplied.map` in the coordinates of `straightened`; further inputs and outputs stay."""
+    if loop.levels is None:
+        return G
+    Q = np.eye(G.inputs, dtype=int).astype(object)
+    for own, level in zip(loop.devices, loop.levels, strict=True):
+        Q[own, own] = principal_axes(level)[0]
+    Q = numbers(Q, G.T)
+    return Q.T @ G @ Q
+
+
+@lru_cache(maxsize=64)
+def principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
+    """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
+
+    Q is the Cayley transform of a rational skew matrix S, hence exactly orthogonal. The eigenvectors come from Jacobi's
+    rotations, whose additions, products and roots round alike on every machine: a proof is read on another one.
+    d lies below the diagonal of Q' Delta Q by its Gershgorin radii.
+    """
+    n = len(level)
+    A, V = np.array(level, dtype=float), np.eye(n)
+    for p, q in [*itertools.combinations(range(n), 2)] * _JACOBI_SWEEPS:
+        if abs(A[p, q]) > 1e-40 * abs(A).max():  # tau would overflow
+            tau = (A[q, q] - A[p, p]) / (2 * A[p, q])
+            t = np.copysign(1.0, tau) / (abs(tau) + np.sqrt(1 + tau * tau))
+            c = 1 / np.sqrt(1 + t * t)
+            for M in (A, V, A.T):
+                M[:, p], M[:, q] = c * (M[:, p] - t * M[:, q]), c * (t * M[:, p] + M[:, q])
+    one: Any = eye(n, Fraction(1))
+    axes: Any = numbers(V, Fraction(1))
+    S = times(one - axes, inverse(one + axes))
+    S = np.frompyfunc(lambda v: Fraction(round(v * 2**_SKEW_BITS), 2**_SKEW_BITS), 1, 1)((S - S.T) / 2)
+    Q = times(one - S, inverse(one + S))
+    D = times(times(Q.T, numbers(level, Fraction(1))), Q)
+    radii = np.abs(D - np.diag(np.diag(D))).sum(axis=1)
+    d = tuple((1 - _BELOW) * float(v) for v in np.diag(D) - radii)
+    if not all(0 < rational(v) < w for v, w in zip(d, np.diag(D) - radii, strict=True)):
+        raise NotProved(f"levels: the principal axes of {[list(row) for row in level]} N s/m could not be enclosed")
+    return Q, d
+
+
 _BITS = 320  # precision of the balls (intervals) that enclose q
 _MOST_ULPS = 8  # largest distance of q from its bounds; rounding the midpoint of a ball needs one
 
@@ -183,6 +242,8 @@ def _checked_rates(loop: Loop, beta: Sequence[Fraction]) -> tuple[Any, Any]:
     """Return c0 and c2 over Fractions. Raises NotProved unless they are positive."""
     exact = loop.period(True)
     c0, c2 = _rates(_known(loop, exact), numbers(loop.delta, exact), _row(beta))
+    if any(len(set(beta[own])) > 1 for own in loop.devices):
+        raise NotProved(f"beta is {[float(b) for b in beta]}, expected one value for all axes of a device")
     if not ((c0 > 0).all() and (c2 > 0).all() and all(b > 0 for b in beta)):
         raise NotProved(f"beta is {[float(b) for b in beta]}, too large for the bounds of the devices")
     return c0, c2
@@ -320,10 +381,14 @@ class Sweep:
 
 
 class _Search:
-    """The search for beta and multipliers, x = (beta [s], multipliers in units, or 1/alpha in its unit; share)."""
+    """The search for beta and multipliers: x = (beta [s], multipliers in their units, or 1/alpha in its, share).
+
+    All axes of a device have one beta, so that its bounds may be those of matrices.
+    """
 
     def __init__(self, sweep: Sweep, high: float) -> None:
-        self.sweep, self.high, self.m = sweep, high, sweep.loop.channels
+        self.sweep, self.high, self.m = sweep, high, len(sweep.loop.devices)
+        self.device = np.array(sweep.loop.per_channel(range(self.m)))  # (channels,)
         each = [(each, unit) for each in sweep.unknowns for unit in each.units]
         self.units = np.array([unit for _, unit in each])
         self.searched = np.flatnonzero(self.units)
@@ -334,11 +399,15 @@ class _Search:
         self.sampled = [self.parts(i, grid) for i, grid in enumerate(sweep.grids)]
         self.tangents: list[tuple[Complex, Complex]] = []
 
+    def beta(self, x: Array) -> Array:
+        """Return beta [s] of every channel."""
+        return x[: self.m][self.device]
+
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
         """Return z (k,), and (1 + m + q, k, n, n): the block for zero beta and multipliers, then the slope of each."""
         m, z = self.m, on_circle(w)
-        none, no_beta = 0 * self.units, np.zeros(m)
-        each = [(no_beta, none), *((beta, none) for beta in np.eye(m))]
+        none, no_beta = 0 * self.units, np.zeros(self.device.size)
+        each = [(no_beta, none), *((beta, none) for beta in np.eye(m)[:, self.device])]
         each += [(no_beta, none + self.units * (np.arange(self.units.size) == i)) for i in self.searched]
         demands = [self.sweep.idle(environment, beta, tuple(values)) for beta, values in each]
         blocks = np.array([hermitian(demand.free.at(z)) for demand in demands])
@@ -346,6 +415,10 @@ class _Search:
         if (spare := demands[0].spare) is not None:
             blocks[0] -= np.diag(spare)
         return z, blocks
+
+    def largest(self, share: float) -> Array:
+        """Return the largest beta (devices,) [s] for this share of the damping."""
+        return self.sweep.loop.per_device(largest_beta(self.sweep.loop, share))
 
     def weights(self, x: Array) -> Array:
         """Return the multipliers of x in their units."""
@@ -363,11 +436,11 @@ class _Search:
 
         alpha weighs dx + beta (v+ - v), so for switching delays the block is not affine in (alpha, beta).
         """
-        m, weights = self.m, self.weights(x)
-        block = parts[0] + np.tensordot(np.concatenate([x[:m], weights]), parts[1:], axes=1)
+        m, beta, weights = self.device.size, self.beta(x), self.weights(x)
+        block = parts[0] + np.tensordot(np.concatenate([x[: self.m], weights]), parts[1:], axes=1)
         alpha = named_parts(self.sweep.unknowns, self.values(x)).get("alpha")
         for i, weight in enumerate(self.sweep.loop.per_channel(alpha) if alpha else ()):
-            speed, v = x[i] * (z - 1), m + i
+            speed, v = beta[i] * (z - 1), m + i
             for part in self.sweep.moves:
                 block[:, part[i], v] -= weight / 2 * speed
                 block[:, v, part[i]] -= weight / 2 * np.conj(speed)
@@ -376,7 +449,7 @@ class _Search:
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
         """Return the block (k, n, n) as a concave function of x, with inputs w scaled by 1/alpha over that in `at`."""
-        cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), x[: self.m])
+        cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:
             own = np.real(np.diagonal(parts[1 + a], axis1=1, axis2=2)).min(axis=0) > 0
@@ -404,7 +477,7 @@ class _Search:
 
         The place is (environment, index of the frequency), or None.
         """
-        beta, share, binding = x[: self.m], self.sweep.floor(x[: self.m]), None
+        beta, share, binding = self.beta(x), self.sweep.floor(self.beta(x)), None
         for e, (z, parts) in enumerate(self.sampled):
             idle = self.idle(z, parts, x)
             for _ in range(budgets.BETA_CUTS):
@@ -422,7 +495,7 @@ class _Search:
 
     def room(self, z: Complex, parts: Complex, idle: Complex, x: Array) -> Array:
         """Return the least eigenvalue (k,) of the block with L, each scaled to a diagonal of about one."""
-        cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), x[: self.m])
+        cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block = with_cost(idle, z, cost, self.sweep.moves)
         terms = np.abs(np.diagonal(parts, axis1=2, axis2=3)) * np.abs(np.concatenate([[1.0], x[:-1]]))[:, None, None]
         size = terms.max(axis=(0, 1)) + np.abs(np.diagonal(block - idle, axis1=1, axis2=2)).max(axis=0)
@@ -432,9 +505,7 @@ class _Search:
     def run(self) -> Best:
         """Return the best of all beta and multipliers that the search tries."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
-        at_once = [
-            np.concatenate([eta * largest_beta(self.sweep.loop, self.high), start, [self.high]]) for eta in _ETAS
-        ]
+        at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
             self.cut(x)
         x, best, bound = at_once[1], Best(self.high, 0.0, (), self.sweep.usual), 0.0
@@ -461,14 +532,14 @@ class _Search:
             except DesignFailed:
                 break
             bound = max(bound, float(x[-1]))
-            x[-1] = max(x[-1], self.sweep.floor(x[: self.m]))
+            x[-1] = max(x[-1], self.sweep.floor(self.beta(x)))
         if candidate is not None:
             best = min(best, self.swept(candidate))
         return best._replace(bound=min(bound, best.share)) if best.beta else best._replace(share=np.inf)
 
     def swept(self, x: Array) -> Best:
         """Return the share of beta and multipliers of x, rounded, by a refined sweep."""
-        beta = tuple(float(f"{b:.{_DIGITS}g}") for b in x[: self.m])
+        beta = tuple(float(f"{b:.{_DIGITS}g}") for b in self.beta(x))
         values = tuple(float(f"{v:.{_DIGITS}g}") for v in self.values(x))
         return Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
 
@@ -498,12 +569,12 @@ class _Search:
         """Return the x of least share under the tangents. Raises DesignFailed."""
         sweep, m = self.sweep, self.m
         weights = np.where(self.inverse, 1 / least, 1.0)
-        unit = np.concatenate([largest_beta(sweep.loop, least), weights, [least]])
+        unit = np.concatenate([self.largest(least), weights, [least]])
         last = unit.size - 1
         constant, slopes = (np.concatenate(part, axis=-3) for part in zip(*self.tangents, strict=True))
         blocks = [Inequality(constant, slopes * unit[:, None, None, None], range(unit.size))]
-        lowest = _LEAST_ETA * largest_beta(sweep.loop, self.high)
-        low, top = np.append(lowest, self.low), np.append(_LARGEST_ETA * sweep.highest, self.top)
+        lowest, highest = _LEAST_ETA * self.largest(self.high), sweep.loop.per_device(sweep.highest)
+        low, top = np.append(lowest, self.low), np.append(_LARGEST_ETA * highest, self.top)
         for sign, ends in ((1, low / unit[:last]), (-1, -top / unit[:last])):
             rows = sign * np.eye(last, unit.size)[:, :, None, None].swapaxes(0, 1)
             blocks.append(Inequality(-ends[:, None, None], rows, range(unit.size)))
@@ -579,8 +650,6 @@ class KnownDevice(Condition):
     def beyond(self, loop: Loop) -> str | None:
         if not loop.known_devices:
             return _NONE
-        if loop.levels:
-            return f"levels: {self.name} {FULL_LEVELS}"
         if loop.latency:
             return _LATE
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
@@ -597,20 +666,26 @@ class KnownDevice(Condition):
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
-        """Return the demand of a map of `plain`, in any arithmetic."""
-        return compose(G, loop, self.facts(loop), values, hands=hands)
+        """Return the demand of a `map`, in any arithmetic."""
+        return compose(G, straightened(loop), self.facts(loop), values, hands=hands)
+
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        """Return the map of `plain` in principal axes of the levels."""
+        return _turned(self.plain.map(loop, coupling, exact), loop)
 
     def sweep(self, loop: Loop, coupling: Coupling) -> Sweep:
         """Return the sweep of all environments of the loop. Raises SingularLoop."""
-        maps = [self.plain.map(each, coupling) for each in self._loops(loop)]
+        maps = [self.map(each, coupling) for each in self._loops(loop)]
         one = loop.at(loop.environment)
-        return Sweep(one, maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop))
+        return Sweep(
+            straightened(one), maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop)
+        )
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """Return the block at the loop's own damping; it does not scale with s."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
-        m = loop.channels
+        m, straight = loop.channels, straightened(loop)
         beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
         own, unknowns = tuple(multiplier[3 * m :]), self.unknowns(loop)
         if not any(beta):
@@ -620,11 +695,11 @@ class KnownDevice(Condition):
             each.check(values[each.name])
         if exact:
             rationals = [[rational(v) for v in part] for part in (beta, below, above)]
-            check_q(loop, *rationals)
-            hands = KnownMotor(exact_cost(loop, *rationals), rationals[0])
+            check_q(straight, *rationals)
+            hands = KnownMotor(exact_cost(straight, *rationals), rationals[0])
         else:
-            hands = KnownMotor(period_cost(loop, 1.0, np.array(beta, dtype=float)), beta)
-        G = self.plain.map(loop, coupling, exact)
+            hands = KnownMotor(period_cost(straight, 1.0, np.array(beta, dtype=float)), beta)
+        G = self.map(loop, coupling, exact)
         if exact:
             require_size(G.order + sum(loop.delays.hi) + 2 * m)
         return self.form(G, loop, values, hands)
@@ -651,7 +726,7 @@ class KnownDevice(Condition):
             return plain
         bounds = (0.0,) * 2 * m
         if suffices(best.share):
-            below, above = q_bounds(loop, [rational(b) for b in best.beta])
+            below, above = q_bounds(straightened(loop), [rational(b) for b in best.beta])
             bounds = below + above
         requirement = from_ratio(self.name, best.share, loop.delta, best.w / (2 * np.pi * loop.T))
         return replace(requirement, multiplier=(*best.beta, *bounds, *best.values))
@@ -660,6 +735,9 @@ class KnownDevice(Condition):
         """Return the requirement with the beta and multipliers in `multiplier`."""
         m = loop.channels
         beta, own, sweep = np.array(multiplier[:m]), multiplier[3 * m :], self.sweep(loop, coupling)
+        if (loop.per_device(beta) < -loop.per_device(-beta)).any():
+            reason = f"beta is {beta.tolist()} s, expected one value for all axes of a device"
+            return replace(refusal(self.name, loop.delta, reason), multiplier=multiplier)
         for i, each in enumerate(self._loops(loop)):
             demand = sweep.idle(i, beta, own)
             if reason := unsound(demand.free, loop.delta) or self.plain.unsound_static(sweep.maps[i], each, demand):
@@ -694,7 +772,7 @@ class KnownDevice(Condition):
         Shares between _LEAST_DRAWN and that of the plain condition are tried with the betas of _DRAWN, the same part of
         the largest beta on every channel. The grid is coarse because a map needs thousands of couplings.
         """
-        plain = self.plain.ratios(loop, coupling)
+        plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):
             return plain if plain is None else np.full(plain.size, np.inf)
         holds = self._drawn(loop, coupling, plain.size)
@@ -779,7 +857,7 @@ class _KnownDeviceAny(KnownDevice):
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
-        return compose_any(G, loop, self.facts(loop), values, hands=hands)
+        return compose_any(G, straightened(loop), self.facts(loop), values, hands=hands)
 
     def sampled(self, loop: Loop, coupling: Coupling, z: Complex) -> Sampled:
         return coupling.sampled(z, loop.T)

@@ -134,7 +134,7 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
     `proved` is the requirement of known-device, if it is known already.
     """
-    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
+    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.levels or loop.T_max not in (None, loop.T):
         return None
     equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
     if walls and not equal:

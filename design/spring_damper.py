@@ -407,8 +407,8 @@ def _stiffest_known(loop: Loop) -> Design:
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
     started, gains = time.perf_counter(), []
-    for i in range(loop.channels):
-        gains.append(_stiffest_channel(loop.channel(i)))
+    for own in loop.devices:
+        gains += _stiffest_device([loop.channel(i) for i in range(own.start, own.stop)])
     K, B = zip(*gains, strict=True)
     coupling = SpringDamper(K, B)
     requirement = KNOWN_DEVICE_ANY.judge(loop, coupling)
@@ -419,19 +419,23 @@ def _stiffest_known(loop: Loop) -> Design:
     return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", float(sum(K)), requirement, 0, wall_s)
 
 
-def _stiffest_channel(loop: Loop) -> tuple[float, float]:
-    """Return K [N/m] and B [N s/m] of the stiffest spring-damper for any environment, with a design's reserve."""
+def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
+    """Return K [N/m] and B [N s/m] of each axis of a device, stiffest before any environment, with a design's reserve.
+
+    All axes have one beta.
+    """
     from scipy.optimize import minimize_scalar  # slow to load
 
     z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))
-    steps = np.abs(1 - 1 / z) ** 2 / loop.T
+    T = axes[0].T
+    steps = np.abs(1 - 1 / z) ** 2 / T
 
     def stiffest(B: float, limits: Array) -> float:
         """Return the largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, or 0.
 
         |1/D|^2 steps = T, and the real part of 1/D is T/2.
         """
-        a, b = limits * loop.T, (limits * steps * B - 0.5) * loop.T
+        a, b = limits * T, (limits * steps * B - 0.5) * T
         c = limits * steps * B**2 - B
         room = b**2 - 4 * a * c
         if (room < 0).any():
@@ -440,21 +444,30 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
         high, low = ((-b + sign * root) / (2 * a) for sign in (1, -1))
         return float(high.min()) if low.max() <= high.min() else 0.0
 
-    def at(eta: float) -> tuple[float, float]:
-        """Return (-K, B) of the best B for this share of the largest beta."""
-        beta = eta * largest_beta(loop, 1 - _STIFF_RESERVE)
-        cost = period_cost(loop, np.full(z.size, 1 - _STIFF_RESERVE), beta)
-        limits = _chi(z, loop.theta, cost, beta)[:, 0]
-        most = 1 / (limits * steps).max()
-        optimum = minimize_scalar(lambda B: -stiffest(B, limits), bounds=(0.0, most), method="bounded")
-        return float(optimum.fun), float(optimum.x)
+    def at(eta: float) -> tuple[float, list[tuple[float, float]]]:
+        """Return (-sum of K, gains) of the best B of every axis for this share of the largest beta."""
+        gains = []
+        for limits in _limits(axes, eta, z, _STIFF_RESERVE):
+            most = 1 / (limits * steps).max()
+            optimum = minimize_scalar(
+                lambda B, limits=limits: -stiffest(B, limits), bounds=(0.0, most), method="bounded"
+            )
+            gains.append((-float(optimum.fun), float(optimum.x)))
+        return -sum(K for K, _ in gains), gains
 
     tried = [at(eta) for eta in _ETAS]
     best = int(np.argmin([value for value, _ in tried]))
     ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
     optimum: Any = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6})
-    K, B = min(at(float(optimum.x)), tried[best])
-    return float(f"{-K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")
+    _, gains = min(at(float(optimum.x)), tried[best])
+    return [(float(f"{K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")) for K, B in gains]
+
+
+def _limits(axes: Sequence[Loop], eta: float, z: Complex, reserve: float) -> list[Array]:
+    """Return chi (k,) of each axis of a device for one beta, a share of the largest that all axes allow."""
+    beta = eta * np.min([largest_beta(one, 1 - reserve) for one in axes], axis=0)
+    share = np.full(z.size, 1 - reserve)
+    return [_chi(z, one.theta, period_cost(one, share, beta), beta)[:, 0] for one in axes]
 
 
 _TAPS = 4096  # number of frequencies for the Fourier coefficients of chi
@@ -472,20 +485,19 @@ def _stiffest_linear(loop: Loop) -> Design:
 
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
-    started, channels = time.perf_counter(), []
+    started, channels, each = time.perf_counter(), [], list[Array]()
     z = on_circle(np.linspace(0, 2 * np.pi, _TAPS, endpoint=False))
-    for i in range(loop.channels):
-        one = loop.channel(i)
+    for own in loop.devices:
+        axes = [loop.channel(i) for i in range(own.start, own.stop)]
 
-        def needed(eta: float, one: Loop = one) -> Array:
-            beta = eta * largest_beta(one, 1 - RESERVE)
-            return _chi(z, one.theta, period_cost(one, np.full(z.size, 1 - RESERVE), beta), beta)[:, 0]
+        def needed(eta: float, axes: Sequence[Loop] = axes) -> float:
+            return sum(limits.mean() for limits in _limits(axes, eta, z, RESERVE))
 
-        best = int(np.argmin([needed(eta).mean() for eta in _ETAS]))
+        best = int(np.argmin([needed(eta) for eta in _ETAS]))
         ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-        optimum: Any = minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded")
-        eta = float(optimum.x)
-        limits = needed(eta)
+        optimum: Any = minimize_scalar(needed, bounds=ends, method="bounded")
+        each += _limits(axes, float(optimum.x), z, RESERVE)
+    for limits in each:
         series = np.fft.rfft(limits).real / _TAPS
         left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # sums of the terms from each one on
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))

@@ -12,6 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import msgspec
+import numpy as np
+
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
 from haptic_loop.hw.limits import (
@@ -24,6 +27,7 @@ from haptic_loop.hw.limits import (
     watchdog_for,
 )
 from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
+from haptic_loop.models.device import symmetric
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 _PATIENCE_US = 2_000_000  # a question without an answer is given up after this time
@@ -393,16 +397,30 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
         raise wire.SafetyStop(f"the device is disarmed and applies {state.applied} steps")
 
 
+def axis_by_axis(scenario: Scenario) -> Scenario:
+    """Return the scenario with what INFO can state of a full delta: one number per axis, which lie below the matrix.
+
+    d diag(Delta) <= Delta with the least eigenvalue d of D^-1/2 Delta D^-1/2, D = diag(Delta).
+    """
+    devices = []
+    for device in scenario.device:
+        Delta = symmetric("delta", device.passivity_level, device.axes)
+        own = np.diag(Delta)
+        if (Delta != np.diag(own)).any():
+            share = np.linalg.eigvalsh(Delta / np.sqrt(np.outer(own, own)))[0]
+            level = np.floor(1e6 * share * own) / 1e6  # INFO has uN s/m
+            device = msgspec.structs.replace(device, delta=tuple(level.tolist()))
+        devices.append(device)
+    return scenario.replace(device=tuple(devices)) if devices != [*scenario.device] else scenario
+
+
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
     """Return a session that asks for at most `cap` [N] at the hand.
 
     Raises:
-        InputError: A limit or T is impossible, or the damping of a device is a full matrix, which INFO cannot state.
+        InputError: A limit or T is impossible.
     """
-    if scenario.loop("I").levels is not None:
-        least = ", ".join(f"{d:.3g}" for d in scenario.loop("I").least_damping)
-        advice = f"give delta as numbers below the matrix, {least} are its least eigenvalues"
-        raise InputError(f"delta is a full matrix, but a device states its damping axis by axis: {advice}")
+    scenario = axis_by_axis(scenario)
     if scenario.unit == "rad" and scenario.radius is None:
         raise InputError("radius is missing: give the distance in metres from the axis to the hand, for its limits")
     limits, balls = scenario.limiter_limits

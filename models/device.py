@@ -25,6 +25,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m]
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a matrix: far below any device's, and above the rounding of the largest ones
 AXES = ("x", "y", "z")
 
 #: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
@@ -51,8 +52,12 @@ def symmetric(field: str, value: Any, axes: int) -> _Matrix:
         shape = f"{axes} numbers or {axes} rows of {axes} numbers"
         raise ValueError(f"{field} is {_listed(value)}, expected one number, {shape}")
     matrix = np.array(rows, dtype=float)
-    if not (np.isfinite(matrix).all() and (matrix == matrix.T).all()):
-        raise ValueError(f"{field} is {_listed(value)}, expected a symmetric matrix")
+    for holds, kind in (
+        (np.isfinite(matrix).all(), "finite numbers"),
+        ((matrix == matrix.T).all(), "a symmetric matrix"),
+    ):
+        if not holds:
+            raise ValueError(f"{field} is {_listed(value)}, expected {kind}")
     return matrix
 
 
@@ -295,6 +300,8 @@ def _check_axes(self: Any) -> None:
             raise ValueError(
                 f"clamped names {axis!r}, allowed are {', '.join(names)}: the device has axes = {self.axes}"
             )
+    if len(set(self.clamped)) < len(self.clamped):
+        raise ValueError(f"clamped is {list(self.clamped)}, expected each axis of {', '.join(names)} at most once")
     if len(set(self.clamped)) == self.axes:
         raise ValueError(f"clamped is {list(self.clamped)}, which leaves no axis of {', '.join(names)}")
 
@@ -313,18 +320,17 @@ def _check_damping(self: Any) -> None:
         return
     damping = symmetric("damping", self.damping, self.axes)
     least, most = np.linalg.eigvalsh(damping)[[0, -1]]
-    if not (least > 0 and most <= MOST_DAMPING):
-        range_ = f"eigenvalues in (0, {MOST_DAMPING:g}] N s/m"
+    if not (least >= _LEAST_EIGENVALUE and most <= MOST_DAMPING):
+        range_ = f"eigenvalues in [{_LEAST_EIGENVALUE:g}, {MOST_DAMPING:g}] N s/m"
         raise ValueError(
             f"damping is {_listed(self.damping)} with eigenvalues {least:g} to {most:g}, allowed are {range_}"
         )
     if self.delta is None:
         return
     delta = symmetric("delta", self.delta, self.axes)
-    if not (lowest := np.linalg.eigvalsh(delta)[0]) > 0:
-        raise ValueError(
-            f"delta is {_listed(self.delta)} with the eigenvalue {lowest:g}, expected a positive definite one"
-        )
+    if not (lowest := np.linalg.eigvalsh(delta)[0]) >= _LEAST_EIGENVALUE:
+        expected = f"eigenvalues of at least {_LEAST_EIGENVALUE:g} N s/m"
+        raise ValueError(f"delta is {_listed(self.delta)} with the eigenvalue {lowest:g}, expected {expected}")
     # eigvalsh is exact to a few units in the last place of the largest entry
     if (left := np.linalg.eigvalsh(damping - delta)[0]) < -1e-12 * most:
         raise ValueError(

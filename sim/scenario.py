@@ -793,7 +793,7 @@ def _require_no_along(environment: Any) -> None:
 def _direction(number: int, row: Any) -> list[float]:
     """Return a direction x, y, z of unit length. Raises ValueError."""
     length = 0.0
-    if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) for c in row):
+    if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) and abs(c) < 1e6 for c in row):
         length = float(np.linalg.norm(row))
     if not 1e-6 < length < 1e6:
         raise ValueError(f"environment.along #{number} is {row!r}, expected a direction [x, y, z], not all zero")

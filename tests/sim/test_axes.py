@@ -82,6 +82,14 @@ def rows(matrix: Array) -> str:
     [
         ('clamped = ["x", "y", "z"]', "", ("device #1: clamped", "leaves no axis")),
         ('clamped = ["w"]', "", ("clamped names 'w'", "allowed are x, y, z")),
+        ('clamped = ["y", "y"]', "", ("clamped is ['y', 'y']", "at most once")),
+        ("damping = [[1, nan, 0], [nan, 1, 0], [0, 0, 1]]", "", ("damping is [[1", "finite numbers")),
+        ("damping = [[1, 1, 0], [1, 1.00000000000001, 0], [0, 0, 1]]", "", ("damping is [[1", "eigenvalues in [1e-09")),
+        (
+            "",
+            ', {between = ["left", "ground"], stiffness = 1.0, along = [1e200, 0, 0]}',
+            ("springs #3: along", "[1e+200, 0.0, 0.0]", "below 1e9"),
+        ),
         ("damping = [[1, 0, 0], [0.5, 1, 0], [0, 0, 1]]", "", ("damping is", "symmetric")),
         ("damping = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]", "", ("damping is", "eigenvalues -1 to 3")),
         ("damping = [1, 2]", "", ("damping is [1", "expected one number, 3 numbers or 3 rows")),
