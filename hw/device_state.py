@@ -2,7 +2,8 @@
 
 With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
 
-The machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
+The machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py). There
+are two because a rehearsal must need no compiler, and because each is the other's test.
 docs/protocol.md has its rules. Forces are in steps, per axis, as tuples.
 """
 

@@ -14,23 +14,10 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Self
 
+from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.device_state import RUNNING, Device
 from haptic_loop.hw.emulator import info_of
 from haptic_loop.hw.haptic_device import PortLost
-from haptic_loop.hw.protocol import (
-    NO_MARGIN,
-    Ack,
-    Config,
-    Decoder,
-    Force,
-    Info,
-    Phase,
-    Reason,
-    SafetyStop,
-    State,
-    Stop,
-    encode,
-)
 from haptic_loop.sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # in place of a port
@@ -100,7 +87,7 @@ class ForceDimension:
         self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
         self._sdk.enableExpertMode()  # which the watchdog needs
         self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
-        self._device, self._decoder = Device(self._info), Decoder()
+        self._device, self._decoder = Device(self._info), wire.Decoder()
         self._T = 1e-9 * self._info.period_ns
         self._due = clock()
 
@@ -116,15 +103,15 @@ class ForceDimension:
             if sum(name == used for used, _ in self._where) < 3
         ]
 
-    def info(self) -> Info:
+    def info(self) -> wire.Info:
         """Return INFO; the library does not tell damping and encoder step, so these are the scenario's."""
         return self._info
 
-    def configure(self, config: Config) -> int:
+    def configure(self, config: wire.Config) -> int:
         self._device.configure(config)
         (ack,) = self._decoder.feed(self._device.ack)
         self._device.ack = b""
-        assert isinstance(ack, Ack)
+        assert isinstance(ack, wire.Ack)
         if not ack.refused:
             for index, ID in self._ids.items():
                 self._heeded(self._sdk.setMaxForce(self._strongest(config, index), ID=ID))
@@ -132,11 +119,11 @@ class ForceDimension:
             self._write(self._device.zero)
         return ack.refused
 
-    def exchange(self, force: Force | None) -> State | None:
+    def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
-            self._device.receive(encode(force), came := self._now())
+            self._device.receive(wire.encode(force), came := self._now())
             self._write(self._device.applied)
-            if self._device.margin != NO_MARGIN:  # of a force that acts: writing it takes time
+            if self._device.margin != wire.NO_MARGIN:  # of a force that acts: writing it takes time
                 self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
         while (left := self._due - self._clock()) > 0:
             self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
@@ -148,11 +135,11 @@ class ForceDimension:
         _, out = self._device.tick(self._now(), self._counts())
         if self._device.applied != before or force is None:
             self._write(self._device.applied)
-        return next((m for m in self._decoder.feed(out) if isinstance(m, State)), None)
+        return next((m for m in self._decoder.feed(out) if isinstance(m, wire.State)), None)
 
-    def stop(self, reason: Reason) -> None:
-        self._device.receive(encode(Stop(reason)), self._now())
-        if self._device.phase == Phase.ESTOP:
+    def stop(self, reason: wire.Reason) -> None:
+        self._device.receive(wire.encode(wire.Stop(reason)), self._now())
+        if self._device.phase == wire.Phase.ESTOP:
             self._write(self._device.zero)
 
     def __enter__(self) -> Self:
@@ -175,7 +162,7 @@ class ForceDimension:
         steps = zip(self._where, self._info.encoder_step, strict=True)
         return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
 
-    def _strongest(self, config: Config, index: str) -> float:
+    def _strongest(self, config: wire.Config, index: str) -> float:
         """Return the length [N] of the largest force that a device may be asked for, plus 1 % for rounding."""
         each = enumerate(zip(self._where, config.cap, self._info.force_step, strict=True))
         caps = {i: 1e-6 * cap * step for i, ((own, _), cap, step) in each if own == index and i not in self._shared}
@@ -196,7 +183,7 @@ class ForceDimension:
                 cause = self._sdk.ForceOffCause(status.forceoffcause).name.lower()
                 troubles[f"has switched its forces off, cause {cause}"] = 1
             if wrong := next((words for words, there in troubles.items() if there), None):
-                raise SafetyStop(f"device {index} {wrong}")
+                raise wire.SafetyStop(f"device {index} {wrong}")
 
     def _write(self, steps: tuple[int, ...]) -> None:
         forces = {index: [0.0, 0.0, 0.0] for index in self._ids}

@@ -24,7 +24,7 @@ from haptic_loop.hw.control import Controller
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction, friction
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session
-from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, viscosity
+from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, starts, viscosity
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
@@ -217,7 +217,7 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
         return spectrum.error(np.append(p, 0.0), 1.0)  # without memory
 
     how: dict[str, Any] = {"bounds": (_LEAST, np.inf), "x_scale": "jac", "max_nfev": _STEPS}
-    fits = [scipy.optimize.least_squares(error, start[:7], **how) for start in spectrum.starts(found)]
+    fits = [scipy.optimize.least_squares(error, start[:7], **how) for start in starts([spectrum], found)]
     fit = min(fits, key=lambda fit: fit.cost)
     if 2 * fit.cost > (_VAGUE * np.linalg.norm(spectrum.motion) / np.abs(spectrum.motion).max()) ** 2:
         return None

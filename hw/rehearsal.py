@@ -97,16 +97,13 @@ class _Cable:
             rehearsal.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
         rehearsal.at(now + self.period * emulator.stretch, self.tick)
         if emulator.unplugged and not self.gone:
-            rehearsal.at(now + rehearsal.latency_us, self._unplug)
+            rehearsal.at(now + rehearsal.latency_us, partial(setattr, self, "gone", True))
         for when, part in self.up.send(data, now, emulator.since_armed(clock)) if data else []:
             rehearsal.at(when, partial(self._hear, part))
         return None
 
     def _hear(self, data: bytes) -> None:
         self.data += data
-
-    def _unplug(self) -> None:
-        self.gone = True
 
     def _deliver(self, data: bytes) -> None:
         self.emulator.receive(data, round(self.rehearsal.now))
@@ -358,19 +355,9 @@ def rehearse(
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[(seconds, stop)])
     rehearsal.run_until_armed(seconds + 0.5)
-    return _outcome(rehearsal, recorder, programs, delays, stopped)
-
-
-def _outcome(
-    rehearsal: Rehearsal,
-    recorder: Recorder,
-    programs: list[CertifiedCoupling],
-    delays: list[float],
-    stopped: list[float],
-) -> Rehearsed:
-    session, first = rehearsal.session, programs[0] if programs else None
-    scenario, ran = session.scenario, rehearsal.armed_us is not None
+    first, ran = programs[0] if programs else None, rehearsal.armed_us is not None
     meta = {"scenario": scenario.name, "scenario_digest": scenario.digest, "stage": str(session.stage)}
+    ticks = ran and len(recorder)
     return Rehearsed(
         stage=str(session.stage),
         cause=session.cause,
@@ -379,8 +366,6 @@ def _outcome(
         latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
         assessment=first and first.assessment,
-        result=recorder.trace(session.units, scenario.T, meta, scenario.channel_names)
-        if ran and len(recorder)
-        else None,
+        result=recorder.trace(session.units, scenario.T, meta, scenario.channel_names) if ticks else None,
         zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )

@@ -17,15 +17,7 @@ import numpy as np
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
-from haptic_loop.hw.limits import (
-    DRIVING,
-    ENDED,
-    SafetyLimits,
-    Stage,
-    Units,
-    probe_delay,
-    watchdog_for,
-)
+from haptic_loop.hw.limits import DRIVING, ENDED, SafetyLimits, Stage, Units, probe_delay, watchdog_for
 from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.models.device import symmetric
 from haptic_loop.sim.scenario import InputError, Scenario, is_world

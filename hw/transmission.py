@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction
-from haptic_loop.hw.viscosity import Spectra
+from haptic_loop.hw.viscosity import Spectra, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, an encoder of 5 um sees nothing of 1 N
 _TOLD = 0.01  # part of the motion to which the model is held; and the encoder's noise
 _UNEXPLAINED = 2.5  # times both: play and presliding friction leave 3 to 6, ideal rigs 1, dry friction up to 2.1
 _GROUPS = 5  # of a record's frequencies, which are left out in turn
 _SIGMAS, _SCALE = 2.0, 0.005
-_MODES_HZ, _PARTS = np.geomspace(20.0, 250.0, 30), (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mode and the motor's mass
 _WITHIN = (2.0, 0.85)  # times the lowest and the highest frequency heard, between which the clamped mode must lie
 _STEPS = 60  # of a fit
 _LATE = 0.05  # [T] that a force may be late: no proof covers a current loop that is slower
@@ -73,19 +72,6 @@ class _Joint:
         how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "loss": "soft_l1", "max_nfev": _STEPS}
         return scipy.optimize.least_squares(error, np.clip(start, low + 1e-13, high - 1e-13), **how).x
 
-    def start(self, friction: Friction) -> Array:
-        """Return the split of the mass and the clamped mode that explain the spectra's sizes best."""
-        tried = []
-        for part in _PARTS:
-            for hz in _MODES_HZ:
-                m1 = part * friction.mass
-                k = (2 * np.pi * hz) ** 2 * m1
-                masses = np.log([m1, friction.mass - m1, k, 0.05 * np.sqrt(k * m1)])
-                p = np.array([*masses, max(friction.viscous, 1e-3), 1e-5, 0.0])
-                sizes = (np.log(np.abs(r.model(np.append(p, 0.0), 1.0) / r.motion)) for r in self.records)
-                tried.append((float(sum(np.abs(size).mean() for size in sizes)), len(tried), p))
-        return min(tried)[2]
-
 
 def transmission_bounds(
     free: tuple[Array, Array],
@@ -108,7 +94,7 @@ def transmission_bounds(
         dry = dry_friction(lever * x, T, friction)
         records.append(Spectra(lever * x, force / lever - dry, T, held, _BAND_HZ))
     joint, everything = _Joint(records, lever * step), [np.ones(r.hz.size, dtype=bool) for r in records]
-    p = joint.fitted(joint.start(friction), everything)
+    p = joint.fitted(starts(records, friction, clamped=True)[0][:7], everything)
     for r, error in zip(records, joint.errors(p), strict=True):
         if (rms := float(np.sqrt(np.mean(np.abs(error) ** 2)))) > _UNEXPLAINED:
             which = "clamped" if r.held else "free"

@@ -101,7 +101,7 @@ def preflight(paths: Sequence[str]) -> str:
 
     It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
     """
-    checks = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _clock_source(), _stalls()
+    checks = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _stalls()
     return "pre-flight: " + "; ".join(checks)
 
 
@@ -135,16 +135,6 @@ def _latency_timer(path: str) -> str:
     except (OSError, ValueError):
         return "no latency timer"
     return f"latency timer {ms} ms" + (f" (setserial {path} low_latency)" if ms > 1 else "")
-
-
-def _clock_source() -> str:
-    try:
-        with open("/sys/devices/system/clocksource/clocksource0/current_clocksource") as file:
-            source = file.read().strip()
-    except OSError:
-        return "clock source unknown"
-    fast = source in ("tsc", "kvm-clock", "arch_sys_counter")
-    return f"clock {source}" + ("" if fast else " (slow to read; a kernel that trusts its tsc is better)")
 
 
 def _worst_stall() -> float:

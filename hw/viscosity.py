@@ -18,6 +18,7 @@ because the encoder is coarse, it does not credit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
@@ -38,8 +39,8 @@ _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 u
 _LOUD = 0.05  # part of the strongest force in the band that a frequency must have
 _POINTS = 200  # frequencies at which a fit begins
 _ALIASES = (-1, 0, 1)  # sampling adds what is whole multiples of 1/T away; the next are below 1e-3
-_MODES_HZ = np.geomspace(25.0, 300.0, 40)  # where a transmission's mode is looked for first
-_PARTS = (0.15, 0.3, 0.5)  # of the mass, that the motor may have
+_MODES_HZ = np.geomspace(20.0, 300.0, 40)  # where a transmission's mode is looked for first
+_PARTS = (0.15, 0.3, 0.5, 0.65)  # of the mass, that the motor may have
 _STEPS = 30  # of a fit
 _VAGUE = 3.0  # standard deviation of a logarithm before the record is seen
 _B, _C = 4, 7  # places of b and c among the parameters
@@ -170,16 +171,20 @@ class Spectra:
         error = self.motion - self.model(p, tau, end)
         return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
 
-    def starts(self, friction: Friction) -> list[Array]:
-        """Return initial parameters: the two splits of the mass that explain the spectrum's size best."""
-        tried = []
-        for hz, part in product(_MODES_HZ, _PARTS):
-            m1, m2 = part * friction.mass, (1 - part) * friction.mass
-            k = (2 * np.pi * hz) ** 2 * m1 * m2 / friction.mass
-            p = np.array([*np.log([m1, m2, k, 0.02 * np.sqrt(k * m2)]), max(friction.viscous, 1e-3), 1e-5, 1e-5, 0.0])
-            size = np.log(np.abs(self.model(p, 1.0)) + 1e-15) - np.log(np.abs(self.motion) + 1e-15)
-            tried.append((float(np.abs(size).mean()), len(tried), p))
-        return [p for *_, p in sorted(tried)[:2]]
+
+def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False) -> list[Array]:
+    """Return initial parameters: the two splits of the mass and modes that explain the spectra's sizes best.
+
+    The modes that are tried are those of a free handle, or of a `clamped` one.
+    """
+    tried = []
+    for hz, part in product(_MODES_HZ, _PARTS):
+        m1, m2 = part * friction.mass, (1 - part) * friction.mass
+        k = (2 * np.pi * hz) ** 2 * m1 * (1.0 if clamped else m2 / friction.mass)
+        p = np.array([*np.log([m1, m2, k, 0.03 * np.sqrt(k * m1)]), max(friction.viscous, 1e-3), 1e-5, 1e-5, 0.0])
+        sizes = (np.log(np.abs(each.model(p, 1.0) / each.motion) + 1e-15) for each in spectra)
+        tried.append((float(sum(np.abs(size).mean() for size in sizes)), len(tried), p))
+    return [p for *_, p in sorted(tried)[:2]]
 
 
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
@@ -207,8 +212,8 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
         how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
         return scipy.optimize.least_squares(partial(error_of, spectra, tau or 1.0), begin, **how)
 
-    starts = [np.insert(start, _C, 0.0) for start in few.starts(friction)]
-    rough = min((fitted(few, start) for start in starts), key=lambda fit: fit.cost)
+    begins = [np.insert(start, _C, 0.0) for start in starts([few], friction)]
+    rough = min((fitted(few, start) for start in begins), key=lambda fit: fit.cost)
     plain = fitted(every, rough.x)
     left, points = plain.fun, len(every.force)
     noise = np.sqrt(float(left @ left) / len(left))
@@ -234,7 +239,7 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
         jacobian[:, _C] = (error_of(every, tau, bent) - left) / step
         change, spread, squares = linear(jacobian, left)
         b, c = float(plain.x[_B] + min(change[_B], 0.0)), float(change[_C])
-        tried = [_split(start, friction.viscous) for start in (plain.x, starts[0])]
+        tried = [_split(start, friction.viscous) for start in (plain.x, begins[0])]
         if unsure := abs(c) + _QUANTILE * spread[_C] > _MUCH * plain.x[_B]:
             tried.append(plain.x + change)
         near = min((fitted(few, start, tau) for start in tried), key=lambda fit: fit.cost)

@@ -23,7 +23,7 @@ from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Viscosity
 from haptic_loop.models.device import RigidDevice
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
@@ -294,23 +294,13 @@ def test_undetectable_hands_add_no_damping(odd):
 
 def test_damping_in_one_sitting_is_refused(tmp_path):
     """In virtual time, a dashpot of 0.3 N s/m at the handles in the first one: two records of three agree."""
+    one = tmp_path / "one.toml"
+    text = (SCENARIOS / "one-wall.toml").read_text()
+    one.write_text(text.replace('kind = "compliant"', 'kind = "rigid"\nmass = 0.25'))
     for sittings, code in ((2, 1), (3, 0)):
-        out, options = tmp_path / str(sittings), ["--rehearse", "--scenario", "omega-pair-rigid", "--measure", "60"]
-        options += [
-            "--seconds",
-            "0.8",
-            "--travel",
-            "8",
-            "--coulomb",
-            "0.02",
-            "--hand",
-            "0.3",
-            "--sittings",
-            str(sittings),
-            "--out",
-            str(out),
-        ]
-        assert identify_command(options) == code
+        out = tmp_path / str(sittings)
+        options = f"--rehearse --scenario {one} --measure 60 --seconds 0.8 --travel 8 --coulomb 0.02 --hand 0.3"
+        assert identify_command([*options.split(), "--sittings", str(sittings), "--out", str(out)]) == code
         report = json.loads((out / "report.json").read_text())
         assert report["bounded"] == (code == 0) == (out / "devices.toml").exists()
         assert len(report["sittings"]) == sittings
@@ -404,22 +394,21 @@ def test_bounds_hold_wherever_the_encoder_stands(coarse):
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):
         x = step * np.round(exact / step + origin)
-        found = identify(x, force, T, step, rigid=True)
-        assert 0.98 * 0.5 < found.friction.delta <= 0.5
+        found = friction(x, force, T, step)
+        assert 0.98 * 0.5 < found.delta <= 0.5
         assert found.viscous == pytest.approx(0.5, rel=0.01)
 
 
 def test_a_bound_never_exceeds_what_is_declared(coarse):
     T, step, force, exact = coarse
     x = step * np.round(exact / step)
-    found = identify(x, force, T, step, rigid=True)
+    found = Estimate(friction(x, force, T, step), None, Viscosity(0.5, 0.0, 0.0, 0.5, 1e-3, False))
     scenario = load("omega-pair-rigid")
     little = msgspec.structs.replace(scenario.device[0], damping=0.48, delta=None)
     scenario = scenario.replace(device=(little, little), delta=(0.48, 0.48))
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
     assert held([found], scenario, session) == []  # 4 % more than declared is not yet a hand
     assert found.friction.delta > 0.48
-    found = replace(found, viscosity=replace(found.viscosity, lasting=0.5))
     assert [e.delta for e in capped([found], scenario, session)] == [0.48]
 
 
