@@ -282,20 +282,12 @@ class Walls(Fact):
     """Walls that make and break contact, by the law of each wall at every tick, with multipliers a, c, d, m.
 
     The inputs of a wall are u, the step of the depth h, and for a wall with a damper s >= 0, which is positive only
-    when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z). With `stiff`
-    the block is that of a wall of k + 2b without a damper, and covers every softer wall.
+    when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
     """
-
-    def __init__(self, stiff: bool = False) -> None:
-        self.stiff = stiff
 
     def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:
         """Return (k, b) of every wall [N/m]; b is the damping divided by T."""
-        each = []
-        for wall in loop.environment.walls:
-            k, b = numbers(wall.stiffness, T), numbers(wall.damping, T) / T
-            each.append((k + 2 * b, 0 * b) if self.stiff else (k, b))
-        return each
+        return [(numbers(wall.stiffness, T), numbers(wall.damping, T) / T) for wall in loop.environment.walls]
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         laws = self.laws(loop, loop.T)
