@@ -1,4 +1,4 @@
-"""The nonlinear equations of a tick: complementarity problems of walls and of force limits, each with one solution."""
+"""The nonlinear equations of a tick: complementarity problems of walls and force limits, with a unique solution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 
 _LEAST_MINOR = 1e-12  # a smaller principal minor of a matrix with unit diagonal counts as zero
-_MOST_CANDIDATES = 27  # active sets that are enumerated (three channels, or two with a wall); pivoting beyond
+_MOST_CANDIDATES = 27  # largest number of active sets to enumerate (three channels, or two with a wall)
 GROUNDED = 1e-10  # regularisation of a singular matrix for pivoting, relative to its largest diagonal entry
 PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of its difference
 
@@ -62,7 +62,7 @@ class Complementarity(_Problem):
 
     @cached_property
     def _candidates(self) -> Array:
-        """The maps from q to p for every set of pushing walls, stacked, (2^w w, w)."""
+        """The stacked maps (2^w w, w) from q to p, one for every set of walls in contact."""
         w, maps = len(self.M), []
         for pushing in itertools.product((False, True), repeat=w):
             chosen = np.ix_(pushing, pushing)
@@ -79,8 +79,8 @@ class Complementarity(_Problem):
 class BoxProblem(_Problem):
     """f = q - M v with lower <= f <= upper, v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
 
-    If M is a P-matrix, there is exactly one solution for every q. Active sets on which M is singular (an environment
-    that nothing holds) are skipped, since f is unique nevertheless.
+    If M is a P-matrix, there is exactly one solution for every q. Active sets on which M is singular, as for an
+    environment without a connection to ground, are skipped. f is still unique then.
 
     Raises:
         SingularLoop: A principal minor of M is negative.
@@ -126,10 +126,11 @@ class BoxProblem(_Problem):
 
     @cached_property
     def _candidates(self) -> tuple[Array, ...]:
-        """For each of c active sets: its signs, and the affine maps from q to (v, f) and from q to the slack.
+        """The signs of c active sets, and the affine maps from q to (v, f) and from q to the slack of each set.
 
-        The shapes are (c, n, 1), (c, 2n, n), (c, 2n, 1), (c 2n, n), (c 2n, 1). The tuple is empty if there are too many
-        sets. The slack is nonnegative if v has the sign of its limit and every free force is within both limits.
+        The shapes are (c, n, 1), (c, 2n, n), (c, 2n, 1), (c 2n, n), (c 2n, 1). The tuple is empty if there are more
+        than _MOST_CANDIDATES sets. The slack is nonnegative if v has the sign of its limit and every free force is
+        within both limits.
         """
         n, diagonal, one = len(self.M), self._diagonal[:, 0], np.eye(len(self.M))
         kinds = [
@@ -159,7 +160,7 @@ class BoxProblem(_Problem):
         return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
     def _listed(self, q: Array) -> tuple[Array, Array]:
-        """Return (v, f) of the active set with the largest slack: that of the solution is negative by rounding only."""
+        """Return (v, f) of the active set with the largest slack, since only the solution's is nonnegative."""
         signs, by_q, by_one, room, room_one = self._candidates
         n, k = q.shape
         best = (room @ q + room_one).reshape(len(signs), 2 * n, k).min(axis=1).argmax(axis=0)
@@ -169,11 +170,11 @@ class BoxProblem(_Problem):
         return v, np.minimum(np.maximum(f, self.lower[:, None]), self.upper[:, None])
 
     def _pivoted(self, q: Array) -> Array:
-        """Solve for v by principal pivoting: all wrong limits at once, and only the first one if that cycles.
+        """Solve for v by principal pivoting: change all wrong signs at once, or only the first one if that cycles.
 
-        Pivoting on the first wrong index ends for every P-matrix M. Index n is pivoted only when all others are right
-        for it. Uniqueness then shows on which side of its limit the solution lies, so that n takes each of its three
-        states at most once. The same holds for n - 1 in between, and so on.
+        Changing only the first wrong sign ends for every P-matrix M. Index n changes only if all others are right for
+        its present sign. By uniqueness index n then has each of its three signs at most once. Between two changes of
+        index n the same holds for index n - 1, and so on.
         """
         n, k = q.shape
         M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
@@ -203,7 +204,10 @@ class BoxProblem(_Problem):
 
 
 def magnitudes(force: Array, balls: Sequence[int]) -> Array:
-    """Return |f| of the vector that each entry of forces (.., m, nsim) belongs to; `balls` are the sizes of vectors."""
+    """Return the length of the vector to which each entry of forces (.., m, nsim) belongs.
+
+    `balls` are the numbers of entries of the vectors; without them every entry is a vector.
+    """
     if not balls:
         return np.abs(force)
     starts = np.concatenate([[0], np.cumsum(balls)[:-1]]).astype(int)
@@ -221,10 +225,11 @@ def _within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
 class BallProblem(_Problem):
     """f = q - M v with f in a product of balls, and v along the outward normal where f is on the sphere, else 0.
 
-    There is one solution for every q where M is block triangular over the vectors, in some order, and its diagonal
-    blocks have a positive definite symmetric part. Blocks are solved one after the other: a semismooth Newton iteration
-    in u = f + v tau, which begins with the radial scaling of q, and behind it a bisection for a single vector or an
-    iteration of Douglas and Rachford for several. What these do not solve to `_RESIDUAL` gets f = 0 and is counted.
+    The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
+    diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in
+    u = f + v tau, which starts from the radial scaling of q. If it fails, a single vector is found by bisection, and
+    several vectors by an iteration of Douglas and Rachford. If these leave more than `_RESIDUAL`, f is set to 0, and
+    the failure is counted.
 
     Raises:
         SingularLoop: A block's symmetric part has a negative eigenvalue.
@@ -241,7 +246,7 @@ class BallProblem(_Problem):
 
     @cached_property
     def blocks(self) -> list[_BallBlock]:
-        """The blocks of M in the order in which they are solved: each after those that act on it."""
+        """The blocks of M in the order of their solution: each comes after the blocks that act on it."""
         owner = np.repeat(np.arange(len(self.balls)), self.balls)
         joined = np.zeros((len(self.balls),) * 2, dtype=bool)
         np.logical_or.at(joined, (owner[:, None], owner[None]), self.M != 0)
@@ -267,9 +272,10 @@ class BallProblem(_Problem):
         return v, f
 
 
-_RESIDUAL = 1e-12  # of the limit
-_NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # iterations
-_FULL, _SHARES = 10, (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # full Newton steps; shares of later ones that are tried
+_RESIDUAL = 1e-12  # allowed residual, relative to the limit
+_NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # largest numbers of iterations
+_FULL = 10  # number of full Newton steps
+_SHARES = (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # lengths of later Newton steps, of which the best one is taken
 _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its terms
 
 
@@ -286,7 +292,7 @@ class _BallBlock:
         if least < -GROUNDED:
             rows = (at + 1).tolist()
             raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
-        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # f is unique nevertheless
+        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # regularised; f is unique without it, too
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
         self._by_tau, self.tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)
@@ -303,7 +309,7 @@ class _BallBlock:
         return (u - f) / self.tau, f
 
     def solve(self, q: Array) -> tuple[Array, Array, int]:
-        """Return (v, f) for every column of q, and of how many none was found."""
+        """Return (v, f) for every column of q, and the number of columns without a solution."""
         if self._radial:
             return *self._of(q), 0
         u = self._newton(q.copy(), q)
@@ -311,8 +317,8 @@ class _BallBlock:
         left = np.flatnonzero(self._missing(v, f, q))
         if not left.size:
             return v, f, 0
-        behind = self._bisected if len(self.balls) == 1 else self._split
-        v[:, left], f[:, left] = behind(q[:, left])
+        fallback = self._bisected if len(self.balls) == 1 else self._split
+        v[:, left], f[:, left] = fallback(q[:, left])
         lost = np.flatnonzero(self._missing(v, f, q))
         v[:, lost], f[:, lost] = self._inverse @ q[:, lost], 0.0
         return v, f, lost.size
@@ -345,7 +351,7 @@ class _BallBlock:
         return u
 
     def _bisected(self, q: Array) -> tuple[Array, Array]:
-        """Solve for one vector: f = (I + lam M)^-1 q with the length of the limit; its length falls with lam."""
+        """Solve for one vector by bisection: |f| = limit for f = (I + lam M)^-1 q, whose length decreases with lam."""
         one, limit = np.eye(len(q)), self.limit[0]
         excess = np.linalg.norm(q, axis=0) / limit - 1
         low, high = excess / np.linalg.norm(self.M, 2), excess / np.linalg.eigvalsh((self.M + self.M.T) / 2)[0]
@@ -361,7 +367,7 @@ class _BallBlock:
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
-        """Solve by Douglas and Rachford's iteration, which converges for every monotone M; end by Newton steps."""
+        """Solve by the Douglas-Rachford iteration, which converges for every monotone M, with final Newton steps."""
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):

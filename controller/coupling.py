@@ -21,7 +21,7 @@ from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sam
 
 _LARGEST_COEFFICIENT = 1e12  # largest coefficient of a stored coupling, SI units
 _MOST_TERMS = 2000  # longest moving average; each term is a state
-_ROUNDING = 1e-12  # that a damping matrix may miss of being semidefinite, relatively
+_ROUNDING = 1e-12  # largest negative eigenvalue of a damping matrix, relative to its largest entry
 _LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in the sweep
 _Rows = tuple[tuple[float, ...], ...]
 
@@ -44,7 +44,7 @@ class Coupling:
         """
         V = self.compliance(environment.T)
         if V is None:
-            raise ValueError(f"a coupling of class {type(self).__name__} has no compliance(T): define it")
+            raise ValueError(f"a coupling of class {type(self).__name__} has no compliance(T): define this method")
         if isinstance(environment, Lti):
             contacts = environment.inputs - further
             if (V.outputs, V.inputs) != (contacts, environment.outputs - further):
@@ -54,7 +54,7 @@ class Coupling:
         return environment.feedback(as_like(environment, V))
 
     def compliance(self, T: Number) -> Lti | None:
-        """Return V(z) in the arithmetic of T, or None if the coupling is not a V in feedback."""
+        """Return V(z) in the arithmetic of T, or None if the coupling is no V in feedback."""
         return Lti.diag(*channels) if (channels := self.channels(T)) else None
 
     def channels(self, T: Number) -> list[Lti] | None:
@@ -81,10 +81,10 @@ class Coupling:
 
     def turned(self, Q: Array) -> Coupling:
         """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m)."""
-        raise ValueError(f"a coupling of class {type(self).__name__} is of the axes that it has")
+        raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
     def in_series(self, T: Number) -> Lti | None:
-        """Return a block with the poles that it adds to the environment, if it closes no loop; otherwise None."""
+        """Return a block with the poles that a coupling in series adds to the environment, or None with feedback."""
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
@@ -93,14 +93,14 @@ class Coupling:
         return {"order": V.order if V else 0}
 
     def form(self) -> Form:
-        """Return its form in a file."""
+        """Return the content of the coupling in a file. Raises ValueError if it cannot be stored."""
         raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
     def __repr__(self) -> str:
         """Name the class, with the order of its filter."""
         try:
             return f"{type(self).__name__}(order {self.figures(1.0)['order']})"
-        except (ValueError, TypeError):  # of a user's own class, which needs not have a compliance
+        except (ValueError, TypeError):  # a user's own class may have no compliance
             return f"{type(self).__name__}()"
 
 
@@ -512,9 +512,9 @@ NO_PAIRS = np.zeros((0, 2))
 def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
     """Return the basis functions b_k(z) of a filter, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
-    b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each is
-    multiplied by the all-pass sections of the poles before it. So these are Takenaka-Malmquist functions up to scale.
-    Poles at zero give 1, 1/z, 1/z^2 and so on.
+    b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each function
+    is multiplied by the all-pass sections of the poles before it, which makes it a Takenaka-Malmquist function up to
+    scale. Poles at zero give 1, 1/z, 1/z^2 and so on.
     """
     values, through = [np.ones_like(z)], np.ones_like(z)
     for a in poles:
@@ -536,8 +536,8 @@ def _own_columns(R: Array) -> Array:
 def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
-    A chain ends with the last function whose coefficient is not zero. The chain of the sum of all inputs is the sum of
-    the inputs' chains, so it has states of its own only beyond the shortest one.
+    A chain ends with the last function whose coefficient is not zero. The chain for the sum of all inputs is the sum of
+    the inputs' chains, so it needs states of its own only after the shortest of these has ended.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size
@@ -551,10 +551,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
         after.append(a * state + through)
         through = (1 - a * a) * state - a * through
     for b1, b2 in pairs:
-        first, second = (
-            signals[len(after)],
-            signals[len(after) + 1],
-        )  # z/den, 1/den times earlier sections
+        first, second = signals[len(after)], signals[len(after) + 1]  # z/den and 1/den times the earlier sections
         read[len(after) + 1] = read[len(after) + 2] = 1 + b1 + b2
         after += [through - b1 * first - b2 * second, first]
         through = b2 * through + b1 * (1 - b2) * first + (1 - b2 * b2) * second
@@ -684,7 +681,7 @@ class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
 
 
 class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
-    """The form of an internal-model coupling: the poles of its basis, and a coefficient per function."""
+    """The form of an internal-model coupling: the poles of its basis, and a coefficient for each basis function."""
 
     poles: tuple[float, ...]  # (n,)
     Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
@@ -705,7 +702,7 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
 
 
 class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
-    """The form of a force filter: the poles of its basis, and a coefficient per function."""
+    """The form of a force filter: the poles of its basis, and a coefficient for each basis function."""
 
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)

@@ -1,4 +1,4 @@
-"""When forces act: delays and how they vary, lost packets, the playout buffer; periods that vary, late forces."""
+"""The times at which forces act: delays, constant or varying, lost packets, varying periods, and late forces."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from haptic_loop.controller.arithmetic import Number
 from haptic_loop.controller.lti import Array, Lti, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
-# Delays: constant ones as linear blocks, Theta (4), Psi (5) and Lambda (7); varying ones as a line that holds.
+# Constant delays are linear blocks, Theta (4), Psi (5) and Lambda (7). Varying delays are a line with a hold:
 #
-#         tick k     packet k leaves with the force g[k]; it takes delays[k] ticks, or is LOST
-#                    the device applies the newest packet that is there: f[k] = g[j], j = max{j : j + delays[j] <= k}
-#                    where nothing new is there it holds: f[k] = f[k-1], and 0 before the first arrival
+#         tick k     packet k is sent with the force g[k]; it arrives after delays[k] ticks, or is LOST
+#                    the device applies the newest packet that has arrived: f[k] = g[j], j = max{j : j + delays[j] <= k}
+#                    without a newer packet it holds f[k] = f[k-1], and 0 before the first arrival
 #
-# The age k - j of the force in use lies between the least and the largest delay while no packet is lost, whatever the
-# order of arrival; it grows by at most one per tick.
+# If no packet is lost, the age k - j of the force in use lies between the least and the largest delay, for any order of
+# arrival. The age grows by at most one per tick.
 
 
 Ticks = NDArray[np.int64]
 
-LOST = -1  # as a delay: the packet never arrives
+LOST = -1  # the delay of a packet that never arrives
 
 
 def delay(steps: Sequence[int], T: Number) -> Lti:
@@ -43,14 +43,14 @@ def moving_sum(steps: Sequence[int], T: Number) -> Lti:
     return _chains(tuple((1,) * (n + 1) for n in steps), T)
 
 
-@lru_cache(maxsize=256, typed=True)  # typed: the period's type decides the arithmetic
+@lru_cache(maxsize=256, typed=True)  # typed, because the type of the period decides the arithmetic
 def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
-    """Return the taps of each channel, cached: loops are evaluated often with the same delays."""
+    """Return the taps of each channel from a cache, because loops are often evaluated with the same delays."""
     return Lti.diag(*(taps(each, T) for each in weights))
 
 
 def packet_delays(values: ArrayLike) -> Ticks:
-    """Return a read-only array of delays (ticks, m, nsim) [samples], LOST among them. Raises ValueError."""
+    """Return a read-only array of delays (ticks, m, nsim), in samples or LOST. Raises ValueError for other numbers."""
     delays = np.array(values, dtype=np.int64)
     if delays.ndim != 3:
         raise ValueError(f"delays have the shape {delays.shape}, expected (ticks, channels, simulations)")
@@ -78,10 +78,10 @@ def ages(delays: Ticks) -> Ticks:
 
 
 def realising(wanted: Ticks) -> Ticks:
-    """Return packet delays (ticks, ..) under which the device uses forces of the `wanted` ages (ticks, ..).
+    """Return packet delays (ticks, ..) with which the device uses forces of the `wanted` ages (ticks, ..).
 
-    Ages may grow by one per tick at most. A packet that is never used arrives together with the next newer one, so no
-    delay exceeds the largest wanted age.
+    A packet that the device never uses arrives together with the next newer one, so no delay exceeds the largest
+    wanted age. Raises ValueError if an age grows by more than one in a tick.
     """
     ticks = wanted.shape[0]
     packet = np.arange(ticks).reshape(-1, *(1,) * (wanted.ndim - 1)) - wanted
@@ -90,17 +90,17 @@ def realising(wanted: Ticks) -> Ticks:
     delays = np.empty_like(wanted)
     for column in np.ndindex(*wanted.shape[1:]):
         used = packet[(slice(None), *column)]
-        # packet j shows at the first tick whose packet is j or newer
+        # packet j arrives at the first tick that uses packet j or a newer one
         delays[(slice(None), *column)] = np.searchsorted(used, np.arange(ticks)) - np.arange(ticks)
     late = np.arange(ticks).reshape(packet.shape[0], *(1,) * (wanted.ndim - 1)) + delays >= ticks
     return np.where(late, wanted.max(axis=0), delays)
 
 
 class HeldLine:
-    """Forces on their way to the devices, for any number of simulations; see the head of this file."""
+    """A delay line with a hold for the forces to the devices, in any number of simulations."""
 
     def __init__(self, delays: Ticks, nsim: int) -> None:
-        """Take `delays` of all simulations, or of one that serves all. Raises ValueError for another number of them."""
+        """Start a line with `delays` (ticks, m, nsim or 1) [samples]. Raises ValueError for another last axis."""
         if delays.shape[2] not in (1, nsim):
             raise ValueError(f"delays are those of {delays.shape[2]} simulations, expected 1 or {nsim}")
         ticks, m, _ = delays.shape
@@ -113,7 +113,7 @@ class HeldLine:
         self._held = np.zeros((m, nsim))
 
     def carry(self, k: int, force: Array) -> None:
-        """Take the force (m, nsim) sent at tick k, in place leave the one that the devices apply at tick k."""
+        """Replace the force (m, nsim) that is sent at tick k, in place, by the one that the devices apply at tick k."""
         if k >= self._fresh.shape[0]:
             raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, tick {k} needs one more")
         self._sent[k % self._sent.shape[0]] = force
@@ -132,10 +132,10 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lo: tuple[int, ...]  # (m,) [samples]
     hi: tuple[int, ...]  # (m,) [samples]
     pattern: _Pattern = "random"
-    loss: float = 0.0  # probability that a packet is lost, each by itself
-    playout: bool = False  # the device applies every packet at age hi, so that what arrives is delayed constantly
-    calm: float = 20.0  # bursty: mean length of a stretch at lo [packets]
-    burst: float = 5.0  # bursty: mean length of a stretch at more than lo [packets]
+    loss: float = 0.0  # probability that a packet is lost, independent of the others
+    playout: bool = False  # a buffer in the device, which applies every packet at age hi
+    calm: float = 20.0  # bursty: mean number of successive packets with the delay lo
+    burst: float = 5.0  # bursty: mean number of successive packets with longer delays
     recorded: tuple[tuple[int, ...], ...] = ()  # delays of packets 0, 1, .. [samples] by channel, repeated; -1 is lost
 
     def __post_init__(self) -> None:
@@ -172,7 +172,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def steady(self) -> bool:
-        """Whether every force has the same constant delay theta: then Theta is linear, and certificates hold."""
+        """Whether every force has the same delay theta, so that Theta is linear and its certificates hold."""
         return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
 
     @property
@@ -180,10 +180,10 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return any(LOST in row for row in self.recorded)
 
     def draw(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None = None) -> Ticks:
-        """Draw the delays (ticks, m) of the packets of one run, LOST among them.
+        """Draw the delays (ticks, m) of the packets of one run, in samples or LOST.
 
-        `given` are the rows (period, m), repeated, of the patterns that depend on the loop: theta for constant, what
-        a search has found worst for adversarial. Raises ValueError where they are missing.
+        `given` are the delays (rows, m), repeated, for the patterns that depend on the loop: theta for constant, and
+        the worst sequence of a search for adversarial. Raises ValueError if these patterns lack them.
         """
         delays = self._delays(rng, ticks, given)
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
@@ -205,7 +205,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 return np.resize(np.asarray(recorded, dtype=np.int64), (ticks, lo.size))
 
     def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
-        """Return where (ticks, m) a packet is in a burst: two states per channel, geometric stretches, calm first."""
+        """Return whether each packet (ticks, m) is in a burst; calm and bursts alternate with geometric lengths."""
         count = 1 + int(2 * ticks / (self.calm + self.burst)) + 8 * int(np.sqrt(ticks) + 1)
         columns = []
         for _ in self.lo:
@@ -216,14 +216,14 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Ticks: when they begin and when forces latch, where neither is at k T. A tick k takes x[k] at its beginning and lasts
-# T_k. The force f_i[k] that is computed from it acts from tau_i[k] after that beginning on; until then f_i[k-1] does.
+# Times of ticks and forces that are not multiples of T. Tick k measures x[k] at its beginning and lasts T_k. The force
+# f_i[k], which is computed from x[k], acts from the time tau_i[k] after this beginning. Until then f_i[k-1] acts.
 
-_PERIODS, _LATENCIES = 9, 3  # evenly spaced values that are drawn of each range, its ends among them: maps are kept
+_PERIODS, _LATENCIES = 9, 3  # number of evenly spaced values of a range that are drawn, so that few maps are needed
 
 
 class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Lengths of the periods: between two of them, drawn anew at every tick, or a recorded list, repeated."""
+    """Lengths of the periods: drawn for every tick between `min` and `max`, or a recorded list that is repeated."""
 
     min: float | None = None  # [s]
     max: float | None = None  # [s]
@@ -237,8 +237,8 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if wrong:
                 raise ValueError(f"period.recorded has {wrong[0]:g} s, allowed are 1e-06 to 0.1 s")
         elif self.min is None or self.max is None or not 1e-6 <= self.min <= self.max <= 0.1:
-            came = ", ".join("none" if T is None else f"{T:g} s" for T in (self.min, self.max))
-            raise ValueError(f"period.min, period.max are {came}, expected 1e-06 <= min <= max <= 0.1 s")
+            values = ", ".join("none" if T is None else f"{T:g} s" for T in (self.min, self.max))
+            raise ValueError(f"period.min, period.max are {values}, expected 1e-06 <= min <= max <= 0.1 s")
 
     @property
     def shortest(self) -> float:
@@ -261,10 +261,10 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """Length and latch times of every tick; a longer run begins anew."""
+    """Length and latch times of every tick; a longer run repeats them."""
 
     period: Array  # (ticks,) [s]
-    late: Array | None  # (ticks, m) [s] after the tick's beginning, below its period; None where forces latch at ticks
+    late: Array | None  # (ticks, m) [s] after the tick's beginning, below its period; None if forces latch at ticks
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "period", frozen(self.period, 1, "period"))
@@ -283,17 +283,17 @@ class Timing:
 
     @property
     def kinds(self) -> list[tuple[float, tuple[float, ...] | None]]:
-        """The ticks that differ: (period, latch time of each channel) [s]."""
+        """The different kinds of ticks, as (period, latch time of each channel) [s]."""
         return [(float(row[0]), None if self.late is None else tuple(row[1:].tolist())) for row in self._table[0]]
 
     @property
     def which(self) -> list[int]:
-        """(ticks,) the place of every tick among `kinds`."""
+        """The index (ticks,) in `kinds` of every tick."""
         return self._table[1].tolist()
 
     @property
     def steady(self) -> bool:
-        """Whether every tick is like the first one: then the loop has eigenvalues."""
+        """Whether all ticks are of one kind, so that the loop has eigenvalues."""
         return len(self._table[0]) == 1
 
     def times(self, first: int, ticks: int) -> Array:

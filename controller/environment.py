@@ -28,9 +28,9 @@ GROUND = "ground"
 _NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or the network of linearise(world, pose)"
 
 
-#: largest amounts, far from where arithmetic ends and beyond what anybody renders
+#: largest amounts: far above those of any rendered object, and far below the largest float
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-_LEAST_AMOUNT = 1e-12  # far below anything that is felt, and its square still far above the smallest float
+_LEAST_AMOUNT = 1e-12  # far below the amounts that a person can feel; its square is far above the smallest float
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
@@ -41,7 +41,7 @@ def _check_amount(what: str, value: float, unit: str) -> None:
         raise ValueError(f"{what} is {value}, allowed are 0 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)")
 
 
-_SAME_LENGTH = 1e-15  # relative: a direction that was normalised before is not changed again
+_SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice changes nothing
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
@@ -62,7 +62,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m]
     inertance: float | msgspec.UnsetType = msgspec.UNSET  # [kg] of an inerter in parallel
-    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction, of unit length once it is built
+    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction, which is normalised to length 1
 
     def __post_init__(self) -> None:
         if self.along:
@@ -87,8 +87,8 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m], only while in contact, and never pulling
-    gap: float = 0.0  # [m] free way from rest; negative if it is compressed at rest
-    normal: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # of unit length once it is built
+    gap: float = 0.0  # [m] distance from rest to contact; negative if the wall is compressed at rest
+    normal: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # normalised to length 1
 
     def __post_init__(self) -> None:
         ends = " and ".join(self.between)
@@ -104,15 +104,14 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def slope(self, T: Number) -> Number:
-        """Return K + 2 B/T [N/m], its largest stiffness for alternating motions, in the arithmetic of T."""
+        """Return K + 2 B/T [N/m], the largest stiffness of the wall for alternating motions, in the arithmetic of T."""
         return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
 def parts_of(element: Any) -> list[Spring | Wall]:
-    """Return the springs and walls of an element of the user's own. Raises ValueError for another object.
+    """Return the springs and walls of a user's own element. Raises ValueError for an object without such parts.
 
-    Nodes besides its ends belong to the element. A hardening spring is a spring with walls in parallel, which push
-    beyond their gaps.
+    A hardening spring, for example, is a spring with walls in parallel, which push beyond their gaps.
     """
     listed = element.parts() if callable(getattr(element, "parts", None)) else None
     parts = list(listed) if isinstance(listed, list | tuple) else []
@@ -172,8 +171,8 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return A, B, C, D
 
 
-_ROUNDING = 1e-9  # allowed asymmetry and negativity of E(1), relative to the mean gain
-_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # springs, relative to the mean gain, that are added to make a block passive
+_ROUNDING = 1e-9  # allowed asymmetry of E(1) and negative eigenvalue, relative to the mean gain
+_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # usual and largest spring that makes a block passive, relative to the mean gain
 
 
 @functools.lru_cache(maxsize=64)
@@ -217,40 +216,40 @@ def _correction(block: Block) -> Any:
 
 
 class Environment:
-    """Base class of environments. A class of the user's own has `contacts` and `E(T)`."""
+    """Base class of environments. A user's own class defines `contacts` and `E(T)`."""
 
     __slots__ = ()
-    contacts: Any  # tuple[str, ...], one a channel
+    contacts: Any  # tuple[str, ...], one per channel
     walls: tuple[Wall, ...] = ()
-    here: Any = "this environment"  # str: its name in guarantees
-    world: Any = None  # a MuJoCo scene, known by its file only
-    one_period = False  # whether it is known for one T only
+    here: Any = "this environment"  # str: the environment's name in guarantees
+    world: Any = None  # a MuJoCo scene, of which only the file is known
+    one_period = False  # whether E(z) is known for one T only
 
     def check(self, psi: Sequence[int], T: float) -> None:
-        """Raise ValueError if no loop with this environment makes sense."""
+        """Raise ValueError if the environment cannot be part of a loop with these delays and this period."""
         self.E(T)
 
     def active(self, T: float) -> str | None:
-        """Return why E(z) may feed power in at some frequency, or None; a network does not, by its parameters."""
-        what = type(self).__name__
+        """Return the reason why E(z) may generate energy at some frequency, or None if E is passive."""
+        name = type(self).__name__
         try:
             lift = _correction(Block.of(self.E(T)))
         except ValueError as error:
-            return f"environment {what}: {str(error).removeprefix('block: ')}"
+            return f"environment {name}: {str(error).removeprefix('block: ')}"
         if lift.any():
-            return f"environment {what}: passive within rounding only; Network(contacts, block=Block.of(E)) mends that"
+            return f"environment {name}: passive within rounding only; Network(contacts, block=Block.of(E)) mends that"
         return None
 
     def as_network(self) -> Network:
-        """Return itself if it is a network. Raises ValueError otherwise."""
+        """Return the environment if it is a network. Raises ValueError otherwise."""
         raise ValueError(f"{self.here} is no network of springs, dampers and masses")
 
     def E(self, T: Number) -> Lti:
         """Return E(z) from contact displacements [m] to forces [N], with every wall touching, in T's arithmetic."""
-        raise TypeError(f"{type(self).__name__} has no E(T): define it")
+        raise TypeError(f"{type(self).__name__} has no E(T): define this method")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """Return G = (I + Psi E V)^-1 Psi E, the map to the forces as they leave. Raises SingularLoop."""
+        """Return G = (I + Psi E V)^-1 Psi E, the map from displacements to the sent forces. Raises SingularLoop."""
         return coupling.around(delay(psi, T) @ self.E(T))
 
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
@@ -265,7 +264,7 @@ class Environment:
 class RigidWall(Environment, enum.Enum):
     """E -> infinity: a rigid wall behind a coupling, always in contact. One channel."""
 
-    RIGID_WALL = "rigid wall"  # as files have it
+    RIGID_WALL = "rigid wall"  # its name in files
 
     @property
     def contacts(self) -> tuple[str, ...]:
@@ -330,9 +329,9 @@ class Network(
     masses: dict[str, float] = {}  # [kg], by node; other nodes have no mass
     walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
     block: Block | None = None  # an E(z) that is added to the network
-    elements: tuple[Any, ...] = ()  # of the user's own: their parts become springs and walls
-    world: World | None = None  # replaces everything else
-    points: dict[str, tuple[str, ...]] = {}  # the coordinates of each point in space: nodes, or ground if held
+    elements: tuple[Any, ...] = ()  # of a user's own classes; their parts become springs and walls
+    world: World | None = None  # a MuJoCo scene in place of springs, masses, walls and block
+    points: dict[str, tuple[str, ...]] = {}  # the nodes of each point's coordinates; ground for a fixed coordinate
     linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model
 
     def __post_init__(self) -> None:
@@ -413,7 +412,7 @@ class Network(
         return tuple(held(self, touching) for touching in walls)
 
     def coordinates(self, end: str) -> tuple[str, ...]:
-        """Return the nodes of a point in space; another name is a node itself."""
+        """Return the nodes of a point's coordinates, or the node of this name."""
         return self.points.get(end, (end,))
 
     def _check_axes(self, part: Spring | Wall) -> None:
@@ -466,7 +465,7 @@ class Network(
         return [[(node, c) for node, c in signed if c and node != GROUND]]
 
     def joined(self, part: Spring | Wall) -> list[list[str]]:
-        """Return the nodes that each length of a part joins, with ground for a missing end."""
+        """Return the nodes that each length of a part joins, including ground."""
         free = [[node for node, _ in ends] for ends in self._lengths(part)]
         return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
 
@@ -485,12 +484,15 @@ class Network(
         return rows
 
 
-#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
+#: mass [kg], damping [N s/m] and stiffness [N/m] as from Network.matrices, (..., nodes, nodes) each
 _Matrices = tuple[Array, Array, Array]
 
 
 class Networks(Environment):
-    """Networks with the same nodes, the contacts first, by their matrices; matrices with axes are a stack."""
+    """Networks with the same nodes, given by their matrices; the contacts are the first nodes.
+
+    Matrices with leading axes hold many networks.
+    """
 
     def __init__(self, contacts: tuple[str, ...], matrices: _Matrices) -> None:
         self.contacts, self.matrices = contacts, matrices
@@ -502,7 +504,7 @@ class Networks(Environment):
         return Lti(*_realise(self.matrices, len(self.contacts), T), T)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
-        """Return E at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
+        """Return E at z (n, k) from the dynamic stiffness, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
         M, D, K = (part[..., None, :, :] for part in self.matrices)
         s = ((z - 1) / (T * z))[..., None, None]
         Z = M * s**2 + D * s + K
@@ -520,8 +522,7 @@ def environment(network: Network, T: Number) -> Lti:
 
     Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
     for v at every tick. The states are q- and v- of the internal nodes, and past values for the contact dampers and
-    masses; see `_adrift` for bodies without a place of rest. The arithmetic is that of T. Raises ValueError if nothing
-    holds an internal node.
+    masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor connections.
     """
     adrift = _adrift(network, network.springs)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
@@ -529,9 +530,10 @@ def environment(network: Network, T: Number) -> Lti:
 
 
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:
-    """Return `environment` with ports for walls, [x; p] -> [f; y]: wall forces p [N] to displacements y [m] across.
+    """Return the environment with ports for walls, from [x; p] to [f; y].
 
-    With `places` every node has a port before those of the walls, from a force to the node's displacement.
+    p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node has a port
+    from a force to its displacement, before the ports of the walls.
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
@@ -548,8 +550,8 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
 def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
     """Return the bodies that no spring joins to a contact or to ground, as lists of indices of internal nodes.
 
-    Only dampers drag such a body, so its place does not affect any force and would be an unobservable integrator. The
-    places of its nodes are stored relative to the first one.
+    Only dampers act on such a body, so that its position affects no force and would be an unobservable integrator. The
+    positions of its nodes are stored relative to that of the first one.
     """
     names = network.nodes()
     body = {name: name for name in (*names, GROUND)}  # union-find: each node points towards its body's root
@@ -585,11 +587,11 @@ def _solvable(network: Network, T: Number) -> _Matrices:
     return M, D, K
 
 
-_SLACK = 1e-9  # share of the largest stiffness below which a stiffness is rounding of directions
+_SLACK = 1e-9  # smaller stiffnesses, relative to the largest one, come from the rounding of directions
 
 
 def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
-    """Raise ValueError for a body in space that springs hold in some of its directions only, skew to the axes."""
+    """Raise ValueError if springs hold a body in some directions only, and these are no coordinate directions."""
     adrift = _adrift(network, network.springs)
     loose = {i for group in adrift for i in group}
     held = [i for i in range(len(names)) if i not in loose]
@@ -607,10 +609,10 @@ def _realise(
     across: Array | None = None,
     adrift: Sequence[Sequence[int]] = (),
 ) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
+    """Return A, B, C, D of E(z) for the network (M, D, K) whose first `c` nodes are contacts.
 
-    With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
-    outputs, these displacements. The places of internal nodes in a group of `adrift` are relative to its first node.
+    With `across` (w, nodes) there are w more inputs, forces against the displacements `across q`, and w more outputs,
+    these displacements. The positions of internal nodes in a group of `adrift` are relative to that of its first node.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
@@ -654,7 +656,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
 
 
 def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
-    """Return the indices of the states that reach the outputs, now or later."""
+    """Return the indices of the states that affect an output at this tick or a later one."""
     count = after.shape[-1]
     reads = (after.reshape(-1, count - inputs, count)[..., inputs:] != 0).any(axis=0)
     used = (force.reshape(-1, count)[:, inputs:] != 0).any(axis=0)
@@ -664,7 +666,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """Return the network with the touching walls (default: all) as two-sided springs, without the others."""
+    """Return the network with touching walls, by default all, as two-sided springs, and without the other walls."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping, along=w.normal) for w, on in walls)

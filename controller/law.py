@@ -17,9 +17,10 @@ from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
-# Walls: springs that push and never pull, so that contact is made and broken.
+# Walls are springs that push and never pull, so that contacts begin and end.
 #
-# Across a wall of stiffness K and damping B the way into it is d = y - gap, and it pushes with
+# With the displacement y across a wall of stiffness K and damping B, the depth in it is d = y - gap. The wall pushes
+# with the force
 #
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
@@ -27,13 +28,14 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 # dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall is the spring-damper
 # between the same nodes except for the constant force of its gap.
 #
-# The wall forces are further inputs of the linear block and the ways are further outputs, y = y_free - D p, because
-# environment and coupling respond within the tick. The algebraic loop of a tick is the linear complementarity problem
+# The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
+# coupling respond within the tick, y = y_free - D p, so that the tick has an algebraic loop. It is the linear
+# complementarity problem
 #
 #         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
 #
 # whose matrix has positive principal minors, since D is positive semidefinite for a passive environment and coupling.
-# So there is exactly one solution; the code tries every set of touching walls.
+# So there is exactly one solution. The code tries every set of touching walls.
 
 
 Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
@@ -44,9 +46,9 @@ State = tuple[bool, ...]  # which walls touch
 class Law(ReadOnly):
     """The map of a tick from positions to forces: the linear block of a loop, and walls that push.
 
-    `sent` is the block [x; p] -> [f_e; y] before Theta, and the walls turn y into p. The state is that of the block
-    with its delays, then h [m], the depth of each wall at the previous tick.
-    Raises SingularLoop if the walls' forces are not determined.
+    `sent` is the block from [x; p] to [f_e; y] before Theta. The walls compute p from y. The state holds that of the
+    block with its delays, then h [m], the depth in each wall at the previous tick.
+    Raises SingularLoop if the walls' forces are not unique.
     """
 
     sent: Lti  # m + w inputs and outputs
@@ -83,11 +85,11 @@ class Law(ReadOnly):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        """Return (row of [f; z+], limit [N]) of each force that is limited before it is sent."""
+        """The pairs (row of [f; z+], limit [N]) of the forces that are limited before they are sent."""
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Return where forces (ticks, m, ..) were limited: here at the actuators' limits `most` (m, ..) [N]."""
+        """Return whether each force (ticks, m, ..) was limited, here by the actuators' limits `most` (m, ..) [N]."""
         return np.abs(force) >= most
 
     @property
@@ -112,7 +114,7 @@ class Law(ReadOnly):
 
     @cached_property
     def open(self) -> Lti:
-        """F while no wall touches, with the state of the law, although h does not affect the force."""
+        """F while no wall touches, with the state of the law including h."""
         G, m, w = self._block, self.channels, len(self.walls)
         A, B = np.pad(G.A, ((0, w), (0, w))), np.pad(G.B[:, :m], ((0, w), (0, 0)))
         return Lti(A, B, np.pad(G.C[:m], ((0, 0), (0, w))), G.D[:m, :m], G.T)
@@ -128,7 +130,7 @@ class Law(ReadOnly):
         return self.open.at_rest(x)
 
     def frozen(self) -> dict[State, Lti]:
-        """Return F of every contact state, without the gaps' constant forces, from no touching wall to all walls."""
+        """Return F for every set of touching walls, from none to all, without the constant forces of the gaps."""
         block, m, T, walls = self._delayed(self.sent), self.channels, self.sent.T, range(len(self.walls))
         if not self.walls:
             return {(): block}
@@ -142,7 +144,7 @@ class Law(ReadOnly):
         return maps
 
     def transition(self) -> Transition:
-        """Return the function of one tick for any number of simulations."""
+        """Return the function that computes one tick of any number of simulations."""
         if not self.walls:
             return self.linear.dot
         G, m, w, F = self._block, self.channels, len(self.walls), self.open
@@ -154,16 +156,16 @@ class Law(ReadOnly):
         solve, depth = self._problem.solve, slice(G.order, F.order)
 
         def tick(before: Array, after: Array) -> None:
-            way = reach(before) - gap  # into the walls without their forces
-            force = solve(way - memory * before[depth])
+            d = reach(before) - gap  # without the walls' forces
+            force = solve(d - memory * before[depth])
             linear(before, after)
             after += kick(force)
-            np.maximum(way + give(force), 0.0, out=after[-w:])
+            np.maximum(d + give(force), 0.0, out=after[-w:])
 
         return tick
 
     def together(self, laws: Sequence[Law]) -> Transition:
-        """Return one tick for several laws of this kind and size, one simulation for each."""
+        """Return the function of one tick for several laws of this kind and size, with one simulation for each."""
         if not self.walls:
             return _side_by_side(laws)
         return _one_by_one(laws) if len(self.walls) > 1 else _one_wall(laws)
@@ -174,13 +176,13 @@ class Law(ReadOnly):
 
 
 def _side_by_side(laws: Sequence[Law]) -> Transition:
-    """Return one tick for several laws while all of them are linear."""
+    """Return the function of one tick for several linear laws."""
     blocks = _last_axis([law.linear for law in laws])
     return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
 
 
 def _one_by_one(laws: Sequence[Law]) -> Transition:
-    """Return one tick for several laws of any kind, one after the other."""
+    """Return the function of one tick for several laws of any kind, which are computed one after the other."""
     transitions = [law.transition() for law in laws]
 
     def together(before: Array, after: Array) -> None:
@@ -193,7 +195,7 @@ def _one_by_one(laws: Sequence[Law]) -> Transition:
 
 
 def _one_wall(laws: Sequence[Law]) -> Transition:
-    """Return one tick for several laws with one wall each, where p = max(0, q)/M."""
+    """Return the function of one tick for several laws with one wall each, where p = max(0, q)/M."""
     m, blocks = laws[0].channels, [law._block for law in laws]
     linear, order = _side_by_side(laws), blocks[0].order
     reach = _last_axis([np.concatenate([G.C[m], [0.0], G.D[m, :m]]) for G in blocks])
@@ -203,11 +205,11 @@ def _one_wall(laws: Sequence[Law]) -> Transition:
     memory = damping / laws[0].sent.T / np.array([law.steepness[0] for law in laws])
 
     def together(before: Array, after: Array) -> None:
-        way = np.einsum("in,in->n", reach, before) - gap
-        force = np.maximum(way - memory * before[order], 0.0) / M
+        d = np.einsum("in,in->n", reach, before) - gap
+        force = np.maximum(d - memory * before[order], 0.0) / M
         linear(before, after)
         after += kick * force
-        after[-1] = np.maximum(way + give * force, 0.0)
+        after[-1] = np.maximum(d + give * force, 0.0)
 
     return together
 
@@ -218,34 +220,34 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The limiter: forces leave as f_e with |f_e,i| <= L_i always, because the contact slips by e.
+# The limiter sends forces f_e with |f_e,i| <= L_i, because the contact slips by e.
 #
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
-# It acts before Theta, so that delays carry limited forces. While no force reaches its limit, e = 0. With the forces
-# without slip, f_free, and the feedthrough D_G the limiter solves
+# The limiter acts before Theta, so that delayed forces are limited forces. While no force reaches its limit, e = 0.
+# With the forces without slip, f_free, and the feedthrough D_G the limiter solves
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
-# together with the walls, whose forces are the same kind of unknown over the box (-inf, 0]: a box problem.
+# together with the walls, whose forces are further unknowns over the box (-inf, 0]. This is a box problem.
 
 
 def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
-    """Return (m,) [N] a limit of each channel that implies those of the vectors."""
+    """Return limits (m,) [N] of the channels that imply the limits of the vectors."""
     return limit / np.sqrt(np.repeat(sizes, sizes)) if sizes else limit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Limiter(Law):
-    """The forces of a loop before Theta, [x; p] -> [f_e; y], limited by a slip e; walls turn y into p.
+    """A law whose forces f_e are limited by a slip e before Theta.
 
-    Its state is [that of `sent`, e [m] at the tick before, the lines of Theta, h [m] of the walls].
-    Raises SingularLoop if the limited forces are not determined.
+    The state holds that of `sent`, e [m] at the previous tick, the delay lines of Theta, and h [m] of the walls.
+    Raises SingularLoop if the limited forces are not unique.
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
-    rho: Array  # (m,) [N/m] the slip's lag: 0 under any-environment, beta delta/T under this-environment
-    balls: tuple[slice, ...] = ()  # neighbouring channels whose force is limited as a vector
+    rho: Array  # (m,) [N/m] lag of the slip: 0 with any-environment, beta delta/T with this-environment
+    balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold
 
@@ -301,12 +303,12 @@ class Limiter(Law):
         return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self.sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Return where the contact slipped, which is before the force arrives."""
+        """Return whether each contact slipped, at the tick that sends the force."""
         return self.slips(z) != 0
 
     @cached_property
     def _step(self) -> Lti:
-        """[x; e; p] -> [f_e; y], states [sent, e_-]."""
+        """The block from [x; e; p] to [f_e; y], with the states of `sent` and e_-."""
         m, w, T = self.channels, len(self.walls), self.sent.T
         one, zero = np.eye(m + w), np.zeros((w, m))
         lag = Lti.diag(*(taps([-r, r], T) for r in self.rho))
@@ -316,12 +318,12 @@ class Limiter(Law):
 
     @cached_property
     def _block(self) -> Lti:
-        """[x; e; p] -> [f; y], states [sent, e_-, Theta]."""
+        """The block from [x; e; p] to [f; y], with the states of `sent`, e_- and Theta."""
         return self._delayed(self._step)
 
     @cached_property
     def problem(self) -> BoxProblem | BallProblem:
-        """The problem of a tick for [e; p]; all its limits are in N."""
+        """The problem of a tick for [e; p], with all limits in N."""
         m, w = self.channels, len(self.walls)
         if self.balls:
             return BallProblem(-self._step.D[:, m:], self.limit, self.sizes)
@@ -338,7 +340,7 @@ class Limiter(Law):
 
     @cached_property
     def sent_rows(self) -> NDArray[np.intp]:
-        """The rows (m,) of f_e in [f; z+]: the output itself, or the first place of its delay line."""
+        """The rows (m,) of f_e in [f; z+]: the output, or the first state of the output's delay line."""
         m = self.channels
         lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
         return np.where(np.array(self.theta) == 0, np.arange(m), lines)
@@ -353,7 +355,7 @@ class Limiter(Law):
                 linear(before, after)
                 free = after.take(sent, axis=0)
                 touched = magnitudes(free, balls) > limit
-                if b"\1" not in touched.tobytes():  # a sixth of the time that any() takes, of a few channels
+                if b"\1" not in touched.tobytes():  # takes a sixth of the time of any() for a few channels
                     return
                 at = slice(None) if touched.shape[1] == 1 else np.flatnonzero(touched.any(axis=0))
                 e, f = solve(free[:, at])
@@ -366,15 +368,15 @@ class Limiter(Law):
         gap = np.array([wall.gap for wall in self.walls])[:, None]
         steep = self.steepness[:, None]
         memory = np.array([wall.damping / F.T for wall in self.walls])[:, None]
-        way_of = np.hstack([step.C[m:], np.zeros((w, block.order - step.order + w)), step.D[m:, :m]]).dot
+        d_of = np.hstack([step.C[m:], np.zeros((w, block.order - step.order + w)), step.D[m:, :m]]).dot
         give, depth = step.D[m:, m:], slice(block.order, block.order + w)
         assert isinstance(self.problem, BoxProblem)
         upper, lower = self.problem.upper[:, None], self.problem.lower[:, None]
 
         def walled_tick(before: Array, after: Array) -> None:
-            way = way_of(before) - gap  # into the walls, if these did not push and nothing slipped
+            d = d_of(before) - gap  # without wall forces and slip
             linear(before, after)
-            right = np.vstack([after.take(sent, axis=0), steep * way - memory * before[depth]])
+            right = np.vstack([after.take(sent, axis=0), steep * d - memory * before[depth]])
             touched = ((right > upper) | (right[: m + w] < lower)).any(axis=0)
             at = np.flatnonzero(touched)
             if at.size:
@@ -382,13 +384,13 @@ class Limiter(Law):
                 bent = after[:, at] + kick @ v
                 bent[sent] = f[:m]
                 after[:, at] = bent
-                way[:, at] += give @ v
-            np.maximum(way, 0.0, out=after[-w:])
+                d[:, at] += give @ v
+            np.maximum(d, 0.0, out=after[-w:])
 
         return walled_tick
 
     def together(self, laws: Sequence[Law]) -> Transition:
-        """Return a transition in which only laws with a force beyond its limit solve their problem."""
+        """Return the function of one tick in which only laws with a force beyond its limit solve their problem."""
         if self.walls:
             return _one_by_one(laws)
         limiters = cast("Sequence[Limiter]", laws)
@@ -405,9 +407,9 @@ class Limiter(Law):
         return together
 
     def at_rest(self, x: Array) -> Array:
-        """The state that displacements x (m,) [m] lead to where they are held, no wall touching: see resting.
+        """Return the steady state for held displacements x (m,) [m], with no wall touching.
 
-        The slip is the one that a force of F(1) x needs, so that the lines hold forces within the limits.
+        The slip is that of the force F(1) x, so that the delay lines hold forces within the limits.
         """
         m, G = self.channels, self.sent
         free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
@@ -422,5 +424,5 @@ class Limiter(Law):
         return np.concatenate([free.at_rest(x - e), e, lines, np.zeros(len(self.walls))])
 
     def slips(self, z: Array) -> Array:
-        """Return the slips e [m] at each tick but the last, (ticks - 1, m, ..): not zero where a force was limited."""
+        """Return the slips e (ticks - 1, m, ..) [m] at each tick but the last; zero if the force was not limited."""
         return z[1:, self.sent.order : self.sent.order + self.channels]

@@ -5,8 +5,8 @@
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-Known of a device are its damping and, if guaranteed, bounds of motor and transmission; of a human nothing is known.
-controller.tick runs it in time.
+A loop holds the damping of every device and, if guaranteed, bounds of motor and transmission. It holds nothing about
+the humans. controller.tick simulates the loop.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_l
 from haptic_loop.controller.ranges import Member, Ranges, members
 from haptic_loop.controller.units import PositionUnit, in_unit
 
-MOST_SAMPLES = 1000  # longest delay of a channel; every sample is a state
+MOST_SAMPLES = 1000  # longest delay of a channel, which has a state for each sample
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
-_LEAST_DAMPING = 1e-12  # [N s/m] far below any device's, and squares of its inverse are still floats
+_LEAST_DAMPING = 1e-12  # [N s/m] far below that of any device, without overflow in squares of its inverse
 Rows = tuple[tuple[float, ...], ...]  # rows of a matrix
 
 
@@ -57,7 +57,7 @@ class DelayRange(Strict, frozen=True):
 
 
 class DeviceBounds(Strict, frozen=True):
-    """Guaranteed bounds of a device besides its damping, for every device within them."""
+    """Guaranteed bounds of a device's motor and transmission; a proof holds for every device within them."""
 
     motor_mass_min: _Positive  # [kg] mass that moves rigidly with the motor's shaft, at the encoder's coordinate
     transmission_stiffness_max: _Positive  # [N/m] between the motor and everything behind it
@@ -71,14 +71,14 @@ class DeviceBounds(Strict, frozen=True):
 
 
 class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of the digest
-    """The data of a condition besides the coupling."""
+    """All data from which a condition certifies a coupling."""
 
     T: _Positive  # [s]
     theta: _Steps  # (m,) transmission delays [samples]
     psi: _Steps  # (m,) environment delays [samples]
     lam: _Steps  # (m,) delays of the reference [samples], for transparency only
     delta: tuple[_Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
-    environment: Network | RigidWall  # or a class of the user's own, which cannot be stored
+    environment: Network | RigidWall  # or an object of a user's own class, which cannot be stored
     ranges: Ranges | None = None  # ranges of the environment's parameters
     varying_delay: DelayRange | None = None  # delays of the forces that may switch at every tick
     T_max: _Positive | None = None  # [s] longest period if periods vary; None: T
@@ -140,15 +140,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         if len(levels) != len(self.devices):
             raise ValueError(f"levels has {len(levels)} matrices for {len(self.devices)} devices")
         for i, (level, own) in enumerate(zip(levels, self.devices, strict=True), start=1):
-            n, words = own.stop - own.start, f"level #{i} is {[list(row) for row in level]}"
+            n, shown = own.stop - own.start, f"level #{i} is {[list(row) for row in level]}"
             if len(level) != n or any(len(row) != n for row in level):
-                raise ValueError(f"{words}, expected a {n} x {n} matrix [N s/m]")
+                raise ValueError(f"{shown}, expected a {n} x {n} matrix [N s/m]")
             if any(level[j][k] != level[k][j] for j in range(n) for k in range(j)):
-                raise ValueError(f"{words}, expected a symmetric matrix")
+                raise ValueError(f"{shown}, expected a symmetric matrix")
             if any(level[j][j] != d for j, d in enumerate(self.delta[own])):
-                raise ValueError(f"{words}, expected delta = {list(self.delta[own])} on its diagonal")
+                raise ValueError(f"{shown}, expected delta = {list(self.delta[own])} on its diagonal")
             if not positive_definite(numbers(level, Fraction(1))):
-                raise ValueError(f"{words}, expected a positive definite matrix")
+                raise ValueError(f"{shown}, expected a positive definite matrix")
         if not any(value for level in levels for j, row in enumerate(level) for value in (*row[:j], *row[j + 1 :])):
             msgspec.structs.force_setattr(self, "levels", None)
 
@@ -189,12 +189,12 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return np.minimum.reduceat(np.asarray(values, dtype=float), [own.start for own in self.devices])
 
     def per_channel(self, values: Sequence[Any]) -> tuple[Any, ...]:
-        """Return a value per device as one per channel."""
+        """Repeat the value of each device for each of its channels."""
         return tuple(v for v, n in zip(values, self.axes or (1,) * self.channels, strict=True) for _ in range(n))
 
     @property
     def least_damping(self) -> tuple[float, ...]:
-        """The least eigenvalue of each Delta_i [N s/m]: the damping that every direction of a device has."""
+        """The least eigenvalue of each Delta_i [N s/m], the least damping of a device over all directions."""
         if self.levels is None:
             return tuple(self.per_device(self.delta).tolist())
         return tuple(float(np.linalg.eigvalsh(np.array(level))[0]) for level in self.levels)
@@ -216,7 +216,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.environment.E(self.period(exact))
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return G = (I + Psi E V)^-1 Psi E, the map to the forces as they leave. Raises SingularLoop."""
+        """Return G = (I + Psi E V)^-1 Psi E, from displacements to the sent forces. Raises SingularLoop."""
         if not exact:
             return self.environment.sent(coupling, self.psi, self.T)
         key = (self.environment, coupling, self.psi, self.T)
@@ -231,7 +231,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.environment.sent_at(coupling, self.psi, z, self.T)
 
     def late(self, G: Block) -> Block:
-        """Return Theta G (6), the forces G as the devices feel them."""
+        """Return Theta G (6), from displacements to the forces that act on the devices."""
         return as_like(G, delay(self.theta, G.T)) @ G
 
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
@@ -239,15 +239,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.late(self.sent(coupling, exact))
 
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return F without walls and with ports for them, [x; p] to [f; y]: wall forces [N] to ways into walls [m].
+        """Return F with ports for the walls, from [x; p] to [f; y].
 
-        Psi and Theta also delay the walls' forces at the devices. Raises SingularLoop, and ValueError for a coupling
-        that excludes walls.
+        p are the forces [N] of the walls, and y the displacements [m] across them. Psi and Theta delay the effect of
+        p on f. Raises SingularLoop, and ValueError for a coupling that excludes walls.
         """
         return self._beside_walls(self.theta, exact) @ self.walled_before_delay(coupling, exact)
 
     def walled_before_delay(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return `walled` with the forces as they leave, before Theta: [x; p] to [f_e; y]."""
+        """Return the block of `walled` before Theta, from [x; p] to [f_e; y] with the sent forces f_e."""
         E = walled_environment(self.network, self.period(exact))
         return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
 
@@ -262,11 +262,11 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         rho: ArrayLike | None = None,
         balls: Sequence[slice] = (),
     ) -> Law:
-        """Return the law of a tick; with `rho` (m,) [N/m] forces leave through a limiter of `limit` (m,) [N].
+        """Return the law of a tick.
 
-        `balls` are neighbouring channels whose force is limited as a vector.
-
-        Raises SingularLoop, and ValueError for a coupling that excludes walls.
+        With `rho` (m,) [N/m] a limiter bounds the sent forces by `limit` (m,) [N]. `balls` are groups of neighbouring
+        channels whose force is limited as a vector. Raises SingularLoop, and ValueError for a coupling that excludes
+        walls.
         """
         walls = self.environment.walls
         sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
@@ -282,7 +282,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
 
     @property
     def network(self) -> Network:
-        """The environment as a network. Raises ValueError if it is none."""
+        """The environment, if it is a network. Raises ValueError otherwise."""
         return self.environment.as_network()
 
     def frozen(self) -> tuple[Loop, ...]:
@@ -294,7 +294,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return msgspec.structs.replace(self, environment=network, ranges=None)
 
     def channel(self, i: int) -> Loop:
-        """Return channel i at a rigid wall: any-environment does not depend on the environment."""
+        """Return channel i with a rigid wall, for conditions that do not depend on the environment."""
         own, known, late, span = slice(i, i + 1), self.known_devices, self.latency, self.varying_delay
         return Loop(
             self.T,
@@ -321,14 +321,14 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
 
     @property
     def delays(self) -> DelayRange:
-        """What the delays of the forces may be; of no width where they are constant."""
+        """The range of the forces' delays, with lo = hi = theta if the delays are constant."""
         return self.varying_delay or DelayRange(self.theta, self.theta)
 
 
-#: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
+#: The key and the value of the last G over Fractions, which a proof reads three times and which takes most of its work
 _exactly: list[Any] = [(None,) * 4, None]
 
 
 def forget_exact() -> None:
-    """Forget what an earlier proof has built, so that the counted work of a proof does not depend on it."""
+    """Clear the stored G of an earlier proof, so that the counted work of a proof does not depend on it."""
     _exactly[:] = (None,) * 4, None

@@ -6,8 +6,8 @@ systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
     G.feedback(H)   (I + G H)^-1 G                                 G.over_z_minus_one()  G(1), G/(z - 1) less its pole
 
-The type of the period decides the arithmetic. A block with a float T is floating point. A block with a Fraction T is
-exact, and a stored float then means its shortest decimal, as a person wrote it: 0.0012 is 12/10000.
+The type of the period decides the arithmetic. A block with a float T has floating-point matrices. A block with a
+Fraction T is exact, and a float then stands for its shortest decimal: 0.0012 is 12/10000.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
 
 
 def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError:
-    """Return the error of `frozen`. It is built on demand, because formatting a matrix costs more than copying it."""
+    """Return the error of `frozen`, which is made only when needed, because formatting a matrix takes long."""
     expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
     return ValueError(f"{name} is {value!r}, expected {expected}{got}" if name else f"expected {expected}{got}")
 
 
 class ReadOnly:
-    """A record whose arrays stay read-only after pickling and copying, which make NumPy arrays writeable again."""
+    """A record whose arrays remain read-only when it is pickled or copied, unlike ordinary NumPy arrays."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for value in state.values():
@@ -66,12 +66,12 @@ class ReadOnly:
 
 
 _ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so that they stay in the cache
-_SHORT, _DOUBLINGS = 0.3, 5  # poles of at most 0.3 fade to 2e-17 within 2^5 samples
-_ERROR = 1e-9  # of the largest response of an output: bound on the error of a sum over poles and taps
-_UNIT = 1e-15  # bound on the rounding of a product of few matrices, of the size of its terms
-_UNSEEN = 1e-18  # of the response: weights that are left out
-_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] where the size of a response is looked at, beside its poles
-_OFF_CIRCLE = 1e-9  # of |z|^2 from 1
+_SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
+_ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
+_UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
+_UNSEEN = 1e-18  # smaller weights are omitted, relative to the response
+_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] at which the size of a response is evaluated, besides its poles
+_OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
@@ -149,7 +149,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """Number of states without the delay lines at the outputs, which cost a frequency response nothing."""
+        """Number of states without those of the delay lines at the outputs, which take no time in a response."""
         return self._lines[0].size
 
     @property
@@ -182,8 +182,8 @@ class Lti(ReadOnly):
     def at(self, z: ArrayLike) -> Complex:
         """Return G(z), shape z.shape + (p, m). A stack takes z (n, k) or (1, k) and returns (n, k, p, m).
 
-        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`), anywhere else, and where
-        poles are too nearly equal for that, by back substitution in the complex Schur form of A.
+        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`). At other points, or if poles
+        are nearly equal, it is evaluated by back substitution in the complex Schur form of A.
         """
         z = np.asarray(z, dtype=np.complex128)
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
@@ -220,7 +220,7 @@ class Lti(ReadOnly):
         return G
 
     def _substituted(self, points: Complex) -> Complex:
-        """Return the outputs and the heads of the delay lines, (p + lines, m, points), in blocks of _ROWS rows."""
+        """Return the responses (p + lines, m, points) of the outputs and the heads of delay lines by substitution."""
         S, U = self._schur
         core, lines = self._lines
         at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)
@@ -236,15 +236,19 @@ class Lti(ReadOnly):
     def _terms(self) -> tuple[Complex, Complex, Array] | None:
         """Split the response of outputs and heads into poles, residues, and weights of z^-1, z^-2, ..
 
-        Return (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None where their error may
-        exceed _ERROR. Poles with |z| > _SHORT are taken one by one, with their right and left eigenvectors V and W:
-        P = V W projects on them. The rest N = (I - P) A has the many poles at or near 0 of delays, which have no
-        eigenvectors of their own; its powers fade within 2^_DOUBLINGS samples, so that its response is a finite sum.
+        Poles with |z| > _SHORT have right and left eigenvectors V and W, and P = V W projects on their states. The
+        other part of A, N = (I - P) A, has the many poles at or near 0 that belong to delays. Its powers vanish within
+        2^_DOUBLINGS samples, so that its response is a finite sum.
 
-        The states X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 miss B = (z I - A) X by
-        (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1, which is bounded entry
-        by entry at its largest on the circle, as is what the same response from all states makes of it. So no unit of
-        a state matters. The bound is compared with the response itself at a few points: terms may cancel.
+        The error follows from the residual of B = (z I - A) X. The states
+        X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 leave the residual
+        (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1. Its entries, and the
+        response of the outputs to it, are bounded over the unit circle. The bound does not depend on the units of the
+        states. It is compared with the response at a few points, because terms may cancel.
+
+        Returns:
+            (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None if the error may exceed
+            _ERROR.
         """
         core, lines = self._lines
         A, B = self.A[np.ix_(core, core)], self.B[core]
@@ -261,11 +265,8 @@ class Lti(ReadOnly):
         except np.linalg.LinAlgError:
             return None
         rest = np.eye(core.size) - (V @ W).real
-        Y, rows, power = (
-            rest @ B,
-            C @ rest,
-            rest @ A,
-        )  # Y_j = N^j (I - P) B side by side, C N^j (I - P) below each other
+        # Y holds N^j (I - P) B side by side, and `rows` holds C N^j (I - P) one below the other
+        Y, rows, power = rest @ B, C @ rest, rest @ A
         for _ in range(_DOUBLINGS):
             Y, rows = np.hstack([Y, power @ Y]), np.vstack([rows, rows @ power])
             power = power @ power
@@ -275,7 +276,7 @@ class Lti(ReadOnly):
         weights = (C @ Y).reshape(p, taps, m).swapaxes(1, 2).reshape(p * m, taps)
         residues = (out[:, None] * into.T).reshape(p * m, poles.size).astype(np.complex128)
         points = np.exp(1j * np.concatenate([_ANYWHERE, np.angle(poles)]))
-        with np.errstate(all="ignore"):  # what is not finite is refused
+        with np.errstate(all="ignore"):  # an error that is not finite exceeds the bound
             peak = 1 / np.abs(1 - np.abs(poles))
             driven = peak[:, None] * np.abs(into)
             wrong = np.abs(A @ V - V * poles) @ driven + np.abs(missed).reshape(n, taps, m).sum(axis=1)
@@ -321,7 +322,10 @@ class Lti(ReadOnly):
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
-        """The Schur form A = U S U* of the core states, with S upper triangular. Delay lines have it already."""
+        """The Schur form A = U S U* of the core states, with S upper triangular.
+
+        A lower triangular A, as that of delay lines, only needs its states in reverse order.
+        """
         core = self._lines[0]
         A = self.A[np.ix_(core, core)]
         if _is_lower(A):
@@ -339,8 +343,8 @@ class Lti(ReadOnly):
     def _rest(self) -> tuple[Array, Array]:
         """G(1), shape (..., p, m), and R = C (I - A)^-1, shape (..., p, n).
 
-        An exact block that was composed of others computes them from its parts: closing a loop at z = 1 costs far less
-        than eliminating all states of the closed loop. Raises SingularLoop if A has the eigenvalue one.
+        An exact block that was composed of others computes both from these parts, because closing a loop at z = 1 takes
+        far less work than eliminating all states of the closed loop. Raises SingularLoop if A has the eigenvalue one.
         """
         if from_parts := self.__dict__.get("_parts"):
             try:
@@ -437,7 +441,7 @@ class Lti(ReadOnly):
         """
         T = _common_period(self, other)
         S = inverse(eye(self.outputs, T) + times(self.D, other.D))
-        # y = S (C x - D_G C_H h + D_G u), and the feedback block is driven by y
+        # y = S (C x - D_G C_H h + D_G u) is the input of the feedback block, whose state is h
         y_u = times(S, self.D)
         y_x = _block([[times(S, self.C), -times(y_u, other.C)]])
         u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - times(other.D, y_x)
@@ -469,7 +473,7 @@ def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) 
     total = residues @ (1 / (points - poles[:, None]))
     if weights.size:
         late = _powers(1 / points, weights.shape[1])
-        total.real += weights @ late.real.copy()  # OpenBLAS takes 50 times as long for complex matrices of few rows
+        total.real += weights @ late.real.copy()  # OpenBLAS is 50 times slower with complex matrices of few rows
         total.imag += weights @ late.imag.copy()
     return total
 
@@ -565,7 +569,7 @@ def _matrix(*rows: Sequence[Complex]) -> Complex:
 
 
 def _product(G: Any, H: Any) -> Any:
-    """Return G @ H. Small matrices are multiplied entry by entry, which is far faster than a call for each pair."""
+    """Return G @ H. Small matrices are multiplied entry by entry, which is far faster than a product per pair."""
     if G.shape[-1] == 1:
         return G * H
     if G.shape[-2:] == H.shape[-2:] == (2, 2):
@@ -592,7 +596,7 @@ def vstack(*blocks: Any) -> Any:
 
 
 def hstack(*blocks: Any) -> Any:
-    """Add the outputs of several blocks; their inputs stand side by side."""
+    """Add the outputs of several blocks, each with its own inputs."""
     first = blocks[0]
     if isinstance(first, Sampled):
         return first._with(_block([[b.G for b in blocks]]))

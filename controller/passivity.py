@@ -1,4 +1,4 @@
-"""A lower bound of the least eigenvalue of He G over the whole unit circle, between the points of any grid, too."""
+"""A lower bound of the least eigenvalue of He G at all points of the unit circle, not only at those of a grid."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array, Lti
 
-_FIRST = 64  # intervals of [0, pi]
-_EVALUATIONS = 1 << 15  # for up to 8 states, about half a second; fewer for more states
-_REACH = 0.5  # an interval is bounded only if its half-width is at most this part of the distance that R0 gives
+_FIRST = 64  # number of intervals of [0, pi] at the start
+_EVALUATIONS = 1 << 15  # largest number of intervals for up to 8 states, about half a second; fewer for more states
+_REACH = 0.5  # largest half-width of an interval with a bound, in units of the reciprocal norm of the resolvent
 _UNIT = 2.0**-53
-_NOISE = 1e-4  # in every state, beside the noise at the inputs
-_INFLATED = 1.001  # covers the rounding of norms
-_TOGETHER = 2**18  # entries of resolvents that are held at once
+_NOISE = 1e-4  # covariance of a noise in every state, relative to that of the noise at the inputs
+_INFLATED = 1.001  # factor on norms against rounding
+_TOGETHER = 2**18  # largest number of entries of resolvents in memory
 
 
 def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, float, float]:
-    """Bound the least eigenvalue of He G(e^jw) from below over all w, by intervals that are halved where it is needed.
+    """Bound the least eigenvalue of He G(e^jw) from below over all w, by intervals that are halved where necessary.
 
-    With R = (zI - A)^-1, |G'| and |G''| on an interval follow from R at its middle, so that a narrow resonance cannot
-    hide: |R| is large around it, and the intervals there become short. On an interval of half-width h around w0,
-    He G >= He [G(w0) + t G'(w0)] - h^2 M/2 for |t| <= h, M >= |G''|, and its least eigenvalue is concave in t, so
-    that both ends decide. An a-priori bound of the rounding error of R and of the products is subtracted.
+    R = (zI - A)^-1 at the middle of an interval bounds |G'| and |G''| on it. Near a narrow resonance |R| is large and
+    the intervals become short, so that no resonance is missed. On an interval of half-width h around w0,
+    He G >= He [G(w0) + t G'(w0)] - h^2 M/2 for |t| <= h, M >= |G''|. The least eigenvalue of the right side is concave
+    in t, so it is evaluated at both ends only. An a-priori bound on the rounding errors is subtracted.
 
     Args:
-        G: A stable block of floats; it is real, so that [0, pi] is enough.
-        enough: A lower bound of at least this is not refined.
-        unwanted: The search ends at a frequency with a least eigenvalue below this.
+        G: A stable block of floats. It is real, so that the interval [0, pi] is enough.
+        enough: The lower bound at which an interval is not halved any more.
+        unwanted: The search ends at a frequency whose least eigenvalue is below this number.
 
     Returns:
         (the lower bound, the least eigenvalue that was evaluated, its frequency [rad/sample]).
@@ -60,23 +60,24 @@ def _balanced(G: Lti) -> Lti:
     """Return the same block with states scaled by powers of two, which is exact."""
     if not G.order:
         return G
-    import scipy.linalg  # no help has to wait for it
+    import scipy.linalg  # slow to load
 
-    with np.errstate(invalid="ignore"):  # SciPy casts entries that it does not use where A is nilpotent
+    with np.errstate(invalid="ignore"):  # SciPy casts unused entries if A is nilpotent
         A, scale = scipy.linalg.matrix_balance(G.A, permute=False)
     size = np.diag(scale)
     return Lti(A, G.B / size[:, None], G.C * size, G.D, G.T)
 
 
-_IDLE = 1e-13  # singular value, beside the largest, of a direction of the inputs that counts as idle
+_IDLE = 1e-13  # smaller singular values, relative to the largest one, belong to idle directions
 _Lost = tuple[float, float, float]
 
 
 def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
-    """Return Q'GQ, where an orthonormal Q leaves out directions that are zero at every frequency.
+    """Return Q'GQ, where an orthonormal Q omits the directions in which G is zero at every frequency.
 
-    He G is zero in such a direction, as that of two contacts that move alike, which no finite number of intervals
-    would decide. The second value holds the norms of what Q leaves out of B, C and D, or None where that is nothing.
+    He G is zero in these directions, an example of which is the difference of two contacts with the same motion. No
+    finite number of intervals could decide the sign of zero. The second value holds the norms of the omitted parts of
+    B, C and D, or None if Q omits no direction.
     """
     rows = [part / max(float(np.linalg.norm(part)), 1e-300) for part in (G.B, G.C.T, G.D, G.D.T)]
     _, sizes, V = np.linalg.svd(np.vstack(rows))
@@ -91,11 +92,12 @@ def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
 
 
 def _norms(G: Lti) -> list[tuple[Array, Array]]:
-    """Return L and L^-1 (n, n): for states L^-1 x the norm of the resolvent tells how far the poles are.
+    """Return pairs L, L^-1 (n, n) of coordinates L^-1 x of the states in which the resolvent's norm is computed.
 
-    Any L gives a valid bound, and the better one counts: the states as they are, and states that are even under noise.
+    Every L gives a valid bound, and the best one is used. L is I, and a root of the states' covariance under noise,
+    in whose coordinates the norm is often smaller.
     """
-    import scipy.linalg  # no help has to wait for it
+    import scipy.linalg  # slow to load
 
     one = np.eye(G.order)
     if not G.order:
@@ -111,7 +113,7 @@ def _norms(G: Lti) -> list[tuple[Array, Array]]:
 def _bounded(
     G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array
 ) -> tuple[Array, Array]:
-    """Return lower bounds (k,) over |w' - w| <= half, and least eigenvalues (k,) at w."""
+    """Return lower bounds (k,) for |w' - w| <= half, and the least eigenvalues (k,) at w."""
     A, B, C, D = G.A, G.B, G.C, G.D
     n, m = B.shape
     if not n:
@@ -139,17 +141,17 @@ def _bounded(
 
 
 def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
-    """Bound |G(e^jv)| over the complex v with |v - w| <= radius, and the rounding error of its value at real ones.
+    """Bound |G(e^jv)| for all complex v with |v - w| <= radius, and the rounding error of G(e^jv) for real v.
 
     With R0 at the middle and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0 has |R| <= |R0|/(1 - d |R0|).
 
     Args:
         G: A stable block of floats.
         w: (k,) middles [rad/sample].
-        radius: (k,) radii, up to which nothing is near a pole for the bounds to be finite.
+        radius: (k,) radii [rad/sample].
 
     Returns:
-        (the bounds, the rounding errors), (k,) each, Frobenius norms; inf where half of 1/|R0| is exceeded.
+        (the bounds, the rounding errors), (k,) each, as Frobenius norms; inf if d exceeds half of 1/|R0|, near a pole.
     """
     G = _balanced(G)
     n, m = G.B.shape

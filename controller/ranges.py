@@ -1,7 +1,7 @@
-"""Environments that are not known exactly: ranges of a network's parameters, their vertices, and points inside.
+"""Uncertain environments: ranges of a network's parameters, their vertices, and random points within them.
 
-The vertices are the environments in which every uncertain parameter is at an end of its range, and every contact
-that may be absent is there or not. An absent spring stays in its network with neither stiffness nor damping.
+At a vertex every uncertain parameter is at an end of its range, and every contact that may be absent is present or
+absent. An absent spring remains in its network with neither stiffness nor damping.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from haptic_loop.controller.lti import Array
 
 _Range = tuple[float, float]
 
-_MOST_VERTICES = 128  # each is a world of the design and a proof
+_MOST_VERTICES = 128  # each vertex is an environment of the design and needs a proof
 
 
 class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The ranges of one spring's parameters; where no range is given the environment's own value holds."""
+    """The ranges of one spring's parameters; a parameter without a range has the environment's value."""
 
     between: tuple[str, str]
     stiffness: _Range | None = None  # [N/m]
     damping: _Range | None = None  # [N s/m]
-    absent: bool = False  # the spring may also be missing altogether: a contact lost, or not made yet
+    absent: bool = False  # whether the spring may also be absent, as before or after a contact
 
     def __post_init__(self) -> None:
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
@@ -52,12 +52,12 @@ class Member:
     """One environment within ranges."""
 
     name: str
-    network: Any  # a Network where ranges are, any Environment where none are
+    network: Any  # a Network if there are ranges, otherwise any Environment
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the ranges in which only numbers vary: every contact is either present or absent."""
+    """A part of the ranges in which only numbers vary, because every contact is either present or absent."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
@@ -65,9 +65,9 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """Return the environment, then the vertices of the ranges that differ from it, or 128 of more vertices.
+    """Return the environment, then all vertices of the ranges that differ from it, or 128 of them if there are more.
 
-    Raises ValueError naming the field where the ranges do not fit the network, or are of too many parameters.
+    Raises ValueError with the field's name if the ranges do not fit the network or have too many parameters.
     """
     parts = _parts(network, ranges)
     corners = dict.fromkeys(tuple(p.corners[i] for p, i in zip(parts, at, strict=True)) for at in _vertices(parts))
@@ -77,15 +77,16 @@ def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
 
 
 def number_of_vertices(network: Network, ranges: Ranges) -> int:
-    """Count every combination of ends, and of contacts that are there or absent."""
+    """Return the number of combinations of ends, and of present or absent contacts."""
     return prod(len(part.corners) for part in _parts(network, ranges))
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Return the corner of every part: all combinations, or 128 in which any three ends meet in every combination.
+    """Return the corner of every part: all combinations, or 128 that contain every combination of any three ends.
 
-    These are the words of a linear code. A bit of a corner's number is the parity of the word's number and a mask of
-    its own; all masks have the highest bit, so that no two of them add up to a third: any three are independent.
+    The 128 combinations are the words of a linear code. Each bit of a corner's number is the parity of the word's
+    number and the mask of this bit. All masks have the highest bit, so that no sum of two is a third one. Any three
+    masks are therefore independent.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -98,23 +99,23 @@ def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     own = [[next(masks) for _ in range(count)] for count in bits]
     return [
         tuple(
-            sum(((word & mask).bit_count() & 1) << i for i, mask in enumerate(some)) % size
-            for some, size in zip(own, sizes, strict=True)
+            sum(((word & mask).bit_count() & 1) << i for i, mask in enumerate(bit_masks)) % size
+            for bit_masks, size in zip(own, sizes, strict=True)
         )
         for word in range(_MOST_VERTICES)
     ]
 
 
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
-    """Return the ranges as one region for every way in which its contacts can be there or absent."""
+    """Return the ranges as one region for every combination of present and absent contacts."""
     parts = _parts(network, ranges)
     return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
 
 
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
-    """Draw `count` environments from the ranges, uniformly; a contact that may be absent is absent half of the time.
+    """Draw `count` environments uniformly from the ranges; a contact that may be absent is so with probability 1/2.
 
-    The first are the same whatever the count.
+    A larger count adds environments to the same first ones.
     """
     parts, rng = _parts(network, ranges), np.random.default_rng(seed)
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
@@ -122,21 +123,21 @@ def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Mem
 
 @dataclass(frozen=True)
 class _State:
-    """One state of an uncertain part, present or absent: its ranges in that state, and the part at given values."""
+    """One state of an uncertain part, present or absent, with the ranges of this state."""
 
-    ranges: tuple[_Range, ...]  # those of some width
-    value: Callable[[Sequence[float]], Spring | float]
+    ranges: tuple[_Range, ...]  # without ranges of width 0
+    value: Callable[[Sequence[float]], Spring | float]  # the part, from one number in each of the ranges
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One uncertain part: its values at each of its vertices, and between them."""
+    """One uncertain part, a spring or a mass: its values at its corners and between them."""
 
     place: str  # a spring's ends, or a node
     corners: tuple[Spring | float, ...]
-    own: Spring | float  # as it is in the environment
+    own: Spring | float  # the part of the environment
     draw: Callable[[np.random.Generator], Spring | float]
-    states: tuple[_State, ...]  # there, or absent
+    states: tuple[_State, ...]  # present, and absent if it may be
 
     def label(self, value: Spring | float) -> str:
         if not isinstance(value, Spring):
@@ -202,7 +203,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
 
 
 def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
-    """Return a spring that is present; a range of no width is not a coordinate."""
+    """Return the state of a present spring; a range of width 0 is no coordinate."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:

@@ -1,4 +1,4 @@
-"""The tick: the steps of the computer every T seconds, and their times.
+"""The tick: the steps of the computer every T seconds, and their order.
 
         tick k, at time kT
           1  x = encoder positions, sampled                (the plant's state just before kT)
@@ -8,10 +8,10 @@
           5  commit the discrete states                    (the plant's state just after kT)
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
-Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
-[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Touching walls and limited forces (controller.law)
-add a small complementarity problem; actuators clip forces.
-With varying delays Theta is not in the block: its forces pass through a delay line that holds (controller.delay).
+Steps 2, 3 and 5 together are one linear state-space block, so that a tick is one matrix product
+[f; z+] = [C D; A B] [z; x] for any number of simulations. Touching walls and limited forces (controller.law) add a
+small complementarity problem, and actuators clip forces.
+With varying delays Theta is not part of the block. The forces then pass through a delay line (controller.delay).
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.law import Law, Transition
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
 
-RunBlock = Callable[[int], None]  # runs this number of ticks from row 0
+RunBlock = Callable[[int], None]  # runs a number of ticks from row 0
 
-_PART = 128  # number of ticks of a block that fits into the cache
+_PART = 128  # number of ticks whose rows fit into the cache
 _ROUNDED = 1e-14  # relative rounding error of a force vector that was scaled to its limit
-_CALM = 1 - 1e-9  # share of the limit above which the limiter acts
+_CALM = 1 - 1e-9  # forces above this multiple of their limit may need the limiter
 
 
 class Net(Protocol):
-    """A nonlinear step with memory between the forces of F and the devices, made anew for every record.
+    """A nonlinear step with memory between the forces of F and the devices. Every record has its own net.
 
-    `send` and then `apply` change forces (m, nsim) [N] in place at every tick; packets travel in between.
+    At every tick `send` changes forces (m, nsim) [N] in place before the delays, and `apply` after them.
     """
 
     def send(self, x: Array, force: Array, /) -> None:
@@ -52,7 +52,7 @@ class Net(Protocol):
         ...
 
     def figures(self) -> NetFigures:
-        """Return the figures of its action so far."""
+        """Return figures of the net's action so far."""
         ...
 
 
@@ -61,11 +61,11 @@ class Process(ReadOnly):
     """A law with force limits, encoder steps, varying delays and a net."""
 
     law: Law  # with the constant delays of the loop
-    force_limit: Array  # (m,) [N], inf where there is none
+    force_limit: Array  # (m,) [N], inf without a limit
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
     net: Callable[[int], Net] | None = None  # makes a net for a number of simulations
-    balls: tuple[slice, ...] = ()  # neighbouring channels with one limit, which bounds the length of their force vector
+    balls: tuple[slice, ...] = ()  # neighbouring channels with one limit for the length of their force vector
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -84,7 +84,7 @@ class Process(ReadOnly):
 
     @cached_property
     def ticked(self) -> Law:
-        """The law of a tick, without Theta if forces travel as packets."""
+        """The law of a tick, without Theta if forces are sent as packets."""
         return self.law if self.delays is None else self.law.without_theta
 
     @property
@@ -132,7 +132,7 @@ class Process(ReadOnly):
 
 
 def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-    """Return where forces (ticks, m, nsim) are at the actuators' limits (m,) [N]; balls count as a whole."""
+    """Return whether each force (ticks, m, nsim) is at the limit (m,) [N] of its actuator or of its ball."""
     clipped = np.abs(force) >= force_limit[:, None]
     for ball in balls:
         length = np.linalg.norm(force[:, ball], axis=1, keepdims=True)
@@ -143,10 +143,9 @@ def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> N
 class StepBuffer:
     """The record of a block of ticks, in a layout that the loop writes without copying.
 
-    A row holds [z, s, w, f] of one tick for all simulations: process state, plant state (whose first
-    `channels` entries are the measured positions x), outside forces, and forces fed back; the next row
-    begins with z+. So [z, x] is the tick's input, [f, z+] its output and [w, f] the plant's input, each one
-    contiguous slab of memory.
+    A row holds [z, s, w, f] of one tick for all simulations: the process state, the plant state, whose first
+    `channels` entries are the positions x, the external forces, and the forces fed back. The next row begins with z+.
+    So the tick's input [z, x], its output [f, z+] and the plant's input [w, f] are contiguous in memory.
     """
 
     def __init__(
@@ -156,7 +155,7 @@ class StepBuffer:
         plant_states: int,
         outside: int = 0,
         nsim: int = 1,
-        transition: Transition | None = None,  # replaces that of the process
+        transition: Transition | None = None,  # replaces the process's own
     ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
@@ -178,7 +177,7 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether to try the next ticks by the linear law alone: no force is near its limit
+        #: whether no force is near its limit, so that the linear law alone is tried for the next ticks
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
         for ball in process.balls:  # No vector within this box is longer than the limit.
@@ -191,13 +190,13 @@ class StepBuffer:
         if self.clips:
             bounds += enumerate(most)
         self._bounds = bounds if self._straight else []
-        self._asked = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
+        self._bounded = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
 
     @cached_property
     def _transition(self) -> Transition:
         return self._given or self.process.ticked.transition()
 
-    # Views are made once and only if they are used: making one costs as much as a small product.
+    # Views are made once, and only if they are used, because making one takes as long as a small product.
 
     @cached_property
     def plant_state(self) -> list[Array]:
@@ -225,16 +224,16 @@ class StepBuffer:
         return list(self.after)
 
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
-        """Return the first of these ticks in which a force is nan or above `most` of its limit, else `ticks`."""
-        for forces, limit in self._asked:
+        """Return the first of `ticks` ticks in which a force is nan or above `most` times its limit, else `ticks`."""
+        for forces, limit in self._bounded:
             sent, limit = forces[:ticks], most * limit
             if not (sent.max() <= limit and sent.min() >= -limit):
-                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._asked]
+                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._bounded]
                 return int(np.all(within, axis=0).argmin())
         return ticks
 
     def tick(self, k: int) -> None:
-        """Do steps 1, 2, 3 and 5 for row k, whose plant state has been written: write f[k] and z[k + 1]."""
+        """Write f[k] and z[k + 1] from the plant state of row k, by steps 1, 2, 3 and 5."""
         seen = self.seen(k)
         self._transition(seen, self.law_output[k])
         if self.net is not None:
@@ -255,7 +254,7 @@ class StepBuffer:
         return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
     def rewind(self, ticks: int) -> None:
-        """Start a new block from the states after `ticks` ticks of this one."""
+        """Start a new block from the states after the first `ticks` ticks of this one."""
         self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
@@ -263,10 +262,10 @@ class StepBuffer:
 
 
 class FusedTicks:
-    """One product for the plant's step and the law of the next tick: [f; z+; s] of the next tick.
+    """One matrix product for the plant's step and the law of the next tick, with the result [f; z+; s].
 
-    A row of the memory is [w, f, z+, s, a] of a tick, where the entries a belong to the engine. The next s is
-    A s + B [w; f] + G a; without B the product reads a row from z+ on.
+    A row of the memory is [w, f, z+, s, a] of a tick, where the engine sets the entries a. The next s is
+    A s + B [w; f] + G a. Without B the product uses only [z+, s, a].
     """
 
     def __init__(self, buffer: StepBuffer, A: Array, B: Array | None = None, G: Array | None = None) -> None:
@@ -284,7 +283,7 @@ class FusedTicks:
         self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
 
     def copied(self, n: int) -> tuple[list[memoryview], ...]:
-        """Return memory views of [w, f] and a of each row, and of n positions and velocities of the next row."""
+        """Return memory views of [w, f] and a in each row, and of n positions and n velocities in the next row."""
         numbers, row, (to_z, to_s, to_a) = self._numbers, self._row, self._ends
         q = row + to_s
         ranges = (0, to_z), (to_a, row), (q, q + n), (q + n, q + 2 * n)

@@ -1,7 +1,7 @@
 """The unit of positions: m, or rad for rotary devices, with N m, N m s/rad and kg m2 in place of N, N s/m and kg.
 
-The equations are the same for both. Every text of the program is written for metres; `in_unit` writes it for radians
-where it leaves the program: on the screen, in a picture, in a file's header or key.
+The equations are the same for both. The program's texts use metres. `in_unit` converts them for radians when they are
+printed, drawn, or written to a file's header or keys.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 PositionUnit = Literal["m", "rad"]
 _spoken: ContextVar[PositionUnit] = ContextVar("unit", default="m")
-#: unit in a text -> the rotary one; of N, m and g alone only after a number, a list or an opening bracket
+#: from a unit in a text to the rotary unit; N, m and g alone are units only after a number, a list or a bracket
 _ROTARY = {"N s/m": "N m s/rad", "N/m": "N m/rad", "m/N": "rad/(N m)", "m/s": "rad/s", "kg": "kg m2"}
 _ALONE = {"N": "N m", "m": "rad", "g": "g m2"}
 _WORDS = re.compile(
@@ -25,45 +25,45 @@ _KEYS = {"n_per_m": "nm_per_rad", "mm": "mrad", "um": "urad", "m": "rad", "n": "
 
 
 def speak(unit: PositionUnit) -> None:
-    """Set the unit of what this command prints and writes."""
+    """Set the unit of this command's output."""
     _spoken.set(unit)
 
 
 def speak_of(meta: Any) -> None:
-    """Set the unit of a stored trace, from its meta data as they were read."""
+    """Set the unit of this command's output to that of a stored trace with these meta data."""
     speak("rad" if isinstance(meta, dict) and meta.get("unit") == "rad" else "m")
 
 
 def spoken() -> PositionUnit:
-    """Return the unit of what this command prints and writes."""
+    """Return the unit of this command's output."""
     return _spoken.get()
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
-    """Return a text about metres in the unit `unit`, by default that of this command. Applying it twice is once."""
+    """Return a text with metres in `unit`, by default that of this command's output. A converted text is unchanged."""
     return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
 
 
 def with_unit(meta: dict[str, Any]) -> dict[str, Any]:
-    """Return a trace's meta data with "unit" where it is that of rotary devices."""
+    """Return a trace's meta data, with "unit" if positions are in radians."""
     return meta | {"unit": "rad"} if spoken() == "rad" else meta
 
 
 def comments_in_unit(source: str) -> str:
-    """Return a C source with the comments in this command's unit; its code is unchanged."""
+    """Return a C source with comments in the unit of this command's output; its code is unchanged."""
     return re.sub(r"/\*.*?\*/", lambda comment: in_unit(comment[0]), source, flags=re.DOTALL)
 
 
-def _rotary(found: re.Match[str]) -> str:
-    if small := found["small"]:
+def _rotary(match: re.Match[str]) -> str:
+    if small := match["small"]:
         return f"{small}rad"
-    if found["unit"]:
-        return found["prefix"] + _ROTARY[found["unit"]]
-    return found["milli"] + _ALONE[found["alone"]]
+    if match["unit"]:
+        return match["prefix"] + _ROTARY[match["unit"]]
+    return match["milli"] + _ALONE[match["alone"]]
 
 
 def keys_in_unit(report: Any) -> Any:
-    """Return plain data with the keys and texts of this command's unit: encoder_step_m becomes encoder_step_rad."""
+    """Return plain data with keys and texts in this command's unit: encoder_step_m becomes encoder_step_rad."""
     if spoken() == "m":
         return report
     if isinstance(report, dict):

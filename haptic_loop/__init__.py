@@ -3,20 +3,20 @@
     from haptic_loop import load, simulate, validate, design_coupling, certify
 
 load("omega-pair"), parse(text)     Return a Scenario, from a TOML file, a packaged name, or a text.
-Scenario.loop("I")                  Return the Loop of a scenario: all that a design may know of it.
+Scenario.loop("I")                  Return the Loop of a scenario: all data that a design may use.
 design_coupling(loop, kind)         Return a Design: the best coupling of a kind. DesignOptions lists the options.
 certify(loop, coupling)             Return a Requirement per condition: the damping that the coupling needs.
 assess(loop, coupling)              Return an Assessment: requirements, force limits, and the guarantee or a reason.
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
-simulate(scenario, coupling)        Return a Trace: a run with the people of the scenario, tick by tick.
-validate(scenario, coupling)        Return Findings: the growth of the loop with many random people.
-linearise(world, pose)              Return the Network that a MuJoCo scene is near a pose.
-rehearse(scenario)                  Return a Rehearsed: a whole session with an emulated device, in virtual time.
+simulate(scenario, coupling)        Return a Trace: a run with the humans of the scenario, tick by tick.
+validate(scenario, coupling)        Return Findings: the growth of the loop with many random humans.
+linearise(world, pose)              Return a Network, the linear model of a MuJoCo scene near a pose.
+rehearse(scenario)                  Return a Rehearsed: a session with an emulated device, in virtual time.
 trace.plot(path), trace.to_frame()  Draw a Trace; return it as a pandas data frame.
 
 Couplings: SpringDamper, NoCoupling. Devices: RigidDevice, CompliantDevice. Environments: Network, with Spring
-and Wall, and RIGID_WALL. InputError and DesignFailed are ValueErrors. Names are imported on first use, so that no
-command waits for a library that it does not need.
+and Wall, and RIGID_WALL. InputError and DesignFailed are ValueErrors. Names are imported on first use, so that commands
+start quickly.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "controller").is_dir():
 
 
 def _command_starts() -> bool:
-    """Return whether this process runs one of our commands, which Python may still be looking up."""
+    """Return whether this process runs a command of this package; Python may not have resolved its module yet."""
     words, started = sys.orig_argv, sys.argv[0] if sys.argv else ""
     module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
     files = (os.path.join(*module.split("."), "__main__.py"), os.path.join(*module.split(".")) + ".py")
@@ -94,8 +94,8 @@ def _command_starts() -> bool:
     return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
 
 
-# No command renders through MuJoCo's OpenGL context. Its import takes longer than the rest of MuJoCo, and fails where
-# MUJOCO_GL names a backend that is not installed. A user's script keeps its setting.
+# No command renders through MuJoCo's OpenGL context. Its import takes longer than the rest of MuJoCo, and fails if
+# MUJOCO_GL names a backend that is not installed. The setting of a user's script is not changed.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
 
@@ -107,5 +107,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the names for scripts, and what every package has."""
+    """List the public names and the attributes of every package."""
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
