@@ -299,7 +299,7 @@ def test_damping_in_one_sitting_is_refused(tmp_path):
     one.write_text(text.replace('kind = "compliant"', 'kind = "rigid"\nmass = 0.25'))
     for sittings, code in ((2, 1), (3, 0)):
         out = tmp_path / str(sittings)
-        options = f"--rehearse --scenario {one} --measure 60 --seconds 0.8 --travel 8 --coulomb 0.02 --hand 0.3"
+        options = f"--rehearse --scenario {one} --measure 60 --seconds 0.5 --travel 8 --coulomb 0.02 --hand 0.3"
         assert identify_command([*options.split(), "--sittings", str(sittings), "--out", str(out)]) == code
         report = json.loads((out / "report.json").read_text())
         assert report["bounded"] == (code == 0) == (out / "devices.toml").exists()

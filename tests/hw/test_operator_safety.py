@@ -253,7 +253,7 @@ def test_the_preflight_says_what_the_machine_can_do():
     begun = time.monotonic()
     line = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True).stdout
     assert time.monotonic() - begun > 2.0
-    for words in ("pre-flight: ", "real-time scheduling", "memory ", "latency timer", "clock ", "worst stall in 2 s"):
+    for words in ("pre-flight: ", "real-time scheduling", "memory ", "latency timer", "worst stall in 2 s"):
         assert words in line
     assert line.count("\n") == 1
 
