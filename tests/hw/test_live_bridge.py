@@ -30,6 +30,7 @@ from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.protocol import Phase
 from haptic_loop.hw.recording import load as read
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import IncidentLog
@@ -37,6 +38,7 @@ from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError
 from tests.asked import decisive
 from tests.pseudo_terminal import EmulatorProcess, emulated
+from tests.sessions import rehearsal_of
 
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
@@ -150,29 +152,25 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     ("name", "stage"), [("SIGINT", Stage.FINISHED), ("SIGTERM", Stage.FINISHED), ("SIGUSR1", Stage.ESTOP)]
 )
 def test_a_signal_while_forces_act(scenario, name, stage):
-    """At slow pace: SIGINT and SIGTERM end in a ramp of 100 ms, SIGUSR1 in an emergency stop, at once and latched."""
+    """In virtual time: SIGINT and SIGTERM end in a ramp of 100 ms, SIGUSR1 in an emergency stop that is latched."""
 
     def watch(session):
         if session.stage == Stage.ARMED and not sent:
             sent.append(name)
             signal.raise_signal(getattr(signal, name))
 
-    for pace in PACES:
-        emulator, sent = EmulatorProcess(f"--pace={pace}"), []
-        session, _ = run(
-            emulator, scenario, lambda ages: [certified_coupling(scenario, "I", None, None, 2)], watch, pace
-        )
-        ended = emulator.end()
-        assert ended["phase"] in AT_REST
-        stages = [event.stage for event in session.log]
-        if sent and session.stage == stage:  # else the machine was too busy, before or after the signal
-            break
-    else:
-        pytest.fail(f"never armed and stopped by {name}, at last {session.stage}: {session.cause}")
+    sent, plan = [], lambda ages: [certified_coupling(scenario, "I", None, None, 2)]
+    rehearsal = rehearsal_of(scenario, ())
+    session = rehearsal.session
+    live = Live(session, rehearsal._driver.device, plan, Operator(True, 20.0), watch=watch)
+    live.clock = lambda: round(rehearsal.now)
+    live.run()
+    stages, ended = [event.stage for event in session.log], rehearsal.emulator.device.phase
+    assert ended.name.lower() in AT_REST
     assert session.cause == name
     if stage == Stage.ESTOP:
         assert stages[-2:] == [Stage.ARMED, Stage.ESTOP]
-        assert ended["phase"] == "estop"
+        assert ended == Phase.ESTOP
         return
     assert stages[-3:] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
     at = {event.stage: event.t_us for event in session.log}
