@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
@@ -49,14 +51,27 @@ class Move(Protocol):
     def __call__(self, done: int, total: int, what: str = ...) -> None: ...
 
 
+_SILENCE = 2.0  # [s] after which a command that prints nothing says what it does
+
+
 @contextmanager
 def progress(description: str) -> Iterator[Move]:
-    """Show a progress bar on standard error if that is a terminal; yields the function that moves it."""
+    """Show a progress bar on standard error; yields the function that moves it.
+
+    If standard error is no terminal, one line says after two seconds what the command waits for.
+    """
     from rich.console import Console
 
     terminal = Console(stderr=True)
     if not terminal.is_terminal:
-        yield lambda done, total, what=description: None
+        now = [description]
+        line = threading.Timer(_SILENCE, lambda: print(f"{now[0]} ..", file=sys.stderr, flush=True))
+        line.daemon = True
+        line.start()
+        try:
+            yield lambda done, total, what=description: now.__setitem__(0, what)
+        finally:
+            line.cancel()
         return
     from rich.progress import Progress
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -106,7 +107,8 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
             continue
         if needs[target].certified:
             error = decibels(transparency_of(loop, design).rms_mismatch)
-            designs.append((error, f"--coupling {other} --condition {target} ({error:z.2f} dB rms)"))
+            felt = f"{error:z.2f} dB rms" if math.isfinite(error) else "exact"
+            designs.append((error, f"--coupling {other} --condition {target} ({felt})"))
     return "certified instead: " + ", ".join(words for _, words in sorted(designs)) if designs else ""
 
 

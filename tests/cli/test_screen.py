@@ -3,11 +3,14 @@
 import ast
 import io
 import re
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from rich.table import Table
 
+from haptic_loop.cli import render
 from haptic_loop.cli.screen import Screen
 
 ROOT = Path(__file__).parents[2]
@@ -69,3 +72,18 @@ def test_our_own_tags_are_colours():
         "[red]not guaranteed[/]: [m]"
     )
     assert text.getvalue() == "\x1b[31mnot guaranteed\x1b[0m: [m]\n"
+
+
+def test_a_pipe_is_told_what_a_command_waits_for(capsys, monkeypatch):
+    monkeypatch.setattr(render, "_SILENCE", 0.0)
+    with render.progress("designing the coupling"):
+        for _ in range(2000):
+            time.sleep(0.005)
+            if said := capsys.readouterr().err:
+                break
+    assert said == "designing the coupling ..\n"
+    monkeypatch.setattr(render, "_SILENCE", 1e3)
+    with render.progress("designing the coupling"):
+        pass
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    assert all(timer.finished.is_set() for timer in timers)
