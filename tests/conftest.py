@@ -25,9 +25,13 @@ settings.register_profile("no-clock", deadline=None, suppress_health_check=[Heal
 settings.load_profile("no-clock")
 
 
-#: files of the most seconds: begun first, so that no worker is alone with one at the end
-LONGEST = ("test_docs.py", "test_optimal.py", "test_live_bridge.py", "test_hostile.py", "test_limits.py")
-LONGEST += ("test_run.py", "test_budget.py", "test_ranges.py", "test_session.py", "test_identify.py")
+#: files of the most seconds, in this order: begun first, so that no worker is alone with one at the end
+LONGEST = (
+    *("test_docs.py", "test_known_device.py", "test_identify.py", "test_hostile.py", "test_optimal.py"),
+    *("test_session.py", "test_live_bridge.py", "test_combinations.py", "test_run.py", "test_spring_damper.py"),
+    *("test_budget.py", "test_world.py", "test_ranges.py", "test_ccl.py", "test_audit.py", "test_same_designs.py"),
+    *("test_uneven.py", "test_assessment.py", "test_api.py", "test_optimal_humans.py", "test_validate.py"),
+)
 
 
 #: when the minute of `make check` is over, which begins with lint; some tests are always run, nearest first, and what

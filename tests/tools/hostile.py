@@ -108,7 +108,7 @@ def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str
 
 
 def furnished(model: Path, place: Path) -> None:
-    shutil.copytree(model, place, symlinks=True, ignore=shutil.ignore_patterns("fifo"))
+    shutil.copytree(model, place, symlinks=True, ignore=shutil.ignore_patterns("fifo"), copy_function=shutil.copyfile)
     os.mkfifo(place / "fifo")
 
 
