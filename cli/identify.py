@@ -273,8 +273,8 @@ def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[Transmissio
         lines += ["[device.guaranteed]  # with 95 % confidence, at the forces of the record"]
         least, most = ("motor_mass_min", "transmission_damping_min"), "transmission_damping_max"
         lines += [f"{name} = {_floored(getattr(known, name), 6)}" for name in least]
-        lines += [f"{most} = {-float(_floored(-getattr(known, most), 6)):.6g}"]
-        stiffest = f"{-float(_floored(-known.transmission_stiffness_max, 0)):.6g}"
+        lines += [f"{most} = {-float(_floored(-getattr(known, most), 6))}"]
+        stiffest = -float(_floored(-known.transmission_stiffness_max, 0))
         return "\n".join([*lines, f"transmission_stiffness_max = {stiffest}", ""])
     if (transmission := e.transmission) is not None:
         motor, handle, stiffness = transmission.motor_mass, transmission.handle_mass, transmission.stiffness
