@@ -102,9 +102,10 @@ def _places(scene: Scene) -> tuple[int, ...]:
     return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
 
 
-def _scale(history: Array) -> float:
-    """Return a power of two [N] above every force."""
-    return float(2.0 ** np.ceil(np.log2(max(1.0, 1.05 * np.abs(history).max(initial=0.0)))))
+def _scale(history: Array, limit: Array) -> float:
+    """Return a power of two [N] above every force, and above a sixteenth of the largest limit of a force."""
+    least = min(1.0, float(np.max(limit)) / 16)
+    return float(2.0 ** np.ceil(np.log2(max(least, 1.05 * np.abs(history).max(initial=0.0)))))
 
 
 def _envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
@@ -240,7 +241,7 @@ class ShownScene:
         m = len(self._channels)
         width, height = picture.width // m, round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
-        top, drawn = _scale(frame.history), []
+        top, drawn = _scale(frame.history, self.force_limit), []
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
             own = self._channels[i]
@@ -629,7 +630,7 @@ class FlatPictures:
 
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         """Draw one plot for each device, side by side."""
-        m, most, middle = _devices(self.scene), _scale(frame.history), (top + bottom) / 2
+        m, most, middle = _devices(self.scene), _scale(frame.history, self.force_limit), (top + bottom) / 2
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         width = (_SIZE[0] - 20) / m
         for i in range(m):
