@@ -202,6 +202,19 @@ def test_the_cortex_m7_repeats_the_test_vector(teensy):
     assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
 
 
+def test_the_cortex_m7_limits_vectors(tmp_path):
+    """Two devices with three axes each: the limiter on balls repeats the ticks of Python to the last bit."""
+    words = "--scenario", "omega-space", "--out", str(tmp_path / "coupling.json")
+    assert design.main([*words]) == 0
+    process = ["--process", "--force-limit", "3", "--out", str(tmp_path / "coupling-process.c")]
+    assert export.main([str(tmp_path / "coupling.json"), *process]) == 0
+    text = (tmp_path / "coupling-process.c").read_text()
+    assert "vector" in text
+    build(tmp_path, "arm-none-eabi-gcc", *M7, "-DVECTOR", BOARDS / "m7_board.cpp", "-lm", "-o", "vector.elf")
+    done = subprocess.run([*QEMU, tmp_path / "vector.elf"], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
 def test_the_teensys_forces_are_those_of_python(teensy):
     folder, block = teensy
     handles = [Handle(0.25, 1.37, 1.2e-3) for _ in range(2)]
