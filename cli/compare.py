@@ -19,6 +19,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
+from haptic_loop.design.guarantees import held_torques
 from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite
 from haptic_loop.design.robustness import Nearby, Robustness
 from haptic_loop.sim.alternatives import Alternative, alternatives
@@ -75,7 +76,8 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in rows)):
         files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, rows)
-    render.publish(args, report, [_beside(rows, args.condition)], (), out, files, _nearest(rows))
+    tables = [_beside(rows, args.condition)]
+    render.publish(args, report, tables, _held_torques(scenario, args.case), out, files, _nearest(rows))
     return options.exit_code(True)
 
 
@@ -132,6 +134,11 @@ def _share(value: float | None, absent: str) -> str:
     return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
+def _held_torques(scenario: Scenario, case: str) -> list[str]:
+    torques = held_torques(scenario.loop(case))
+    return [f"Held torques: {torques}."] if torques else []
+
+
 # ----------------------------------------------------------------------------------------------------
 # Couplings over frequency.
 
@@ -142,7 +149,8 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
     prices = [line for c in report.couplings for line in _price(c.name, c.nearby)]
-    lines, tables = [*report.notes, *prices], [_guarantees(report), _feel(report)]
+    lines = [*report.notes, *prices, *_held_torques(scenario, args.case)]
+    tables = [_guarantees(report), _feel(report)]
     render.publish(args, report, tables, lines, out, files, _guaranteed(report))
     return options.exit_code(not failed)
 

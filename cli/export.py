@@ -30,6 +30,7 @@ from haptic_loop.design.export import (
     with_origin,
 )
 from haptic_loop.design.files import off_table, out_file, write
+from haptic_loop.design.guarantees import held_torques
 from haptic_loop.design.result import listed
 from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.scenario import InputError
@@ -105,7 +106,9 @@ def main(argv: list[str]) -> int:
     title = f"{block.name} as C99"
     proof = "the proof in its file was repeated" if verdict.proved else f"not proved: {verdict.reason}"
     written = f"Wrote {path}: {block.name} as C99; {proof}."
-    render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)], verdict=written)
+    torques = held_torques(stored.loop)
+    lines = [f"Held torques: {torques}."] if torques else []
+    render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)], lines, verdict=written)
     return options.exit_code(verdict.proved or not stored.certificate)
 
 

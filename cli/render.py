@@ -96,8 +96,7 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
         except DesignFailed as error:
             from haptic_loop.design.api import instead  # only after a failure
 
-            move(0, 1, "trying other designs")
-            if loop is None or not (others := instead(loop, kind or "spring-damper", condition)):
+            if loop is None or not (others := instead(loop, kind or "spring-damper", condition, move)):
                 raise
             raise type(error)(error.problem, error.results, f"{error.advice}; {others}") from error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
@@ -91,15 +91,21 @@ _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
 )
 
 
-def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> str:
+def instead(
+    loop: Loop,
+    kind: str,
+    condition: str | Condition | None = None,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> str:
     """Return the alternatives to a failed design in words, least rms mismatch first, or "".
 
     Each alternative is designed and certified here. Nothing is tried for varying delays.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
-    for other, target, options in _QUICK:
+    for i, (other, target, options) in enumerate(_QUICK):
         if (other, target) == failed or loop.varying_delay:
             continue
+        progress(i, len(_QUICK), f"{failed[0]} was refused, trying --coupling {other} --condition {target}")
         try:
             design = design_coupling(loop, other, target, **options)
             needs = certify(loop, design)

@@ -40,7 +40,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
-from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES
+from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES, held_torques
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
@@ -467,7 +467,7 @@ class Assessment:
     @property
     def held_torques(self) -> str | None:
         """A remark on held torques of devices with several axes, which no condition counts, or None."""
-        return "not charged: forces count as held in space while the pose moves on" if self.loop.axes else None
+        return held_torques(self.loop)
 
     def without_guarantee(self, reason: str) -> Assessment:
         """Return the assessment without its guarantee, for a reason outside the loop's data."""

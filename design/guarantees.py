@@ -66,3 +66,8 @@ class EncoderSteps:
             has += " N"
         enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has}"
         return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
+
+
+def held_torques(loop: Loop) -> str | None:
+    """Return the remark that no condition counts torques held by a moving device, or None for devices of one axis."""
+    return "not charged: forces count as held in space while the pose moves on" if loop.axes else None

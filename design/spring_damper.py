@@ -247,6 +247,10 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
         raise DesignFailed(None, (), f"{loop.channels} devices, allowed are {most} for a spring-damper by {what}")
 
 
+class _NoLinearDesign(DesignFailed):
+    """No coupling was found even for forces that are not limited."""
+
+
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
     """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
 
@@ -271,6 +275,8 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
         return design(loop, condition, **options)
     try:
         return design(loop, condition, limiter=True, **options)
+    except _NoLinearDesign:
+        raise  # a search without limits would repeat the one that failed
     except DesignFailed:
         if limiter:
             raise
@@ -324,7 +330,8 @@ def _for_this_environment(
     if many:
         starts = likeliest_first(sampled(), starts)
     coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
-    if limiter:  # The result is a little softer than without limits, so the search starts there.
+    nothing = coupling is None and not many
+    if limiter and not nothing:  # The result is a little softer than without limits, so the search starts there.
         limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
         coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
@@ -335,13 +342,13 @@ def _for_this_environment(
         certifies = "the this-environment condition certifies"
         if switching:
             certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
-        if limiter:
+        if limiter and not nothing:
             certifies += " while forces are limited"
         line = (
             f"no spring-damper was found that {certifies} for theta = {loop.theta}, psi = {loop.psi}, "
             f"delta = {loop.delta}"
         )
-        raise DesignFailed(None, (), line)
+        raise (_NoLinearDesign if limiter and nothing else DesignFailed)(None, (), line)
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
     if many:
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
@@ -449,10 +456,10 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
         gains = []
         for limits in _limits(axes, eta, z, _STIFF_RESERVE):
             most = 1 / (limits * steps).max()
-            optimum = minimize_scalar(
+            best: Any = minimize_scalar(
                 lambda B, limits=limits: -stiffest(B, limits), bounds=(0.0, most), method="bounded"
             )
-            gains.append((-float(optimum.fun), float(optimum.x)))
+            gains.append((-float(best.fun), float(best.x)))
         return -sum(K for K, _ in gains), gains
 
     tried = [at(eta) for eta in _ETAS]
