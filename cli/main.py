@@ -93,7 +93,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     `set -o pipefail`. SIGTERM ends a command like Ctrl-C: temporary files are removed.
     """
     code: str | int | None
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for child processes
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
     _load_on_first_use("f2py", "testing")  # SciPy's import names both without using them
     os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown backend would stop the import of matplotlib.
     _streams()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
 
+from haptic_loop.controller.arithmetic import one_blas_thread
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
@@ -42,6 +43,7 @@ class DesignOptions(TypedDict, total=False):
     seconds: float  # optimal: time after which no larger basis is tried
 
 
+@one_blas_thread
 def design_coupling(
     loop: Loop,
     kind: _Kind = "spring-damper",
@@ -118,6 +120,7 @@ def instead(
     return "certified instead: " + ", ".join(words for _, words in sorted(designs)) if designs else ""
 
 
+@one_blas_thread
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 

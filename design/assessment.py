@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.arithmetic import SingularLoop, one_blas_thread
 from haptic_loop.controller.budget import START_J
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Environment
@@ -493,6 +493,7 @@ class Assessment:
         }
 
 
+@one_blas_thread
 def assess(
     loop: Loop,
     coupling: Coupling | Design,

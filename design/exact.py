@@ -88,7 +88,7 @@ def _congruence(X: _Integers, M: _Integers) -> _Integers:
     import flint
 
     (n, m) = X.shape
-    bits = sum(max((int(v).bit_length() for v in part.flat), default=0) for part in (X, M))
+    bits = _longest(X) + _longest(M)
     spend(n * m * (n + m) * (_LIMBS + _BIT * bits))
     product = np.zeros(m * m, dtype=object)
     if X.size:
@@ -221,7 +221,7 @@ def _definite(W: _Integers, bits: int) -> bool:
 
 def _longest(W: _Integers) -> int:
     """Return the number of bits of the largest entry."""
-    return max((v.bit_length() for v in W.ravel().tolist()), default=0)
+    return max(map(int.bit_length, W.ravel().tolist()), default=0)
 
 
 def _dominates(W: Array) -> bool:

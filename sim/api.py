@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from haptic_loop.controller.arithmetic import one_blas_thread
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.arguments import number, of_kind, one_of, shown, whole
@@ -106,6 +107,7 @@ def _chosen(scenario: Scenario, coupling: Coupling | Design | str | Path | None)
     return given(coupling)
 
 
+@one_blas_thread
 def simulate(
     scenario: Scenario,
     coupling: Coupling | Design | str | Path | None = None,
@@ -199,6 +201,7 @@ def simulate(
     return replace(trace, meta=meta)
 
 
+@one_blas_thread
 def validate(
     scenario: Scenario,
     coupling: Coupling | Design | str | Path | None = None,

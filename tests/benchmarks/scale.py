@@ -1,6 +1,6 @@
 """What devices, delays, hands and seconds cost, beside what comes out: CPU seconds of one core.
 
-PYTHONPATH=. python tests/benchmarks/scale.py [devices|commands|delays|hands|duration ..]
+PYTHONPATH=.:tests python tests/benchmarks/scale.py [devices|commands|delays|hands|duration ..]
 """
 
 from __future__ import annotations
