@@ -82,17 +82,21 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return the verdict, the guaranteed coupling with the least force error."""
+    """Return the verdict: which coupling with a guarantee has the least force error, or else the most stiffness."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
-    best = min(guaranteed, key=lambda each: math.inf if each.force_error_percent is None else each.force_error_percent)
+
+    def distance(each: Alternative) -> tuple[float, float]:
+        static = 0.0 if each.dc_ratio is None else abs(1 - each.dc_ratio)
+        return math.inf if each.force_error_percent is None else each.force_error_percent, static
+
+    best = min(guaranteed, key=distance)
+    if best.force_error_percent is None and best.dc_ratio is None:
+        return "No force error was measured, and the object has no static stiffness: nothing tells which is nearest."
     error = render.optional(best.force_error_percent, "{:.3g} % force error", "no force error was measured")
-    static = (
-        "no static stiffness to render" if best.dc_ratio is None else f"{_share(best.dc_ratio, '-')} of the stiffness"
-    )
-    felt = f"{static}, {error}"
-    return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {felt}."
+    static = "no static stiffness" if best.dc_ratio is None else f"{_share(best.dc_ratio, '-')} of the stiffness"
+    return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {static}, {error}."
 
 
 def _beside(couplings: Sequence[Alternative], own: Condition | None) -> render.Table:

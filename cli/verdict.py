@@ -95,7 +95,7 @@ def verdict(
 
 
 SOFT_END = 1.001 * SOFTEST  # [N/m] a spring below is at the soft end of the search
-_NOTHING_DB, _NOTHING = -1.0, 0.01  # rms mismatch, and share of the stiffness, of a force that is as good as none
+_NOTHING_DB = -1.0  # rms mismatch above which a force is about as wrong as none, if there is no stiffness to render
 
 
 def _useless(assessment: Assessment) -> str:
@@ -105,7 +105,7 @@ def _useless(assessment: Assessment) -> str:
     where = ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
     if soft and all(soft):
         where = "all contacts"
-    if not where and felt and felt.rms_mismatch_db > _NOTHING_DB and not felt.dc_ratio > _NOTHING:
+    if not where and felt and felt.rms_mismatch_db > _NOTHING_DB and not felt.dc_ratio > 0:
         return "[red]Useless[/]: its force is about as wrong as no force."
     return f"[red]Useless[/] on {where}: it renders next to nothing there." if where else ""
 

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from haptic_loop.cli.compare import main
+from haptic_loop.cli.compare import _nearest, main
 from haptic_loop.cli.run import main as run_once
+from haptic_loop.sim.alternatives import Alternative
 from haptic_loop.sim.scenario import InputError
 
 
@@ -51,3 +52,9 @@ def test_walls_and_ranges_leave_out_other_couplings(tmp_path, name, kinds):
 def test_conditions_need_named_couplings(tmp_path):
     with pytest.raises(InputError, match="--condition"):
         main(["--condition", "any-environment", "--out", str(tmp_path)])
+
+
+def test_the_stiffest_coupling_is_nearest_without_force_errors():
+    rows = [Alternative("soft", None, "g", dc_ratio=0.3), Alternative("stiff", None, "g", dc_ratio=0.9)]
+    assert "stiff, 90 % of the stiffness" in _nearest(rows)
+    assert _nearest([Alternative("soft", None, "g")]).startswith("No force error was measured")
