@@ -99,11 +99,11 @@ def main(argv: list[str]) -> int:
         notes,
         time.perf_counter() - begin,
     )
-    said = verdicts.verdict(audited.assessment, encoder=report.encoder)
+    verdict = verdicts.verdict(audited.assessment, encoder=report.encoder)
     if args.rigid and isinstance(coupling, SpringDamper):
-        said = f"{said} {_stiffest_wall(audited, coupling)}"
+        verdict = f"{verdict} {_stiffest_wall(audited, coupling)}"
     caveats = [audited.not_covered, *([audited.switching.not_covered or ""] if audited.switching else [])]
-    render.publish(args, report, _tables(audited), _remarks(report), out, verdict=said, details=caveats)
+    render.publish(args, report, _tables(audited), _remarks(report), out, verdict=verdict, details=caveats)
     return options.exit_code(audited.assessment.holds)
 
 

@@ -79,8 +79,8 @@ def main(argv: list[str]) -> int:
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
-            said = "· delta is a full matrix, of which a device states one number per axis below it"
-            render.console(args).print(f"{said}: {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
+            note = "· delta is a full matrix, of which a device states one number per axis below it"
+            render.console(args).print(f"{note}: {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)

@@ -84,8 +84,8 @@ def main(argv: list[str]) -> int:
         checked = replace(checked, claim=own.claim)
     assessment = _assessed(stored, own, searched) if verdict.proved else None
     checked = replace(checked, anew=anew, assessment=assessment)
-    said = verdicts.verdict(assessment) if assessment else f"[red]Not proved[/]: {verdict.reason}"
-    render.publish(args, checked, [_table(checked)], verdict=said)
+    shown = verdicts.verdict(assessment) if assessment else f"[red]Not proved[/]: {verdict.reason}"
+    render.publish(args, checked, [_table(checked)], verdict=shown)
     return options.exit_code(verdict.proved)
 
 

@@ -57,9 +57,9 @@ def main(argv: list[str]) -> int:
     if slow:
         render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
-    said = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby)
+    verdict = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby)
     lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
-    render.publish(args, report, _tables(scenario, report), lines, verdict=said)
+    render.publish(args, report, _tables(scenario, report), lines, verdict=verdict)
     return options.exit_code(assessment.holds, report.interrupted)
 
 

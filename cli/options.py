@@ -25,7 +25,7 @@ from haptic_loop.controller.units import speak
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, DesignFailed
-from haptic_loop.models.device import MOST_DAMPING, Device, Guaranteed
+from haptic_loop.models.device import MOST_DAMPING, Guaranteed
 from haptic_loop.sim.scenario import (
     CASES,
     DEFAULT,
@@ -453,7 +453,8 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)
         with refused("--known-device: "):
-            changes["device"] = tuple(map(_with_bounds, scenario.device, bounds))
+            pairs = zip(scenario.device, bounds, strict=True)
+            changes["device"] = tuple(msgspec.structs.replace(one, guaranteed=bound) for one, bound in pairs)
     return scenario.replace(**changes) if changes else scenario
 
 
@@ -466,10 +467,6 @@ def _known_device(text: str) -> Guaranteed:
         return Guaranteed(*values)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _with_bounds(device: Device, bounds: Guaranteed) -> Device:
-    return msgspec.structs.replace(device, guaranteed=bounds)
 
 
 def in_world(scenario: Scenario, file: str) -> Scenario:

@@ -16,7 +16,7 @@ exists at every tick: with s = 0 the last tick lowers R by its largest loss, and
 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the energy that
 the devices dissipate, devices and hands receive at most W0, and sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
 
-*Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost; after that the
+*Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost. After that the
 device must set its force to zero. The largest loss of tick t is the largest r of these packets, channel by channel, and
 R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
 it, and a tick without a report counts with its largest loss.
@@ -339,9 +339,9 @@ class Shell(_Net):
         self._released = self._released + rise
         self._earn(rise)
 
-    def charge(self, given: float) -> None:
+    def charge(self, energy: float) -> None:
         """Subtract an energy [J] >= 0 that reached the devices on another way than through the port."""
-        self._earn(np.full_like(self.energy, -given))
+        self._earn(np.full_like(self.energy, -energy))
 
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
         """Return f = s f_wanted [N] and the port's displacement u [m], (m, nsim) each, and end the tick.

@@ -48,8 +48,8 @@ PROOF_STATES = 800
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Rows of a block whose multiplier is searched: those of twelve devices with limited forces.
 MULTIPLIER_ROWS = 24
-#: Searches for gains with added frequencies (case I takes 3), and steps of each: from every start with many devices,
-#: from the best starts with many devices, from each start with few devices.
+#: Rounds of a search for gains with added frequencies (case I takes 3), and its steps. The numbers of steps are for
+#: every start and for the best starts with many devices, and for every start with few devices.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 #: Rounds with further frequencies of Theorem 4. Only delays of a hundred samples and more take any.
 THEOREM_4_ROUNDS = 12

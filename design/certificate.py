@@ -64,9 +64,10 @@ def _in_time() -> Iterator[None]:
 # Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
 #
 # The blocks are those of the condition (design.conditions, design.environments), over the rationals. The proof shows
-# that static matrices are symmetric, and positive semidefinite where required, and that each block at the available
-# damping is strictly positive real (design.exact); then F, or V-hat, is stable, too. For any-environment with psi = 0
-# Phi = 0 satisfies Lemma 4, because the parameters of a Network are non-negative. The multipliers are stored.
+# that static matrices are symmetric, and positive semidefinite where required. It shows that each block at the
+# available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
+# any-environment with psi = 0 Phi = 0 satisfies Lemma 4, because the parameters of a Network are non-negative. The
+# multipliers are stored.
 #
 # With ranges this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..), not for the
 # environments in between or for one that changes.

@@ -5,10 +5,10 @@ as free + s gain, where s multiplies the damping Delta_D that the devices guaran
 `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
 (an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-A condition is composed of one **hands' side** (`HandsSide` in design.facts: periods that are even or vary, a latency)
-and of **facts** of the environment's side (`Fact`: walls, delays that switch, the limiter). `compose` stacks their
-inputs and adds their forms, as design.frame describes. design.environments searches the multipliers of all conditions;
-design.certificate has one exact proof and one file format.
+A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
+states whether periods vary and forces have a latency. A `Fact` is a wall, delays that switch, or the limiter. `compose`
+stacks their inputs and adds their forms, as design.frame describes. design.environments searches the multipliers of all
+conditions, and design.certificate has one exact proof and one file format.
 
 To add a hands' side, derive a class from `HandsSide` and state
   `inputs`   one `Input` per scalar input. `moved` are the weights w_0 + w_1 z + .. of its share of the displacement

@@ -67,7 +67,7 @@ class DualMatrix:
         """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
         The intervals between the frequencies `swept` and the bends are halved until each has a bound above -wanted, or
-        a bound near the eigenvalues at its ends, or until the counted work is spent.
+        a bound near the eigenvalues at its ends. The search also ends when the counted work is spent.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
         budget = _MOST // self.points.size - w.size

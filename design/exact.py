@@ -204,8 +204,8 @@ def _less(W: _Integers, units: int) -> _Integers:
 def _definite(W: _Integers, bits: int) -> bool:
     """Return whether the symmetric integer matrix W (n, n) > 0 is proved.
 
-    Between passes the entries are shortened to about 32 bits more than `bits`: each entry then changes by less than one
-    unit, and the matrix by less than n units in norm, which are subtracted from the diagonal.
+    Between passes the entries are shortened to about 32 bits more than `bits`. Each entry then changes by less than one
+    unit, and the norm of the matrix by less than n units, which are subtracted from the diagonal.
     """
     for _ in range(budgets.DEFINITE_PASSES):
         floats = _floats(W)

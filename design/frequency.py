@@ -176,8 +176,8 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     A tick in double precision is a tick of a system whose coefficients have relative errors of (2n + 8) u (n states, u
     the unit), plus their differences to a system `meant` with the same states. With R = (zI - A)^-1 the errors dA, dB,
     dC, dD change the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|, which is large if big terms
-    cancel. The difference of both responses would be less useful: beside a sharp resonance it is large as soon as the
-    peak moves by its width, which already the Schur form of badly scaled states does.
+    cancel. The difference of both responses would be less useful. Beside a sharp resonance it is large if the peak
+    moves by its width, which happens already with the Schur form of badly scaled states.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -291,7 +291,7 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
     """Return the least eigenvalues (k,) of Hermitian matrices (k, m, m) and their unit eigenvectors (k, m).
 
     For many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. The shift differs from the
-    eigenvalue by 1e-13 of the largest entry, so that the share of every other eigenvector is multiplied by at most this
+    eigenvalue by 1e-13 of the largest entry. The share of every other eigenvector is multiplied by at most this
     difference over the distance of both eigenvalues.
     """
     m = H.shape[-1]

@@ -120,8 +120,8 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Full levels. Bounds of mass and transmission are numbers, so that no orthogonal Q_i of a device changes them: in
-# coordinates in which Delta is diagonal the theorem holds as it stands, with one beta for all axes of a device.
+# Full levels. Bounds of mass and transmission are numbers, so that no orthogonal Q_i of a device changes them. In
+# coordinates with a diagonal Delta the theorem holds unchanged, with one beta for all axes of a device.
 
 _SKEW_BITS = 32  # fractional bits of a skew matrix: Q' Delta Q is then diagonal to about 1e-9 of the damping
 _JACOBI_SWEEPS = 12  # converges quadratically: 6 axes need about five
@@ -152,8 +152,8 @@ def principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
     """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
 
     Q is the Cayley transform of a rational skew matrix S, hence exactly orthogonal. The eigenvectors come from Jacobi's
-    rotations, whose additions, products and roots round alike on every machine: a proof is read on another one.
-    d lies below the diagonal of Q' Delta Q by its Gershgorin radii.
+    rotations. Their additions, products and roots have the same rounding on every machine, so that a proof can be
+    checked on another one. d lies below the diagonal of Q' Delta Q by its Gershgorin radii.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)

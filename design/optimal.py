@@ -116,8 +116,8 @@ def design(
 
     With ranges around the environment, this-environment holds at every vertex and at every point that the search
     between the vertices visits. With a range of delays, any switching within the range is safe.
-    If no optimal coupling can be proved or its mismatch is large, the function compares it with the environment scaled
-    down and with the best spring-damper, and returns the best of them.
+    If no optimal coupling can be proved or its mismatch is large, the environment scaled down and the best
+    spring-damper are candidates, too. The function returns the best of them.
 
     Raises ValueError for a loop with walls, and for an environment that is unsafe with any damping because it is not
     passive.

@@ -530,8 +530,8 @@ _STIFF_DIGITS = 6
 def _default_starts(loop: Loop) -> list[SpringDamper]:
     """Return starts around 2 d/(n T), the largest stiffness of a linear coupling for any passive environment.
 
-    With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency;
-    the last start has the environment's stiffness at half the sampling rate.
+    With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency.
+    Therefore the last start has the environment's stiffness at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))

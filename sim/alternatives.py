@@ -1,8 +1,8 @@
 """Comparison of couplings with the same devices and hands, from no coupling to the optimal one.
 
-The couplings are: none, the paper's gains for the paper's loop, the spring-dampers for any passive environment and for
-this environment, and the optimal coupling if it is quick to find. Each is assessed with its proof and drives the same
-hands in the exact engine.
+The couplings are none, the paper's gains for the paper's loop, and the spring-dampers for any passive environment and
+for this environment. The optimal coupling is included if it is quick to find. Each is assessed with its proof and
+drives the same hands in the exact engine.
 """
 
 from __future__ import annotations

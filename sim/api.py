@@ -195,9 +195,9 @@ def simulate(
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     if isinstance(trace.net, InWorld):
-        said, scene = Claim.of(assessment, chosen.certified_for), SceneRecord.of(trace.net.ports[0].world)
+        stated, scene = Claim.of(assessment, chosen.certified_for), SceneRecord.of(trace.net.ports[0].world)
         meta |= {"world": plain(WorldRecord.of(trace.net.figures())), "scene": plain(scene)}
-        meta |= {"guarantee": said.words, "guaranteed": said.guaranteed}
+        meta |= {"guarantee": stated.words, "guaranteed": stated.guaranteed}
     return replace(trace, meta=meta)
 
 

@@ -154,7 +154,7 @@ def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
 
 @dataclass(frozen=True)
 class Plan:
-    """How cells are simulated."""
+    """Settings for the simulation of cells."""
 
     points: int  # rows and columns of the grid that are simulated; 0 for none
     press: float  # [N] steady force of every hand

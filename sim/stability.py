@@ -244,8 +244,8 @@ def _measured_growth(
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
     The projection y = left* xi contains the dominant mode alone. With the known outside force subtracted,
-    y[k+1] - left* B w[k] = lambda y[k]. lambda is the least-squares fit over the ticks before the first clipped one,
-    less `ahead` ticks: a limiter acts that long before its force arrives.
+    y[k+1] - left* B w[k] = lambda y[k]. A least-squares fit gives lambda. It ends `ahead` ticks before the first
+    clipped one, because a limiter acts that long before its force arrives.
     """
     clipped = trace.clipped(force_limit, balls)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead

@@ -120,16 +120,13 @@ class DrawnObject:
             sign = -1.0 if first == GROUND else 1.0
             near, other = (second, first) if first == GROUND else (first, second)
             normal = sign * np.pad(np.array(wall.normal or (1.0,)), (0, 3 - len(wall.normal or (1.0,))))
-            away = (wall.gap + self._radius(near)) * normal
+            away = (wall.gap + _RADIUS[self._kind(near)]) * normal
             yield Shape("wall", self.rest[near] + away + moved.get(other, np.zeros(3)), normal)
         for name, at in self.rest.items():
             yield Shape(self._kind(name), at + moved[name], at)
 
     def _kind(self, name: str) -> Literal["contact", "node", "mass"]:
         return "contact" if name in self.contacts else "mass" if self.network.masses.get(name) else "node"
-
-    def _radius(self, name: str) -> float:
-        return _RADIUS[self._kind(name)]
 
 
 def _place(column: int, y: float) -> Array:
