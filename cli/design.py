@@ -18,6 +18,7 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
+from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
 from haptic_loop.design.robustness import Nearby, ranges_around
@@ -143,7 +144,8 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Return whether the design takes varying delays into account; other designs are only judged under them."""
     kind = kind_of(args.coupling)
-    return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
+    condition = named(args.condition or kind.conditions[0])
+    return "switching" in kind.options and (condition.extensible or condition is KNOWN_DEVICE)
 
 
 def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
@@ -291,6 +293,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         sdps=design.sdps,
         stored=stored,
         interrupted=interrupted,
+        compared="; ".join(design.notes) or None,
         claim=design.own and design.own.said(assessment.requirements[design.condition]),
     )
 
@@ -386,6 +389,7 @@ class _Report:
     stored: Filed = render.several(_stored_rows)
     interrupted: bool = off_table()
     claim: str | None = render.figure("claim", default=None, json="if given")  # on a condition of the user's own
+    compared: str | None = render.figure("compared", default=None, json="if given")  # other certificates
 
     @property
     def aim(self) -> str:

@@ -442,6 +442,8 @@ class BoundBeside:
         """Return the bound for the loop of a design; `reached_db` is the rms mismatch of the design."""
         if loop.channels > MOST:
             return cls(reason=_NO_BOUND)
+        if best.condition == "known-device":
+            return cls(reason="no bound is known of couplings for known devices")
         if best.objective == 0:
             return cls(reason="the mismatch is zero: there is nothing to bound")
         least = bound(loop, band_hz)

@@ -14,8 +14,8 @@ import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
 from haptic_loop.controller.coupling import Coupling, ForceFilter, NoCoupling
-from haptic_loop.controller.environment import Environment
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.environment import Environment, held
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
@@ -60,10 +60,10 @@ KINDS = {
     ),
     "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
     "optimal": _Kind(
-        (THIS_ENVIRONMENT,),
+        (THIS_ENVIRONMENT, KNOWN_DEVICE),
         "optimal",
         "design_with",
-        ("progress",),
+        ("condition", "progress"),
         ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
         model=True,
     ),
@@ -82,12 +82,16 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
     A spring-damper is designed for this environment, which has the least transparency error. For walls, worlds, ranges
-    and varying delays it is designed for any environment. Other kinds have one condition.
+    and varying delays it is designed for any environment. The conditions for known devices take their place where
+    they cover the loop, since they never require more: known-device-any before walls. Others have one condition.
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
     if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
         return KNOWN_DEVICE.name  # never worse than this-environment
+    walls = loop.environment.walls and not loop.environment.world
+    if walls and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
+        return KNOWN_DEVICE_ANY.name
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
     return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
 
@@ -155,6 +159,8 @@ def design_by_kind(
     if chosen.model and options.get("limiter") and (reason := LIMITER.not_designed(loop)):
         with_less = {**options, "limiter": False, "bases": ((4, 3),)}
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
+    if made_for is KNOWN_DEVICE and not chosen.model and (span := options.pop("switching", None)):
+        loop = loop.switching(DelayRange(*(tuple(map(int, end)) for end in span)))
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
     make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
@@ -168,7 +174,8 @@ def design_by_kind(
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
-    if chosen.model or anywhere or not (loop.latency or loop.environment.walls):
+    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # whose gains are searched with constant delays
+    if chosen.model or anywhere or not (loop.latency or loop.environment.walls or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)
 
@@ -277,13 +284,16 @@ def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Co
     """
     share, best, shortfall = 1.0, None, ""
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
-        constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
+        switched = condition.guarantee(loop) == ANY or condition is KNOWN_DEVICE
+        constant = loop.delayed(loop.delays.hi) if switched else loop
+        if condition is KNOWN_DEVICE and loop.environment.walls:
+            constant = constant.at(held(loop.network))  # The search judges gains by beta alone.
         part = msgspec.structs.replace(constant, latency=None, **_scaled(loop, share))
         design = make(part)
         needs = condition.judge(loop.at(loop.environment), design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            best = replace(design, requirement=needs)
+            best = replace(design, requirement=needs, notes=())  # Notes are of the part.
             if needs.ratio > 1 - _UNUSED:
                 return best
         if np.isinf(needs.ratio):

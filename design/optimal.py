@@ -20,10 +20,11 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import budgets, program
 from haptic_loop.design.certificate import prove, required_damping
-from haptic_loop.design.conditions import ratio_in
+from haptic_loop.design.conditions import Condition, ratio_in
 from haptic_loop.design.conditions import this_environment as requirement_of
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
+from haptic_loop.design.known_device import KNOWN_DEVICE, KnownDevice, LimitedKnownDevice, largest_beta
 from haptic_loop.design.result import Design, DesignFailed, NotProved, from_ratio
 from haptic_loop.design.robustness import Spread, at, vertices
 from haptic_loop.design.spring_damper import design as design_spring_damper
@@ -88,6 +89,7 @@ class Optimal(Design):
 
 def design_with(
     loop: Loop,
+    condition: str = THIS_ENVIRONMENT.name,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     **options: Any,
@@ -104,7 +106,8 @@ def design_with(
         progress(f"{result.mismatch_db:z.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
 
     span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
-    return design(loop.switching(span), chosen, progress=reached)
+    made = _for_known_devices if condition == KNOWN_DEVICE.name else design
+    return made(loop.switching(span), chosen, progress=reached)
 
 
 def design(
@@ -174,6 +177,63 @@ def design(
     return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
 
 
+_ETAS = 0.15, 0.3, 0.5  # of the largest beta; the mismatch is flat around its minimum, the same share on every channel
+_SCALINGS = 6  # Each takes MARGIN off the forces.
+
+
+def _for_known_devices(
+    loop: Loop, options: program.Options, progress: Callable[[_BasisResult], None] = lambda result: None
+) -> Optimal:
+    """Return the best coupling under known-device, or under this-environment if that is better.
+
+    The block is affine in the forces for fixed beta and multipliers of facts. The filter over the smallest basis is
+    solved for three values of beta; larger bases take the best one, the vertex of a parabola, and the multipliers of
+    the last filter. The beta of the last filter's least requirement would leave the filter where it is.
+
+    Raises ValueError as `design`, and for a loop that known-device does not cover.
+    """
+    if reason := KNOWN_DEVICE.beyond(loop):
+        raise ValueError(f"{KNOWN_DEVICE.name}: {reason}")
+    if loop.ranges:
+        raise ValueError(f"ranges: an optimal coupling for {KNOWN_DEVICE.name} is designed in one environment")
+    search = replace(_Search.of(loop, options), condition=KNOWN_DEVICE)
+    if exactly := search.nothing():
+        return exactly
+    plain = design(loop, options, progress)
+    best = search.proved_elsewhere(plain)
+    results, eta, multipliers = list(plain.bases), None, search.multipliers(plain.coupling)
+    for taps, poles in options.bases:
+        if not search.room(taps, poles, 0):
+            break
+        tried = [
+            search.over_known(each, multipliers, search.mismatch(best), taps, poles)
+            for each in ([eta] if eta else _ETAS)
+        ]
+        if not eta:
+            middle, curved = (
+                np.polynomial.Polynomial.fit(np.log(_ETAS), list(map(search.merit, tried)), 2).convert().coef[1:]
+            )
+            eta = float(np.clip(np.exp(-middle / (2 * curved)), _ETAS[0], _ETAS[-1])) if curved > 0 else _ETAS[1]
+        candidate = search.scaled_and_proved(min(tried, key=search.merit))
+        result = _BasisResult(
+            taps, poles, candidate.states, search.decibels(candidate), candidate.g, candidate.reason, search.elapsed
+        )
+        gained = search.gained(best, candidate)
+        if candidate.proved and gained <= 0:
+            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
+        results.append(result)
+        progress(result)
+        if result.taken:
+            best, multipliers = candidate, search.multipliers(candidate.coupling)
+        if gained < _SETTLED_DB or search.over():
+            break
+    figures = f"{best.condition}, {search.decibels(best):.2f} dB"
+    note = f"{figures}; this-environment, for devices of which less is known: {search.decibels(plain):.2f} dB"
+    return replace(
+        best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=search.over(), notes=(note,)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class _Search:
     """A loop, the design's options and the environments with their constraints."""
@@ -184,6 +244,7 @@ class _Search:
     bare: float  # largest share of the damping that an environment needs without a coupling
     started: float  # clock time [s] of the start, for the report and for --seconds
     spent: int  # counted work at the start
+    condition: Condition = THIS_ENVIRONMENT  # that judges and proves couplings
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options) -> _Search:
@@ -291,9 +352,12 @@ class _Search:
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)
-        if more or not exact_delay or self.bare > 1 - program.MARGIN:
+        if more or not exact_delay:
             return None
-        candidate = self._proved(self._assessed(NoCoupling(), 1.0), self.slips(None)[0])
+        candidate = self._assessed(NoCoupling(), 1.0)
+        if candidate.requirement.ratio > 1 - program.MARGIN:
+            return None
+        candidate = self._proved(candidate, self.slips(None)[0])
         return candidate if candidate.proved or not self.options.limiter else None
 
     def span(self, taps: int, poles: int) -> program.Span:
@@ -452,6 +516,46 @@ class _Search:
         except (DesignFailed, ValueError):
             return None
 
+    @property
+    def known(self) -> KnownDevice:
+        """The condition for known devices, with limited forces where the options ask for them."""
+        return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
+
+    def proved_elsewhere(self, plain: Optimal) -> Optimal:
+        """Return `plain` under the search's own condition where it is proved there."""
+        candidate = self._proved(self._assessed(plain.coupling, plain.g), None)
+        return candidate if candidate.proved else plain
+
+    def multipliers(self, coupling: Coupling) -> tuple[float, ...]:
+        """Return the multipliers of facts with which known-device asks least of a coupling, or the usual ones."""
+        found = self.known.required(self.loop, coupling).multiplier
+        usual = [value for each in self.known.unknowns(self.loop) for value in each.start or each.units]
+        return tuple(found[3 * self.loop.channels :] if found else usual)
+
+    def over_known(self, eta: float, multipliers: Sequence[float], error: float, taps: int, poles: int) -> Optimal:
+        """Return the optimum over a basis for beta, a share `eta` of the largest one, and multipliers of the facts."""
+        loop, (case, *_) = self.loop, self.cases
+        largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # Axes of a device have one beta.
+        beta = np.array(loop.per_channel((eta * largest).tolist()))
+        here = program.known_device(self.loop, self.known, beta, multipliers)
+        beside = [each for each in case.constraints if each.name in ("high-frequency gain", "mismatch")]
+        span, soft = self.span(taps, poles), program.SOFT[0] * min(error, program.SOFT[1])
+        problem = program.Problem(span, (replace(case, constraints=(here, *beside)),), self.options, soft)
+        coupling = span.filter(problem.solve(self._start(problem)))
+        own = multipliers[: sum(len(each.units) for each in KNOWN_DEVICE.unknowns(self.loop))]
+        return self._assessed(coupling, coupling.g, (*beta.tolist(), *(0.0,) * 2 * beta.size, *own))
+
+    def scaled_and_proved(self, candidate: Optimal) -> Optimal:
+        """Return the coupling with its forces scaled down until known-device proves it, with the best beta."""
+        coupling = candidate.coupling
+        assert isinstance(coupling, ForceFilter)
+        for _ in range(_SCALINGS):
+            candidate = self._proved(self._assessed(coupling, coupling.g), None)
+            if candidate.proved:
+                break
+            coupling = _scaled(coupling, (1 - program.MARGIN) * min(1.0, 1 / candidate.requirement.ratio))
+        return candidate
+
     def _start(self, problem: program.Problem) -> Array:
         """Return the unknowns of R = kappa I that satisfy every constraint strictly.
 
@@ -463,17 +567,23 @@ class _Search:
             kappa /= 2
         return start
 
-    def _assessed(self, coupling: Coupling, g: float) -> Optimal:
-        """Return the coupling with its figures and its swept requirement, without a proof."""
+    def _assessed(self, coupling: Coupling, g: float, multiplier: Sequence[float] | None = None) -> Optimal:
+        """Return the coupling with its figures and its swept requirement, without a proof.
+
+        known-device sweeps with beta, no bounds of q and multipliers in `multiplier`, or searches them.
+        """
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)
-        requirements = [requirement_of(F, loop), *in_each(loop, coupling, members[1:])]
+        if self.condition is KNOWN_DEVICE:
+            requirements = [KNOWN_DEVICE.judge(loop, coupling, multiplier)]
+        else:
+            requirements = [requirement_of(F, loop), *in_each(loop, coupling, members[1:])]
         requirement = requirements[worst(requirements)]
         figures = transparency(F, self.cases[0].E, loop.lam, self.options.band_hz)
         objective = self.options.objective
         return Optimal(
             coupling,
-            "this-environment",
+            self.condition.name,
             objective,
             figures.rms_mismatch if objective == "rms" else figures.relative_mismatch,
             requirement,
@@ -490,7 +600,10 @@ class _Search:
         """Return `candidate` with its certificate, or with the reason why the proof failed."""
         loop, coupling = self.loop, candidate.coupling
         try:
-            if slip:
+            if self.condition is KNOWN_DEVICE:
+                swept = None if self.options.limiter else candidate.requirement
+                certificate = prove(loop, coupling, self.known, swept=swept)
+            elif slip:
                 certificate = prove(loop, coupling, LimitedForces(slip.beta))
             else:
                 certificate = prove(

@@ -8,7 +8,7 @@ frequencies, and a dense sweep adds the frequencies at which the solution violat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Literal
@@ -25,8 +25,10 @@ from haptic_loop.design import budgets
 from haptic_loop.design.arguments import number, one_of
 from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
 from haptic_loop.design.conditions import even_damping, this_environment_demand
-from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.environments import SWITCHING, LimitedForces, named_parts
+from haptic_loop.design.facts import KnownMotor
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks
+from haptic_loop.design.known_device import KnownDevice, period_cost
 from haptic_loop.design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
@@ -163,6 +165,20 @@ def limiter(loop: Loop, slip: Slip) -> _Constraint:
         )
 
     return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop) / loop.T), 2))
+
+
+def known_device(loop: Loop, condition: KnownDevice, beta: Array, multipliers: Sequence[float]) -> _Constraint:
+    """Return known-device at fixed beta (m,) [s] and multipliers, with the share MARGIN of the damping unused."""
+    values = named_parts(condition.unknowns(loop), multipliers)
+    hands = KnownMotor(period_cost(loop, 1 - MARGIN, beta), beta)
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        demand = condition.form(G, loop, values, hands)
+        return demand.free if demand.spare is None else demand.free - np.diag(demand.spare)
+
+    none = Sampled(np.array([[1j]]), np.zeros((1, 1, loop.channels, loop.channels), dtype=complex), loop.T)
+    size = np.diagonal(hermitian(block(none, np.zeros(0)).G)[0, 0].real)
+    return _Constraint(condition.name, block, 1 / np.sqrt(size))
 
 
 def most_gain(loop: Loop, cap: float) -> _Constraint:

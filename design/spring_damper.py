@@ -365,9 +365,6 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
-    if loop.environment.walls:
-        line = f"{KNOWN_DEVICE.name}: designs are made without walls; design for this-environment, and audit the result"
-        raise DesignFailed(None, (), line)
     started, band = time.perf_counter(), band_hz or BAND_HZ
     plain = least_rms(partial(SampledLoop, loop, band), starts or _default_starts(loop), band)
     first = [plain[0]] if plain[0] else []

@@ -24,6 +24,7 @@ from haptic_loop.design.audit import audit
 from haptic_loop.design.certificate import named, prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
+from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import LimitedForces
 from haptic_loop.design.exact import find_storage, prove_positive_real
 from haptic_loop.design.facts import KnownMotor, Limiter, compose, compose_any
@@ -670,7 +671,46 @@ def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     assert prove(loop, found.coupling, "known-device-any").proof == "rational"
 
 
+def test_an_optimal_coupling_uses_known_devices():
+    """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
+    network = Network(("tip",), (Spring(("tip", GROUND), 1200.0, 2.0),), {"tip": 0.2})
+    loop = change(one(1e-3, 1.0, 1, environment=network), lam=(1,))
+    found = design_by_kind(loop, "optimal", bases=((4, 3),))
+    plain = design_by_kind(loop, "optimal", "this-environment", bases=((4, 3),))
+    assert found.condition == "known-device"
+    assert found.objective < 0.8 * plain.objective
+    assert f"{20 * np.log10(plain.objective):.2f} dB" in found.notes[0]
+    z = np.exp(1j * np.concatenate([np.geomspace(1e-4, 0.05, 500), np.linspace(0.05, np.pi, 5000)]))
+    beta, F = found.certificate.multipliers["beta"][0], loop.F(found.coupling).at(z)
+    block = cost_by_hand(z, loop, beta).astype(complex)
+    block[:, 0, 0] += (F[:, 0, 0] / (z - 1)).real
+    block[:, 1, 0] -= beta * F[:, 0, 0] / z / 2
+    block[:, 0, 1] = np.conj(block[:, 1, 0])
+    assert np.linalg.eigvalsh(block).min() > 0
+    assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
+
+
+def test_an_exact_loop_on_known_devices_needs_no_coupling():
+    found = design_coupling(KNOWN, "optimal")
+    assert isinstance(found.coupling, NoCoupling)
+    assert found.objective == 0
+    assert found.requirement.required[0] == pytest.approx(1.3120, rel=1e-4)
+
+
+def test_a_spring_damper_before_a_wall_uses_the_device():
+    loop = on_a_wall(3000.0, 2.0, 1, 2.0)
+    assert design_coupling(loop).condition == "known-device-any"
+    plain = design_coupling(loop, "spring-damper", "this-environment")
+    found = design_coupling(loop, "spring-damper", "known-device")
+    assert found.coupling.K[0] > 3 * plain.coupling.K[0]
+    assert prove(loop, found.coupling, "known-device").facts == ("walls",)
+    assert hands_on_a_wall(loop, 2.0, ticks=1000, hands=50, coupling=found.coupling) == 0
+
+
 def test_designs_refuse_what_known_devices_exclude():
+    ranged = change(KNOWN, ranges=Ranges(masses={"mass": (0.9, 1.1)}))
+    with pytest.raises(ValueError, match="ranges"):
+        design_coupling(ranged, "optimal", "known-device")
     with pytest.raises(ValueError, match="not covered"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
