@@ -99,3 +99,15 @@ def test_reference_and_case_say_one_thing(words, case):
 def test_reference_and_case_must_agree():
     with pytest.raises(InputError, match="--reference I with --case II: give one of them"):
         run_parser().parse_args(["--reference", "I", "--case", "II"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--delta 1.37 1.37", r"unknown word 1.37 \(several numbers are written with commas, as 1,2,3\)"),
+        ("--delta 1.3,1.3,1.3", r"--delta has 3 entries, expected 2 \(one per device\) or 1"),
+    ],
+)
+def test_numbers_are_one_per_device(words, said):
+    with pytest.raises(InputError, match=said):
+        options.scenario_from(run_parser().parse_args(["--scenario", "omega-space", *words.split()]))

@@ -329,3 +329,13 @@ def test_many_device_searches_match_exhaustive_starts(monkeypatch):
     assert made.requirement.certified
     assert made.objective == pytest.approx(usual, rel=0.05)
     assert all(float(f"{gain:.5g}") == gain for gain in (*made.coupling.K, *made.coupling.B))
+
+
+def test_limits_help_no_loop_that_fails_without() -> None:
+    """Where no coupling is certified for free forces, no search is spent on limited ones."""
+    loop, asked = msgspec.structs.replace(load().loop("I"), delta=(1e-3, 1e-3), psi=(1, 1)), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spring_damper, "LimiterLoop", lambda *args: asked.append(args))
+        with pytest.raises(DesignFailed, match="this-environment condition certifies for theta"):
+            spring_damper.design_with(loop, "this-environment")
+    assert not asked
