@@ -45,7 +45,7 @@ from haptic_loop.design.transparency import BAND_HZ, decibels
 _GRID = 250  # points, even and even in the logarithm, on which H is given
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
-_NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that is 1 dB off"
+_NO_BOUND = f"no bound for more than {MOST} channels: half a minute for one that is 1 dB off"
 _NEAR_END = (0.22, 0.5)  # further knots near the band's ends, in steps, because h falls to zero there
 _NEAR_MODE = 1.0  # distance of further knots from a mode, in widths of the mode
 _CLOSEST = 0.1  # least distance of two knots, in steps
