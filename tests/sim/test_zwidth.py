@@ -107,7 +107,7 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
 
 @pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
 def test_maps_before_walls_match_designs(theta, least):
-    """K = 2000, B = 2 before 3000 N/m, 2 N s/m: the figures of docs/theory.md; the frozen contact asks less."""
+    """K = 2000, B = 2 before 3000 N/m, 2 N s/m; the frozen contact asks less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
