@@ -148,6 +148,8 @@ class _Report:
         """Yield one line per event, and the file of the film."""
         yield from (event.line() for event in self.events)
         yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
+        if torques := self.events[0].assessment.held_torques:
+            yield f"Held torques: {torques}."
         if clock := self.ended.clock:
             yield f"The clock was missed {clock.overruns} times: {clock.lost_s:.2f} s lost."
         if film := self.ended.video:

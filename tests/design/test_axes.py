@@ -432,6 +432,14 @@ def test_known_devices_take_full_levels() -> None:
     assert least(needs.ratio * (1 - 1e-3)) < 0
 
 
+def test_known_devices_permit_a_stiffer_coupling_with_full_levels() -> None:
+    known, every = (design_by_kind(KNOWN, "moving-average", name) for name in ("known-device-any", "any-environment"))
+    assert 0.999 < known.requirement.ratio < 1
+    assert prove(KNOWN, known.coupling, "known-device-any").proof == "rational"
+    softer, stiffer = (design.coupling.compliance(KNOWN.T).dc() for design in (every, known))
+    assert np.linalg.eigvalsh(softer - stiffer).min() > 0
+
+
 def test_principal_axes_are_orthogonal_exactly() -> None:
     rng = np.random.default_rng(5)
     for n in (2, 3, 3, 3):
