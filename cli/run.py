@@ -47,10 +47,10 @@ def main(argv: list[str]) -> int:
 
         return world.run(args, scenario, out)
     environment, simulated = _environment(args, scenario)
-    chosen = chosen_by(args, scenario)  # V, Q or R
+    chosen = chosen_by(args, scenario)  # the coupling V, Q or R
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
-    run = _run(args, simulated, assessment)  # sample, compute, limit, hold, advance
+    run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     nearby = _nearby(scenario.loop(args.case), chosen, assessment)
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
     report = replace(report, nearby=nearby)

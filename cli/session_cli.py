@@ -37,7 +37,7 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] added to the run, after which a rehearsal ends by itself
+_SPARE = 600.0  # [s] a rehearsal that has not ended this long after its run is stopped
 _SHOWN_US = 100_000  # [us] of virtual time between two moves of a rehearsal's progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 
@@ -56,7 +56,7 @@ def add_link_options(parser: options.Parser) -> None:
     add("--fault", action="append", default=[], metavar="FAULT", help=fault)
     clamp = f"with --port {FORCE_DIMENSION}: a mechanical clamp holds the axes that no channel drives (default: ask)"
     add("--clamped", action="store_true", help=clamp)
-    # for tests that drive an emulator behind a pseudo-terminal in slow motion
+    # Tests use --pace to drive an emulator behind a pseudo-terminal in slow motion.
     add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
     baud = "speed of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
@@ -251,7 +251,7 @@ def hold_session(
                 _show(session)
 
         def planned(ages: Ages) -> Sequence[Armable]:
-            _clear()  # because a plan prints lines
+            _clear()  # A plan prints lines, which would mix with the status line.
             for path, own in zip(_ports(args), device.ages if isinstance(device, Boards) else (), strict=False):
                 at = {p: round(float(np.percentile(own, p))) for p in (50, 99)}
                 console(args).print(f"{path}: answers are {at[50]} us old, {at[99]} us at the 99th percentile")

@@ -69,13 +69,13 @@ _ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
-_UNSEEN = 1e-18  # smaller weights are omitted, relative to the response
-_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] at which the size of a response is evaluated, besides its poles
+_UNSEEN = 1e-18  # weights below this size, relative to the response, are omitted
+_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] a response's size is evaluated here and at its poles
 _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
-    """Return the counted work of a response, to a factor of 2.5 (up to 200 states, 8 inputs, 2000 points)."""
+    """Return the work of a response for `spend`, within a factor of 2.5 (to 200 states, 8 inputs, 2000 points)."""
     return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
 
@@ -149,7 +149,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """Number of states without those of the delay lines at the outputs, which take no time in a response."""
+        """Number of core states, without delay lines at the outputs, because these take no time in a response."""
         return self._lines[0].size
 
     @property
@@ -234,11 +234,11 @@ class Lti(ReadOnly):
 
     @cached_property
     def _terms(self) -> tuple[Complex, Complex, Array] | None:
-        """Split the response of outputs and heads into poles, residues, and weights of z^-1, z^-2, ..
+        """Split the response of outputs and heads (`_lines`) into poles, residues, and weights of z^-1, z^-2, ..
 
-        Poles with |z| > _SHORT have right and left eigenvectors V and W, and P = V W projects on their states. The
-        other part of A, N = (I - P) A, has the many poles at or near 0 that belong to delays. Its powers vanish within
-        2^_DOUBLINGS samples, so that its response is a finite sum.
+        Poles with |z| > _SHORT have right and left eigenvectors V and W, and P = V W projects onto their eigenspace.
+        The other part of A, N = (I - P) A, has the many poles at or near 0 that belong to delays. Its powers vanish
+        within 2^_DOUBLINGS samples, so that its response is a finite sum.
 
         The error follows from the residual of B = (z I - A) X. The states
         X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 leave the residual
@@ -378,7 +378,7 @@ class Lti(ReadOnly):
         return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
     def over_z_minus_one(self) -> tuple[Array, Lti]:
-        """Return G(1) and a stable block with the Hermitian part of G/(z - 1) on the circle except at z = 1.
+        """Return G(1) and a stable block whose Hermitian part on the circle is that of G/(z - 1), except at z = 1.
 
         The block is (G - G(1))/(z - 1) - G(1)/2, since the real part of 1/(z - 1) is -1/2 on the circle. G must be
         stable and G(1) symmetric.
@@ -546,7 +546,7 @@ class Sampled:
         return self._with(1 / self.G if self.G.shape[-1] == 1 else np.linalg.inv(self.G))
 
     def over_z_minus_one(self) -> tuple[Array, Sampled]:
-        """Return zero in place of G(1), which responses do not contain, and G/(z - 1)."""
+        """Return zero and G/(z - 1). The zero stands for G(1), which sampled responses do not contain."""
         step = -0.5 - 0.5j / np.tan(np.angle(self.z) / 2)  # 1/(z - 1), without the cancellation of z - 1 near z = 1
         return np.zeros(self.G.shape[-2:]), self._with(self.G * step[..., None, None])
 

@@ -1,1 +1,1 @@
-"""Conditions, figures of merit and designs of couplings. A device appears here only as its damping."""
+"""Conditions, figures of merit and designs of couplings. Most conditions describe a device by its damping alone."""

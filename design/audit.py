@@ -37,7 +37,7 @@ from haptic_loop.design.result import GUARD, ConditionName, Requirement, listed,
 from haptic_loop.design.worst_member import Progress
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling in its loop, judged by either condition.
+# The damping that a condition requires for a coupling in its loop.
 
 
 LONGEST_DELAY = 100  # samples; beyond it a sweep takes seconds, and no device has enough damping
@@ -95,7 +95,7 @@ _Ratio = Callable[[float], float]  # required over available damping, of a varie
 
 #: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
-_SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m], and the ratio of two tried stiffnesses
+_SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of an edge
 _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
@@ -112,7 +112,7 @@ class _Stiffest:
 class _Sensitivity:
     """The tolerated error of each datum alone, or None and the reason.
 
-    Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times its value.
+    Errors are relative: the certificate holds for (1 - delta_error) delta, and for (1 + T_error) T.
     """
 
     least_delta: tuple[float, ...] | None = None  # [N s/m]: the required damping
@@ -152,7 +152,10 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Search K from 0 to 2 (delta - B)/T, the bound at z^-n = -1; the set of gains is convex and contains K -> 0."""
+    """Return the largest certified K of each channel, searched up to 2 (delta - B)/T, the bound at z^-n = -1.
+
+    The set of certified gains is convex and contains K -> 0, so the search meets one edge.
+    """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
         if delta <= B:
@@ -220,7 +223,7 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """Return the argument nearest `outside` at which the damping still suffices, to a relative _EDGE."""
+    """Return the argument nearest `outside` at which the damping suffices, with the relative accuracy _EDGE."""
     if suffices(ratio(outside)):
         return outside
 
@@ -301,7 +304,7 @@ def remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Rem
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Shorten the delays of every channel by one sample at a time, without ideal delay lam."""
+    """Shorten the delays `name` of all channels by one sample at a time; lam is 0 in the shortened loop."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
@@ -423,7 +426,7 @@ def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requir
 
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
-    """Return changes that help a condition that does not hold."""
+    """Return changes that certify a failing condition or lower its required damping."""
     helpful = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
     pairs = ((remedy.change, remedy.requirement) for remedy in helpful)
     return [Help(change, condition.name, after.required, after.certified) for change, after in pairs]

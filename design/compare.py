@@ -60,7 +60,7 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Evaluate every condition of a coupling, as figures and over frequency, with all walls touching.
+    """Evaluate every condition with all walls touching: its requirement, and its demand over frequency.
 
     `own` are a user's own conditions; `known` are requirements from an assessment of this loop and coupling. Raises
     SingularLoop.
@@ -77,7 +77,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Return frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and the binding ones."""
+    """Return frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz

@@ -20,7 +20,8 @@ from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that counts as rounding. Problems are scaled so that 1 is large.
 _TOLERANCE = 1e-4
-#: Clarabel is slower than `_interior` if a triangle has more entries than _LARGE and than _MANY times its unknowns.
+#: Clarabel is slower than `_interior` on a block whose triangle has more than _LARGE entries, and more than _MANY
+#: for each unknown.
 _LARGE, _MANY = 300, 4
 
 
@@ -65,7 +66,7 @@ class Inequality:
 
     @classmethod
     def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
-        """Build function(x[unknowns]) >= 0 from values of the function, which is affine to (n, n) or (k, n, n)."""
+        """Build function(x[unknowns]) >= 0 by evaluating an affine function with values (n, n) or (k, n, n)."""
         constant, *values = (function(x) for x in np.eye(len(unknowns) + 1, len(unknowns), k=-1))
         slopes = np.stack(values) - constant
         one = constant.ndim == 2
@@ -91,7 +92,7 @@ class Inequality:
         return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
 
     def rows(self) -> tuple[Array, Array]:
-        """Return constant (k, r) and slopes (q, k, r) as real rows of lower triangles with the same inner products."""
+        """Return constant (k, r) and slopes (q, k, r) as real lower triangles, scaled to keep inner products."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
         i, j = np.tril_indices(constant.shape[-1])
         weight = np.where(i == j, 1.0, np.sqrt(2))
@@ -197,13 +198,13 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 # ----------------------------------------------------------------------------------------------------
 # A primal-dual interior-point method for large blocks in few unknowns.
 #
-# The S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a, and S Z = 0 at the optimum. S Z =
-# mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro). <slope_a, Z + dZ> = cost_a
-# then gives one equation for each unknown. A predictor with mu = 0 gives the next mu and the second-order term dZ dS
-# (Mehrotra). The start may be infeasible.
+# The slacks S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a. At the optimum S Z = 0.
+# The equation S Z = mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro). Then
+# <slope_a, Z + dZ> = cost_a gives one equation for each unknown. A predictor with mu = 0 gives the next mu and the
+# second-order term dZ dS (Mehrotra). The start may be infeasible.
 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
-_ENOUGH = 1e-6  # the best point counts as solved below this error if rounding stops the iteration
+_ENOUGH = 1e-6  # if rounding stops the iteration, its best point counts as solved below this error
 _KEPT = 0.98  # largest step, relative to the distance to the boundary
 _SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
 

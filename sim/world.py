@@ -36,8 +36,8 @@ from haptic_loop.sim.scenario import Scenario
 if TYPE_CHECKING:  # loads MuJoCo, which other scenarios and --help do not need
     from haptic_loop.models.world import Contact, Port, World
 
-_ROUNDING = 1e-9  # relative size of an entry of A that differences of 1e-6 m leave by rounding
-_APART = 1e-12  # relative size of an entry of D_V up to which it is rounding
+_ROUNDING = 1e-9  # entries of A below this relative size are rounding of differences over 1e-6 m
+_APART = 1e-12  # entries of D_V below this relative size count as rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class WorldFigures(ShellFigures):
     given_J: float  # largest energy given to hands and devices, beyond the dissipation of the devices' damping
     port_least_J: float  # least sum of f'(u - u_-) at the contacts
     released_J: float  # largest energy that gravity and springs of the scene have released
-    created_J: float  # energy that contacts created, as the lemma counts it
+    created_J: float  # energy that contacts created, as the lemma on scenes in docs/theory.md counts it
     unsettled_ticks: int  # ticks in which the limited channels still changed after the last repetition of the step
     warnings: list[str]  # the texts of MuJoCo's warnings
 
@@ -207,7 +207,7 @@ class Touched:
 
 
 def live(simulation: Simulation, start: float = START_J) -> Simulation:
-    """Return the loop with its world for any number of ticks, because the net itself delays the forces."""
+    """Return the loop with its world for any number of ticks. The net itself delays the forces."""
     touched, process = Touched(start), simulation.process
 
     def late(nsim: int) -> Net:
@@ -300,7 +300,7 @@ class HandsInWorld:
 
     @property
     def excess_J(self) -> float:
-        """The energy given beyond the account; the guarantee bounds it by 0."""
+        """The energy given beyond W0 and the released energy; the guarantee bounds it by 0."""
         return self.figures.given_J - self.figures.start_J - self.figures.released_J
 
 
@@ -351,7 +351,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
-    """Return the least sum of f'(u - u_-) [J] in ten runs of 1 s, with springs whose ends stop and turn at random."""
+    """Return the least sum of f'(u - u_-) [J] of ten runs of 1 s in which the springs' ends stop and turn at random."""
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
         for _ in range(10):
@@ -369,7 +369,7 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
 
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
-    """Return the least energy at the port [J] by each adversary without a shell; 0 if the scene gave no energy."""
+    """Return for each adversary the least energy [J] at a port without a shell; 0 if the scene gave no energy."""
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
