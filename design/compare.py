@@ -77,7 +77,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Return frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
+    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and those at which conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
