@@ -40,7 +40,9 @@ def main(argv: list[str]) -> int:
     from haptic_loop.sim.run_report import run_report
 
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
-        raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
+        raise InputError(
+            "--error chooses MuJoCo's integrator and substeps: leave out --engine exact, --integrator and --substeps"
+        )
     scenario, out = _scenario(args), options.out_folder(args, "run")
     if is_world(scenario):
         from haptic_loop.cli import world
@@ -79,10 +81,10 @@ def _parser() -> options.Parser:
     add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
     steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
-    steps = "MuJoCo steps per period (default: what the plant asks)"
+    steps = "MuJoCo steps per period (default: as many as the plant's fastest motion needs)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
-    error = "compare engines and steps on this scene, run with the cheapest that keeps this relative rms error"
+    error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     add("--cross-check", action="store_true", help=check)
@@ -247,7 +249,7 @@ def _rows(report: RunReport) -> render.Rows:
             yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
     yield "simulated in", run.environment if assessment.ranges else None
     yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
-    lost = f"[red]{run.unsolved} forces were set to 0[/], which no proof covers: a tick found no limited ones"
+    lost = f"[red]{run.unsolved} forces were set to 0[/], which no proof covers: the limiter found no solution"
     yield "unsolved limits", lost if run.unsolved else None
     yield "cross-check", run.cross_check and _crossed(run.cross_check)
 
@@ -279,7 +281,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 
 def _crossed(other: accuracy.CrossCheck) -> str:
     apart = render.optional(finite(other.position_relative_rms), "{:.1e} relative rms apart")
-    growth = f"its loop grows {other.growth_rate_difference_per_s:+.1e} 1/s otherwise"
+    growth = f"its growth rate differs by {other.growth_rate_difference_per_s:+.1e} 1/s"
     verdict = "[green]same verdict[/]" if other.agrees else "[red]ANOTHER VERDICT[/]"
     return f"{other.integrator} x {other.substeps}: {apart}, {growth}: {verdict}"
 

@@ -51,21 +51,23 @@ def add_link_options(parser: options.Parser) -> None:
     add("--port", metavar="PATH", help=port)
     virtual = "the whole session in virtual time with an emulated device: no port, no waiting, the same everywhere"
     add("--rehearse", action="store_true", help=virtual)
-    fault = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; in front up: or down: for "
-    fault += f"one direction, axis2: for an axis; KIND is {', '.join(KINDS)}"
+    fault = (
+        "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; the prefix up: or down: means "
+    )
+    fault += f"one direction, the prefix axis2: one axis; KIND is {', '.join(KINDS)}"
     add("--fault", action="append", default=[], metavar="FAULT", help=fault)
     clamp = f"with --port {FORCE_DIMENSION}: a mechanical clamp holds the axes that no channel drives (default: ask)"
     add("--clamped", action="store_true", help=clamp)
     # Tests use --pace to drive an emulator behind a pseudo-terminal in slow motion.
     add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
-    baud = "speed of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
+    baud = "baud rate of a UART, checked against T; none: no UART (default 921600; none for a pseudo-terminal)"
     add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
     count = "answers that are timed (default 800)"
     add("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
     share = "share of the measured ages that theta covers (default 0.99)"
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
-    guard = "spare time added to that age (default 1e-4)"
+    guard = "spare time added to the measured age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
     parser.only("with --rehearse: a device has faults of its own", lambda args: args.rehearse, "fault")
     parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
@@ -80,7 +82,8 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
     speed = "fastest motion of a hand while forces act (default 1, or the least credible_speed of the devices)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
-    heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not watched)"
+    heat = "force that each motor bears without end, or one number for all; larger forces are limited in time by I2t "
+    heat += "(default: not watched)"
     add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
     warm = "time constant of the motors' heating (default 10)"
     add("--thermal-time", type=number(0.1, 1000), default=10.0, metavar="SECONDS", help=warm)
@@ -88,7 +91,7 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--no-rereference", action="store_true", help=absolute)
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
-    add("--no-dead-man", action="store_true", help="let forces act though nobody says that he is there")
+    add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
     parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
@@ -192,7 +195,7 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
         raise InputError(f"--port has {count} ports, the scenario {devices} devices: give one for each, or one for all")
     if scenario.T_min:
         raise InputError(
-            "T_min: a tick of a board may have no length where clocks slip; with several ports, leave it out"
+            "T_min: clocks of several boards slip, and a tick may have no length; leave it out with several ports"
         )
     return ticks_behind(scenario.theta, [len(device.free) for device in scenario.device])
 

@@ -97,7 +97,7 @@ _Ratio = Callable[[float], float]  # required over available damping, of a varie
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of an edge
-_NOT_CERTIFIED = "not certified: there is nothing to lose"
+_NOT_CERTIFIED = "not certified, so no change can end a certificate"
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
         if suffices(ratio(softer)):
             return _Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
         scale = softer
-    return _Stiffest(unknown, "no scale of K is certified beside this B")
+    return _Stiffest(unknown, "with this B, no multiple of K is certified")
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
@@ -183,7 +183,11 @@ def sensitivity(loop: Loop, coupling: Coupling, condition: _Condition) -> _Sensi
     fixed = loop.environment.one_period
     largest = None if fixed else _largest_period(loop, coupling, resolved)
     extra = _extra_samples(loop, coupling, resolved)
-    tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
+    tried = (
+        "environment.block is given for one T only"
+        if fixed
+        else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
+    )
     reasons = [
         tried if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
