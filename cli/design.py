@@ -307,10 +307,8 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        yield (
-            "",
-            f"{SOFTEST:g} N/m is the softest that the search tries" if min(gains["K"]) < verdicts.SOFT_END else None,
-        )
+        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # convex designs go below it
+        yield "", f"{SOFTEST:g} N/m is the softest that the search tries" if searched else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)

@@ -476,7 +476,8 @@ class BoundBeside:
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
         left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
         rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"
+        certified = "that this-environment certifies"  # known devices, for one, allow for better couplings
         if self.proved:
-            return f"no linear coupling can be better than {rest}"
+            return f"no linear coupling {certified} can be better than {rest}"
         rest = rest.replace(", nor than", " and", 1)
-        return f"estimate, checked at sampled frequencies: the limit of linear couplings is {rest}"
+        return f"estimate, checked at sampled frequencies: the limit of linear couplings {certified} is {rest}"

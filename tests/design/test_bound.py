@@ -8,6 +8,7 @@ import pytest
 import scipy.integrate
 
 import haptic_loop
+from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.design import bound as module
 from haptic_loop.design.bound import BoundBeside, bound
 from haptic_loop.design.dual_matrix import DualMatrix
@@ -140,8 +141,21 @@ def test_a_bound_holds_between_sharp_bends():
     assert 1.3 * least < lower <= least < 0
 
 
+def test_a_bound_names_its_condition():
+    """Without a coupling, which known devices allow here, the mismatch is zero."""
+    loop = load("omega-pair-known").loop("I")
+    known = haptic_loop.assess(loop, NoCoupling())
+    assert known.guarantee is not None
+    assert known.guarantee.condition == "known-device"
+    assert not known.requirements["this-environment"].certified
+    for proved in (True, False):
+        assert "linear coupling" in BoundBeside(-35.14, proved=proved).words
+        assert "that this-environment certifies" in BoundBeside(-35.14, proved=proved).words
+
+
 def test_only_a_proved_bound_is_called_one(monkeypatch):
-    assert BoundBeside(-3.0, proved=True).words.startswith("no linear coupling can be better than -3.00 dB")
+    limit = "no linear coupling that this-environment certifies can be better than -3.00 dB"
+    assert BoundBeside(-3.0, proved=True).words.startswith(limit)
     assert "no linear coupling" not in BoundBeside(-3.0).words
     assert BoundBeside(-3.0).words.startswith("estimate")
     unequal, _ = judged("n4")  # psi = 1, 0: what the delays forbid is known up to rounding

@@ -177,6 +177,17 @@ def test_a_free_mass_is_called_useless(method, tmp_path, capsys):
     assert "nan" not in shown.out
 
 
+@pytest.mark.parametrize(("condition", "searched"), [("this-environment", True), ("any-environment", False)])
+def test_only_a_searched_spring_is_called_the_softest_tried(condition, searched, tmp_path, capsys):
+    scenario = tmp_path / "free.toml"
+    text = 'name = "free"\nT = 1e-3\ntheta = [1]\n[[device]]\nkind = "compliant"\ndamping = 1.37\n'
+    scenario.write_text(text + '[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')
+    assert main(["--scenario", str(scenario), "--condition", condition, "--out", str(tmp_path / "c.json")]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "Useless on all contacts" in shown
+    assert ("softest that the search tries" in shown) == searched
+
+
 def test_a_stiff_loop_has_its_reachability_gramian(monkeypatch):
     """The Gramian by doubling is SciPy's where both are accurate."""
     rng = np.random.default_rng(0)
