@@ -178,7 +178,7 @@ def test_figures_that_do_not_exist_say_why():
     assert (found.largest_T_s, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
-    assert "no scale of K" in stiffest(*wall(5000, 30), "this-environment").reason
+    assert "multiple of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
     assert "not certified" in sensitivity(*pair(PUBLISHED["I"]), "this-environment").reason
 
