@@ -65,7 +65,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
     along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction, which is normalised to length 1
 
     def __post_init__(self) -> None:
-        if self.along:
+        if self.along is not msgspec.UNSET:
             unit = _unit(f"along between {' and '.join(self.between)}", self.along)
             msgspec.structs.force_setattr(self, "along", unit)
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("inertance", "kg")):
@@ -92,7 +92,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
     def __post_init__(self) -> None:
         ends = " and ".join(self.between)
-        if self.normal:
+        if self.normal is not msgspec.UNSET:
             msgspec.structs.force_setattr(self, "normal", _unit(f"normal of the wall between {ends}", self.normal))
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
             _check_amount(f"{name} of the wall between {ends}", getattr(self, name), unit)

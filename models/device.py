@@ -38,10 +38,13 @@ def symmetric(field: str, value: Any, axes: int) -> _Matrix:
     """Return a number, a list of one number per axis or a symmetric matrix as a matrix (axes, axes).
 
     Raises:
-        ValueError: The list or matrix has the wrong shape, or the matrix is not symmetric.
+        ValueError: A number is not finite, the list or matrix has the wrong shape, or the matrix is not symmetric.
     """
     if isinstance(value, Real):
-        return float(value) * np.eye(axes)
+        number = float(value)
+        if not np.isfinite(number):
+            raise ValueError(f"{field} is {number:g}, expected a finite number")
+        return number * np.eye(axes)
     rows = [row if isinstance(row, Real) else tuple(row) for row in value]
     if len(rows) == axes and all(isinstance(row, Real) for row in rows):
         numbers = np.array(rows, dtype=float)

@@ -393,8 +393,9 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
     along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction; by default the first axis
 
     def __post_init__(self) -> None:
-        if self.along and not (any(abs(c) > 1e-9 for c in self.along) and all(abs(c) < 1e9 for c in self.along)):
-            raise ValueError(f"along is {list(self.along)}, expected entries below 1e9 that are not all 0")
+        along = (1.0,) if self.along is msgspec.UNSET else self.along
+        if not (any(abs(c) > 1e-9 for c in along) and all(abs(c) < 1e9 for c in along)):
+            raise ValueError(f"along is {list(along)}, expected entries below 1e9 that are not all 0")
         require("amplitude", self.amplitude, 0.0, 1.0, "m")
         require("frequency", self.frequency, 0.0, 100.0, "Hz")
         require("phase", self.phase, -100.0, 100.0, "rad")
@@ -437,12 +438,15 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         if several and along and {len(along)} != several:
             raise ValueError(f"voluntary.along is {list(along)}, expected {max(several)} numbers as the links have")
 
-    @property
-    def axes(self) -> int | None:
-        """The number of free axes that the device must have; None if no part of the hand has a direction."""
-        along = self.voluntary.along if self.voluntary else None
-        most = max(link.axes for link in self.links)
-        return len(along) if along else most if most > 1 else None
+    def vectors(self) -> list[tuple[str, tuple[Any, ...]]]:
+        """Return the fields, with values, that have an entry for each free axis of the device."""
+        named = [
+            (f"links #{i}.{name}", getattr(link, name))
+            for i, link in enumerate(self.links, start=1)
+            for name in ("damping", "stiffness")
+        ]
+        named.append(("voluntary.along", self.voluntary and self.voluntary.along))
+        return [(field, value) for field, value in named if isinstance(value, tuple)]
 
     def port(self) -> Port:
         """Return the mechanics that the handle feels."""

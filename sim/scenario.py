@@ -132,11 +132,17 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 raise ValueError(f"lam #{i + 1} is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds([person.holds for person in self.person], len(self.device))
         for i, (human, device) in enumerate(zip(self.human, self.device, strict=True), start=1):
-            axes, has = human.axes if isinstance(human, Human) else None, len(device.free)
-            if axes not in (None, has):
-                raise ValueError(
-                    f"human #{i} has vectors of {axes} numbers, expected {has}, as the device has free axes"
-                )
+            has = len(device.free)
+            for field, value in human.vectors() if isinstance(human, Human) else ():
+                if len(value) != has:
+                    expected = f"expected {has} entries, as the device has free axes"
+                    raise ValueError(f"human #{i}.{field} is {list(value)}, {expected}")
+        for i, person in enumerate(self.person, start=1):
+            free = [self.device[k - 1].axis_names for k in person.holds]
+            if len(set(free)) > 1:
+                shown = "; ".join(", ".join(name[1:] for name in names) for names in free)
+                expected = f"expected devices with the same free axes, which are {shown}"
+                raise ValueError(f"person #{i}.holds is {list(person.holds)}, {expected}")
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
         if self.ranges and self.environment.walls:

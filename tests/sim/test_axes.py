@@ -94,6 +94,8 @@ def rows(matrix: Array) -> str:
         ("damping = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]", "", ("damping is", "eigenvalues -1 to 3")),
         ("damping = [1, 2]", "", ("damping is [1", "expected one number, 3 numbers or 3 rows")),
         ("damping = [1, inf, 1]", "", ("damping is [1", "expected finite numbers")),
+        ("damping = inf", "", ("damping is inf", "expected a finite number")),
+        ("damping = 1.0\ndelta = nan", "", ("delta is nan", "expected a finite number")),
         ("damping = 1.0\ndelta = [1.0, 1.0, 1.1]", "", ("delta is", "delta <= damping as matrices")),
         ("force_limit = [3, 3]", "", ("force_limit is", "expected one number or 3")),
         ("friction = [0, 0, -1]", "", ("friction #3 is -1", "0 to 1000 N")),
@@ -102,6 +104,7 @@ def rows(matrix: Array) -> str:
             ', {between = ["left", "ground"], stiffness = 1.0, along = [0, 0, 0]}',
             ("springs #3: along", "not all 0"),
         ),
+        ("", ', {between = ["left", "ground"], stiffness = 1.0, along = []}', ("springs #3: along", "[]", "not all 0")),
         ("", ', {between = ["left", "ground"], stiffness = 1.0, along = [1, 0]}', ("along", "expected 3 numbers")),
         ("", ', {between = ["left", "ground"], stiffness = [1, 2]}', ("springs #3.stiffness is [1, 2]", "3 numbers")),
         ("", ', {between = ["left", "ground"], stiffness = [1, 1, -2]}', ("springs #3.stiffness", "eigenvalue -2")),
@@ -124,17 +127,29 @@ ALIKE = "damping = 1.0, stiffness = 9.0"
 
 
 @pytest.mark.parametrize(
-    ("link", "more"),
+    ("link", "more", "words"),
     [
-        ("damping = 1.0, stiffness = [9.0, 8.0]", ""),
-        (ALIKE, ", voluntary = { amplitude = 0.01, frequency = 1.0, along = [1, 0] }"),
+        ("damping = 1.0, stiffness = [9.0, 8.0]", "", r"human #1.links #1.stiffness is \[9.0, 8.0\], expected 3"),
+        (
+            ALIKE,
+            ", voluntary = { amplitude = 0.01, frequency = 1.0, along = [1, 0] }",
+            r"along is \[1.0, 0.0\], expected 3",
+        ),
+        (ALIKE, ", voluntary = { amplitude = 0.01, frequency = 1.0, along = [] }", r"along is \[\], expected"),
     ],
 )
-def test_hands_have_the_axes_of_their_devices(link: str, more: str) -> None:
+def test_hands_have_the_axes_of_their_devices(link: str, more: str, words: str) -> None:
     hands = f"{{ links = [{{ mass = 0.1, {link} }}]{more} }}, {{ links = [{{ mass = 0.1, {ALIKE} }}] }}"
     text = f"human = [{hands}]\n" + TEXT.replace("FIRST", "").replace("SECOND", "").replace("MORE", "")
-    with pytest.raises(InputError, match="human #1 has vectors of 2 numbers, expected 3"):
+    with pytest.raises(InputError, match=words):
         parse(text)
+
+
+def test_a_person_holds_devices_with_the_same_free_axes() -> None:
+    person = "person = [{ holds = [1, 2], mass = 30.0, damping = 80.0, stiffness = 900.0 }]\n"
+    text = TEXT.replace("FIRST", "").replace("SECOND", 'clamped = ["z"]').replace("MORE", "")
+    with pytest.raises(InputError, match=r"person #1.holds is \[1, 2\].* which are x, y, z; x, y"):
+        parse(person + text)
 
 
 def test_delays_are_one_for_each_device() -> None:
