@@ -25,7 +25,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m]
-_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a matrix: far below any device's, and above the rounding of the largest ones
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below any device's, above the rounding of the largest
 AXES = ("x", "y", "z")
 
 #: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
@@ -75,7 +75,7 @@ class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_o
     them: the transmission, a spring and a damper in parallel, joins the motor to everything else.
     """
 
-    motor_mass_min: float  # [kg] of all that moves rigidly with the motor's shaft
+    motor_mass_min: float  # [kg] total mass of the parts that move rigidly with the motor's shaft
     transmission_stiffness_max: float  # [N/m]
     transmission_damping_min: float  # [N s/m]
     transmission_damping_max: float  # [N s/m]
@@ -93,7 +93,7 @@ class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_o
 
 
 class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """Properties of both kinds of a device; the kinds declare the fields."""
+    """Properties that both kinds of devices share; the subclasses declare the fields."""
 
     @property
     def passivity_level(self: Any) -> float:
@@ -101,7 +101,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return self.damping if self.delta is None else self.delta
 
     def with_damping(self: Any, damping: float) -> Device:
-        """Return the device with another motor damping, all of it guaranteed and equal on its axes."""
+        """Return the device with this motor damping on each of its axes, all of it guaranteed."""
         return msgspec.structs.replace(self, damping=damping, delta=None)
 
     @property
@@ -117,7 +117,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
     def matrix(self: Any, field: str) -> _Matrix:
         """Return `damping`, or with field "delta" the guaranteed damping, as a matrix over the free axes [N s/m].
 
-        Clamped axes do not move, so v' Delta v of the device is that of the block of the free axes.
+        Clamped axes do not move, so only the block of the free axes contributes to v' Delta v.
         """
         value = self.passivity_level if field == "delta" else self.damping
         return symmetric(field, value, self.axes)[np.ix_(self.free, self.free)]
@@ -151,7 +151,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     `damping` is the output-strict-passivity level of the port at motor and encoder, for every load at the transmission.
     """
 
-    motor_mass: float = 0.06  # [kg] assumed, with handle_mass: 0.25 kg in total
+    motor_mass: float = 0.06  # [kg] assumed; motor and handle have 0.25 kg together
     damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
     handle_mass: float = 0.19  # [kg] assumed
     transmission_stiffness: float = 14500.0  # [N/m] assumed: puts the structural mode near 90 Hz
@@ -160,15 +160,15 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
-    delta: _Levels | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
-    credible_force: float | None = None  # [N] in the transmission, up to which its model is trusted
-    credible_speed: float = 2.0  # [m/s] of the handle, up to which the model is trusted. Assumed: three times 0.7 m/s,
-    # which masters of teleoperation exceed in a fifth of the fast part of a tapping task (abstract of a study)
+    delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
+    credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
+    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted. Assumed: about three times the
+    # 0.7 m/s that teleoperation masters exceed in a fifth of the fast part of a tapping task (abstract of a study)
     guaranteed: Guaranteed | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
-    file: ClassVar[str] = "compliant"  # .xml, its MJCF
+    file: ClassVar[str] = "compliant"  # name of the MJCF file, without ".xml"
 
     @property
     def bodies(self) -> dict[str, float]:
@@ -284,7 +284,7 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
 
 
 def _each(self: Any, name: str) -> tuple[float, ...]:
-    """Return one number per axis, or the one number. Raises ValueError for a list of the wrong length."""
+    """Return the numbers of a field: one per axis, or only one. Raises ValueError for a list of the wrong length."""
     value = getattr(self, name)
     if not isinstance(value, tuple):
         return (value,)
@@ -367,12 +367,12 @@ class Listed:
     """A real device along one axis; None stands for a number without a published source."""
 
     title: str
-    kind: _Known | None = None  # of the model that the source identified; a scenario assumes "rigid" unless it says so
+    kind: _Known | None = None  # kind of the model that the source identified; without it a scenario assumes "rigid"
     damping: _Known | None = None  # [N s/m]
     mass: _Known | None = None  # [kg] felt at the handle
     force_limit: _Known | None = None  # [N]
     encoder_step: _Known | None = None  # [m] at the handle
-    friction: _Known | None = None  # [N] Coulomb, at most
+    friction: _Known | None = None  # [N] upper bound on the Coulomb friction
     stiffness: _Known | None = None  # [N/m] largest stiffness that a programming framework admits
     framework_damping: _Known | None = None  # [N s/m] largest damping that a programming framework admits
 
@@ -444,9 +444,9 @@ def listed_device(name: str) -> tuple[str, Listed]:
 
 
 def fields_of(name: str, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a scenario's [[device]]: those of the catalogue, replaced and completed by its `own`.
+    """Return the fields of a scenario's [[device]]: the catalogue's fields, overridden by the scenario's `own` fields.
 
-    Raises ValueError for an unknown name, or for a required number that neither has.
+    Raises ValueError for an unknown name, or for a required number that is in neither of them.
     """
     key, device = listed_device(name)
     fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}

@@ -35,8 +35,8 @@ class HeldPlant:
 def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPlant:
     """Sample a continuous plant, or many plants, with its input held for T [s].
 
-    If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold], and the held
-    forces act until then: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
+    If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold]. The held forces
+    act until the latch: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
     """
     if late is not None:
         return latched(partial(hold, plant), T, late)
@@ -49,7 +49,7 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
 
 
 def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]) -> HeldPlant:
-    """Return the plant of `hold` with `late`, where `held(t)` samples the plant for a time t [s]."""
+    """Return the plant whose forces latch `late` (m,) [s] after the tick; `held(t)` is the plant held for t [s]."""
     period, m = held(T), len(late)
     *many, n, inputs = period.B.shape
     w = inputs - m
@@ -63,7 +63,7 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return rows (..., m, entries): from [s; held forces; w; f] of a tick to each position when its force latches."""
+    """Return rows (..., m, entries) that map a tick's [s; held forces; w; f] to each position at its force's latch."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -148,8 +148,8 @@ _Which = NDArray[np.intp]
 def product_of(matrices: _Array) -> Product:
     """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
 
-    A plant splits into independent blocks (each device with its human). They are detected from the zeros of the
-    matrices, and only they are multiplied.
+    A plant splits into independent blocks (each device with its human). The zeros of the matrices show the blocks, and
+    only entries inside a block are multiplied.
     """
     if matrices.ndim == 2:
         return np.ascontiguousarray(matrices).dot
@@ -172,7 +172,7 @@ def product_of(matrices: _Array) -> Product:
 def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
     """Return rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
 
-    Their shapes are (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
+    The arrays have the shapes (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
     """
     import scipy
 

@@ -1,10 +1,10 @@
 """Humans as passive ports at the handles: chains of masses, persons with several devices, random draws, own hands.
 
 Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
-feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). A `Port` checks that it is passive when it is
-built, so every human in a simulation is passive.
+feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). The constructor of a `Port` checks passivity,
+so every human in a simulation is passive.
 
-On a device with several axes a port of one axis acts in the same way along each of them (`Port.in_space`).
+On a device with several axes a port of one axis acts in the same way along each axis (`Port.in_space`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
         raise ValueError(f"impedance: passivity cannot be decided, the margin is too small near {hertz}; add damping")
 
 
-_FIRST, _EVALUATIONS = 64, 1 << 15  # number of intervals at the start, and of all intervals that are evaluated
+_FIRST, _EVALUATIONS = 64, 1 << 15  # number of intervals at the start, and largest number of evaluated intervals
 _REACH = 0.5  # largest half-width of an interval, in units of the reciprocal norm of the resolvent
 _UNIT = 2.0**-53
 
@@ -95,9 +95,9 @@ def _real_part(A: _Array, B: _Array, C: _Array, D: _Array) -> tuple[float, float
     """Bound Re Z from below at all frequencies, not only at those of a grid.
 
     The substitution w = a tan(t/2) turns Z into a function G(z) on the unit circle, z = e^jt. On an interval of
-    half-width h around t0 Re G is at least its tangent less h^2/2 max |G''|. |G''| is bounded by means of
-    R = (zI - A)^-1 at t0. It is large near a narrow resonance, where intervals are halved. A bound on the rounding
-    errors is subtracted.
+    half-width h around t0, Re G is at least its tangent less h^2/2 max |G''|. R = (zI - A)^-1 at t0 gives a bound on
+    |G''|, which is large near a narrow resonance. Intervals whose lower bound is negative are halved. A bound on the
+    rounding errors is subtracted.
 
     Returns:
         The lower bound, the least computed value [N s/m], its frequency [rad/s] and the mean of |Z| [N s/m].
@@ -160,7 +160,7 @@ class Port:
     many humans of the same structure.
 
     Raises:
-        ValueError: A shape does not match, a parameter is negative, or a point that is no handle has no mass.
+        ValueError: A shape does not match, a parameter is negative, or a point other than a handle has no mass.
     """
 
     mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
@@ -169,7 +169,7 @@ class Port:
     stiffness: _Array  # (..., springs) [N/m]
     impedance: Impedance | None = None  # between the (only) handle and the base, on every axis
     handles: int = 1
-    pull: int = -1  # spring-damper that the voluntary force contracts, or a group of `axes` spring-dampers
+    pull: int = -1  # index of the spring-damper, or of the group of `axes` of them, that the voluntary force contracts
     axes: int = 1
 
     def __post_init__(self) -> None:
@@ -203,7 +203,7 @@ class Port:
     def chain_in_space(cls, links: _Array, axes: int) -> Self:
         """Return a chain of links (..., n, 1 + 2 axes^2): mass, then damping and stiffness along each of `directions`.
 
-        The springs along the axes are the last ones of a link, which a voluntary force contracts.
+        The springs along the axes come last in a link, so that the voluntary force contracts those of the last link.
         """
         n, count = links.shape[-2], axes**2
         between = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
@@ -237,7 +237,7 @@ class Port:
 
     @classmethod
     def body(cls, hands: int, values: _Array) -> Self:
-        """Return a body on ground whose hands are joined one to the next; values (..., 5) as in Crowd.bodies."""
+        """Return a body on ground, with a spring-damper from each hand to the next; values (..., 5) as Crowd.bodies."""
         mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
         across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
         across[-1] = 0.0
@@ -287,7 +287,7 @@ def directions(axes: int) -> _Array:
 
 
 def _amounts_along(field: str, value: Any, axes: int) -> _Array:
-    """Return the amounts (axes^2,) along `directions` that add up to a number, a list or a matrix.
+    """Return amounts (axes^2,) of springs along `directions` whose sum is the given number, list or matrix.
 
     Raises ValueError if the matrix is not diagonally dominant.
     """
@@ -295,7 +295,7 @@ def _amounts_along(field: str, value: Any, axes: int) -> _Array:
     pairs = [matrix[i, j] for i in range(axes) for j in range(i + 1, axes)]
     skew = [max(0.0, sign * each) for each in pairs for sign in (1, -1)]
     own = 2 * np.diag(matrix) - np.abs(matrix).sum(axis=1)
-    if not (own >= -1e-12 * np.abs(matrix).max()).all():  # rounding of a matrix that was made of amounts
+    if not (own >= -1e-12 * np.abs(matrix).max()).all():  # allows rounding in a matrix that was computed from amounts
         expected = "no row whose diagonal entry is below the sum of the others' magnitudes"
         raise ValueError(f"{field} is {matrix.tolist()}, expected {expected}")
     return np.array([*skew, *np.maximum(own, 0.0)])
@@ -304,7 +304,7 @@ def _amounts_along(field: str, value: Any, axes: int) -> _Array:
 def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
     """Return the port of a hand of `mass` [kg] and impedance C (s I - A)^-1 B + D, from velocity [m/s] to force [N].
 
-    A may have one eigenvalue at zero. It adds k/s to the impedance, and becomes a spring of the stiffness k.
+    A may have one eigenvalue at zero. This eigenvalue adds k/s to the impedance and becomes a spring of stiffness k.
 
     Raises:
         ValueError: The hand is not passive, or A has a double eigenvalue at zero.
@@ -336,7 +336,8 @@ class Hand(Protocol):
     def voluntary_force(self, t: _Array) -> _Array:
         """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port.
 
-        Its shape is that of t, or (N, axes) on a device with several axes, where (N,) acts on the first one.
+        The force has the shape (N,) of t. On a device with several axes it may be (N, axes); then (N,) acts on the
+        first axis only.
         """
         ...
 
@@ -384,12 +385,12 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
 
 class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A motion of the equilibrium, amplitude sin(2 pi frequency t + phase), faded in by a raised cosine."""
+    """A sinusoidal motion amplitude sin(2 pi frequency t + phase) of the equilibrium; a raised cosine fades it in."""
 
     amplitude: float  # [m]
     frequency: float  # [Hz]
     phase: float = 0.0  # [rad]
-    ease: float = 1.0  # [s]
+    ease: float = 1.0  # [s] duration of the fade
     along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction; by default the first axis
 
     def __post_init__(self) -> None:
@@ -413,7 +414,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         return force
 
 
-_MOST_LINKS = 500  # of one hand: the eigenvalues of its loop take five seconds, those for 1000 links half a minute
+_MOST_LINKS = 500  # of one hand: the loop's eigenvalues take five seconds; with 1000 links they take half a minute
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):

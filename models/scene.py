@@ -1,4 +1,4 @@
-"""Devices and the humans who hold them as one MuJoCo scene, as matrices of the same plant, and with many humans."""
+"""Build devices and the humans who hold them as one MuJoCo scene, as matrices, and as many models of one crowd."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
 # Motor, handle and transmission come from compliant.xml or rigid.xml, which a viewer can open. Those of device i are
-# called device_i/motor and so on. The scenario gives their parameters. Shapes that are only drawn stay in the scene's
-# XML and are removed from the model that is simulated.
+# called device_i/motor and so on. The scenario gives their parameters. The scene's XML contains shapes that are only
+# drawn; the simulated model does not.
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
 # Gravity, contacts and constraints are off, except for the Coulomb friction of devices. The inputs are MuJoCo
@@ -50,8 +50,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 # device feels -f.
 #
 # A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper between one point and ground
-# becomes a property of the joint, any other one a fixed tendon. An impedance (A, B, C, D) has no body: it is stored in
-# the model's custom numbers, where `plant` reads it, and the engines integrate its state beside those of the bodies.
+# becomes a property of the joint; every other spring-damper becomes a fixed tendon. An impedance (A, B, C, D) has no
+# body: it is stored in the model's custom numbers, where `plant` reads it, and the engines integrate its state.
 
 
 _Array = NDArray[np.floating[Any]]
@@ -61,12 +61,13 @@ _Array = NDArray[np.floating[Any]]
 #: defaults it stops within 7e-5 m and creeps at 6e-4 m/s.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
-APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
+APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one device, and above the rail
 DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
-_FORCE = "/force"  # in the names of the devices' motors
-_IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then [[A, B], [C, D]] by rows
+_FORCE = "/force"  # part of the names of the motors' actuators
+_IMPEDANCE = "impedance_"  # start of names of custom numbers: joint of the handle, joint of the base or -1, then
+# [[A, B], [C, D]] by rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class Scene:
     handles: tuple[int, ...]  # (m,) joint of each handle, on each of its axes
     pushed: tuple[int, ...]  # (m,) external input that acts on the end of each human (voluntary force)
     tapped: tuple[int, ...]  # (m,) external input that acts on each handle
-    points: tuple[tuple[int, ...], ...]  # (devices + persons,) joints of the points of each port, handles first
+    points: tuple[tuple[int, ...], ...]  # (devices + persons,) joints of each port's points, the handles first
     devices: tuple[int, ...]  # (m,) the device of each channel, counted from 0
 
     @property
@@ -374,14 +375,14 @@ def _place(port: Port, joints: tuple[str, ...], base: tuple[str, ...], name: str
 
 
 class _Amounts(NamedTuple):
-    """Mass, damping and stiffness by the name of a joint or a tendon; arrays over the sets of many humans."""
+    """Masses, dampings and stiffnesses by the name of a joint or tendon; with many sets of humans, arrays over sets."""
 
-    mass: dict[str, Any]  # joints in their order
+    mass: dict[str, Any]  # in the order motors, handles, other masses
     damping: dict[str, Any]
     stiffness: dict[str, Any]
 
 
-#: the mechanics of every device in every set of humans; () if the devices have those of the scenario
+#: the mechanics of every device in every set of humans; () if the devices keep the scenario's mechanics
 _Drawn = tuple[tuple[Mechanics, ...], ...]
 
 
@@ -537,7 +538,7 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
 
 
 def _free_axes(spec: mujoco.MjSpec, i: int, device: Device) -> None:
-    """Replace the slides and the transmission of device i along x by one for each free axis."""
+    """Replace each slide along x of device i, and its transmission, by one slide or transmission per free axis."""
     import mujoco
 
     for name in device.bodies:
@@ -565,7 +566,7 @@ def _file(name: str) -> mujoco.MjSpec:
 
 
 def _pulled(part: _Placed) -> list[tuple[str, float]]:
-    """Return the joints or tendons on which the voluntary force of a human acts, one per axis, and their gears."""
+    """Return one (joint or tendon, gear) per axis, on which the voluntary force of a human acts."""
     pulled, port = [], part.port
     first = port.pull % (len(port.across) // port.axes) * port.axes
     for row in range(first, first + port.axes):
@@ -616,8 +617,8 @@ class Crowd:
     """Sets of humans, one per device, all with the same number of links and without voluntary motion.
 
     `holds` lists the devices of each person with several devices, and `bodies` the bodies and cross springs of these
-    persons. A link with three numbers is the same in every direction. On devices with several axes it may have an
-    amount of damping and one of stiffness along each of `models.human.directions`.
+    persons. A link with three numbers is the same in every direction. On a device with several axes a link may have a
+    damping and a stiffness along each of `models.human.directions`.
     """
 
     links: _Array  # (nsim, devices, links, 3 or more): mass [kg], dampings [N s/m], stiffnesses [N/m]
@@ -683,11 +684,11 @@ MIXED = 0  # a number of links: half of the humans have one link and half have t
 
 
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
-    """Draw the links (devices, links, 3) of the humans with this index, one per device, as in Crowd.
+    """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
-    The links depend on (seed, index) and the population only. With `links` = MIXED there are 1 or 2 of them. With
-    `axes` the damping and the stiffness of a link are sums of random amounts along `directions`, with weights whose sum
-    has the same effect in every direction. So the damping and the stiffness in any direction lie within the
+    The links depend on (seed, index) and the population only. With `links` = MIXED the humans have 1 or 2 links each.
+    With `axes` a link has random amounts of damping and stiffness along `directions`. Their weights w make the sum of
+    w d d' over all directions d the identity. So the damping and the stiffness in any direction lie within the
     population's ranges.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
@@ -697,7 +698,7 @@ def draw(population: Population, devices: int, seed: int, index: int, links: int
         return np.exp(rng.uniform(low, high, size=(devices, count, 3)))
     drawn = np.zeros((devices, count, 1 + 2 * max(axes) ** 2))
     for i, k in enumerate(axes):
-        # The sum of w d d' over all directions d is I: e_i + e_j and e_i - e_j together give 2 (e_i e_i' + e_j e_j').
+        # The sum of w d d' is I because e_i + e_j and e_i - e_j together give 2 (e_i e_i' + e_j e_j').
         weights = np.concatenate([[1.0], *[np.repeat([0.5 / k, 1.0 / k], [k * k - k, k])] * 2])
         which = np.repeat([0, 1, 2], [1, k * k, k * k])
         amounts = np.exp(rng.uniform(low[which], high[which], size=(count, which.size)))
@@ -758,7 +759,7 @@ class HumanSets:
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, m)
     people: tuple[Person, ...] = ()
-    mechanics: _Drawn = ()  # (nsim, devices) as of Crowd
+    mechanics: _Drawn = ()  # (nsim, devices) as in Crowd
 
     def __len__(self) -> int:
         return len(self.sets)

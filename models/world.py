@@ -3,11 +3,11 @@
 A device touches a contact: a body of the scene that is a child of the world body and has no joint. A coupling with
 the direct part D_V responds within the tick, u = u0 - D_V f, where u0 is the contact's position without force. For the
 scene, device, delays and coupling are therefore one spring G = D_V^-1 from the contact to the point u0. The program
-adds this spring, and slides along the contact's directions. It steps with MuJoCo's `discrete` integrator, which solves
+adds this spring and slides along the contact's directions. MuJoCo's `discrete` integrator then solves in each step
 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
 
-This file takes G and u0 as numbers, without a coupling or a device. controller.budget.Shell measures and limits the
+The functions take G and u0 as numbers and need no coupling or device. controller.budget.Shell measures and limits the
 energy that a scene generates; docs/theory.md, "MuJoCo worlds", proves that ordinary scenes generate none.
 """
 
@@ -32,8 +32,8 @@ Array = NDArray[np.floating[Any]]
 _CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
 ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
 MOST_REPETITIONS = 8  # of a step whose forces are limited
-_LIMIT_SLACK = 1e-9  # a force that is nearer to its limit counts as limited; relative to the limit
-_DIRECTION_SLACK = 1e-6  # repetitions end where they change limited forces by less; relative to the limit
+_LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
+_DIRECTION_SLACK = 1e-6  # repetitions end when they change limited forces by less than this part of the limit
 _TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
 
 
@@ -70,7 +70,8 @@ class Part:
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
-    A mesh that exists in several folders is listed with each. Raises ValueError if a file cannot be read or is no XML.
+    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read or is no
+    XML.
     """
     files: dict[Path, None] = {}
     folders: list[Path] = []
@@ -84,7 +85,7 @@ def files_of(path: Path) -> list[Path]:
         for node in _xml(file, path).iter():
             name = node.get("file")
             if node.tag == "include" and name:
-                beside = file.parent / name  # where MuJoCo looks if the main file's folder has none
+                beside = file.parent / name  # MuJoCo reads this file if the main file's folder has none of the name
                 visit(base / name if (base / name).exists() or not beside.exists() else beside, base)
             elif node.tag == "model" and name and (part := base / name).suffix == ".xml":
                 if part not in files:
@@ -164,7 +165,7 @@ class World:
             contacts: One contact per device.
             stiffness: G of each device, (axes, axes), symmetric and positive definite [N/m].
             T: The period of the loop [s].
-            every: The number of ticks for each step of the scene, whose length is as many periods.
+            every: The number of ticks per step of the scene, so that a step lasts every * T.
             gravity: False switches the scene's gravity off.
 
         Raises:
@@ -201,7 +202,7 @@ class World:
         self._joint = np.array([joint.id for joint in joints])
         weightless = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         carried = 0.0 if weightless else self.model.body_gravcomp * ~_lifted_by_actuators(self.model)
-        self._afloat = self.model.body_mass * carried  # (nbody,) [kg] mass without weight, by gravity compensation
+        self._afloat = self.model.body_mass * carried  # (nbody,) [kg] mass whose weight gravity compensation carries
 
     @property
     def channels(self) -> int:
@@ -493,7 +494,7 @@ class Port:
         """
         world = self.world
         goal = world._Q.T @ u0
-        # between its steps the scene is at rest and does no work
+        # The scene does not move between its steps, so it does no work there.
         force = self._within(self._spring(goal)) if self.ticks % world.every else self._stepped(goal)
         self.ticks += 1
         return force
@@ -514,7 +515,7 @@ class Port:
         )
 
     def _within(self, force: Array) -> Array:
-        """Return `force` (m,) [N] after the motors' limits."""
+        """Return `force` (m,) [N] within the motors' limits."""
         if self._radial.any():
             force = force / np.repeat(np.where(self._radial, np.maximum(self._used(force), 1.0), 1.0), self._axes)
         return np.clip(force, -self._limits, self._limits)
@@ -575,7 +576,7 @@ class Port:
         return self._within(np.where(held, push, free))
 
     def _potential(self) -> float:
-        """Return the energy [J] of gravity and the scene's own springs at the present positions, without the springs G.
+        """Return the energy [J] of gravity and of the scene's own springs, but not of G, at the present positions.
 
         Weights that gravity compensation carries are left out.
         """

@@ -1,4 +1,4 @@
-"""Errors of runs: of an engine against the exact one, and of forces against those of an ideal environment.
+"""Errors of runs: of an engine against the exact engine, and of forces against an ideal environment's forces.
 
 `measure` returns the cost and the errors of one setting of an engine, from the same run. `compare_engines` finds the
 cheapest engine and step that keep a given error on a scene.
@@ -35,7 +35,7 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class PositionError:
-    """Error of device positions against the exact engine, or None and the reason."""
+    """Error of device positions against the exact engine; without a comparison, None and the reason."""
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
@@ -47,8 +47,8 @@ def position_error(
 ) -> PositionError:
     """Return the position error of a trace against the exact engine.
 
-    `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace is compared up to
-    the first clipped tick, because growth multiplies any difference.
+    `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace that clips gets no
+    figures, because growth multiplies any difference: `reason` has the error up to the first clipped tick.
     """
     if exact is None:
         return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
@@ -79,7 +79,7 @@ _SETTINGS = (
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
 _REPEATS = 3  # number of runs; the least CPU time is the cost
-_TAIL = 4000  # last ticks, in which a limit cycle is measured
+_TAIL = 4000  # ticks at the end of a run, in which a limit cycle is measured
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ class Row:
     integrator: str | None
     substeps: int | None
     position_relative_rms: float | None
-    growth_rate_error: float  # [1/s] the larger of the loop with and without the coupling
-    verdict_correct: bool  # with and without the coupling
+    growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
+    verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_amplitude_n: float | None  # of the limit cycle without coupling
     cycle_frequency_hz: float | None
     cycle_amplitude_error: float | None  # relative
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
-    pareto: bool = False  # see `_with_front`
+    pareto: bool = False  # whether the setting is on the Pareto front (`_with_front`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class _Reference:
     coupled: Simulation
     uncoupled: Simulation
     trace: Trace
-    cycle: tuple[int, float, float] | None  # channel, amplitude [N], frequency [Hz]; None where none is sustained
+    cycle: tuple[int, float, float] | None  # channel, amplitude [N], frequency [Hz]; None without a limit cycle
 
 
 def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
@@ -124,7 +124,7 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
 def measure_all(
     coupled: Simulation, uncoupled: Simulation, default: int, progress: Callable[[int, int], None]
 ) -> tuple[list[Row], list[str], bool]:
-    """Return (rows of the settings that are stable on this plant, reasons of the others, whether it was interrupted).
+    """Return (rows of the settings that are stable on this plant, reasons for the others, whether Ctrl-C interrupted).
 
     `default` is the default number of substeps of RK4.
     """
@@ -158,9 +158,9 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto` for rows that no other row of the same kind of engine beats in cost and both errors.
+    """Set `pareto` for rows with right verdicts that no row of the same engine beats in cost and both errors.
 
-    The exact engine is always on the front: it exists for linear plants only.
+    MuJoCo's settings do not compete with the exact engine, which exists for linear plants only.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -224,9 +224,9 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """The time at which a run first leaves the devices' declared limits of the model, and the largest values.
+    """The time at which a run first leaves the limits within which the devices' model is credible, and the peaks.
 
-    Figures are per device; the transmission force of a rigid device is None.
+    Each list has one entry per channel; the transmission force of a rigid device is None.
     """
 
     until_s: float | None
@@ -238,10 +238,10 @@ class Credible:
 
 
 def credible(simulation: Simulation, trace: Trace) -> Credible:
-    """Check a run against the limits of the model, whose transmissions and motors have none.
+    """Check whether a run stays within the forces and speeds for which the devices' linear model is credible.
 
     `until_s` is the first time at which a transmission carries more than `credible_force` or a motor moves faster than
-    `credible_speed`, or None.
+    `credible_speed`. It is None if neither happens.
     """
     n, devices = simulation.scene.model.nq, simulation.scenario.axis_devices
     forces: list[float | None] = []
@@ -268,7 +268,7 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
 
 
 def _not_credible(credible: Credible, until: float) -> str:
-    """Return one sentence for report and caption."""
+    """Return a sentence for report and caption on how far the run leaves the credible limits."""
     pairs = zip(credible.transmission_force_n, credible.credible_force_n, strict=True)
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
     speeds = zip(credible.motor_speed_m_per_s, credible.credible_speed_m_per_s, strict=True)
@@ -306,10 +306,10 @@ class ForceError:
 
 
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
-    """Return the run's forces before their limits and those of Lambda E, for the measured displacements.
+    """Compare the run's forces before clipping with those of Lambda E for the measured displacements.
 
-    With switching delays or a limiter the forces are those that arrived, within their limits. Walls have no linear
-    ideal.
+    With switching delays or a limiter, the run's forces are those that arrived, within their limits. With walls there
+    is no comparison, because walls have no linear ideal.
     """
     process = simulation.process
     if process.walls:
@@ -337,19 +337,19 @@ def _rms(values: Array) -> float:
 
 # ---- the cheapest engine and step for a given error
 #
-# The error is the relative rms of the encoders' positions over the run, on a smooth scene against the exact loop. With
-# friction there is no exact loop: Runge-Kutta with n steps is compared with 2 n, until the difference is small enough.
-# If differences shrink by q with every halving, the finest run errs by q/(1 - q) times the last one; the order is one
-# at least, q = 1/2. One pair may agree by chance, so q is taken over two halvings, and is at least _EVEN because
-# friction makes it jump.
+# The error is the relative rms error of the encoders' positions over the run. On a smooth scene the exact loop is the
+# reference. With friction there is no exact loop: runs of RK4 with n and 2 n substeps are compared, and n is doubled
+# until the difference is small enough. If every doubling multiplies the difference by q, the error of the finest run is
+# q/(1 - q) times the last difference; a method of first order has q = 1/2. One pair of runs may agree by chance, so q
+# is the larger ratio of the last two doublings. It is at least _EVEN, because friction makes the ratio jump.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
-_EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics in a step; one for the others
+_EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics per step; other integrators need one
 _MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6
-_CONTRACTS = 0.7  # ratio of successive differences above which they do not converge
-_FEW = 4.0  # the error of differences that do not converge, in units of the largest of them
+_CONTRACTS = 0.7  # largest q of differences that count as convergent
+_FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three
 
 
 @dataclass(frozen=True)
@@ -358,7 +358,7 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # error of the encoders' positions over the run, with that of a refined reference
+    position_relative_rms: float  # error of the encoders' positions over the run, plus that of a refined reference
     verdict_correct: bool  # whether the simulated loop has the verdict of the exact loop
     cpu_s: float  # CPU time of the run, for the report only
 
@@ -375,10 +375,11 @@ class EngineChoice:
 def compare_engines(
     simulation: Simulation, error: float, ticks: int | None = None, progress: Progress = lambda done, ticks: None
 ) -> tuple[EngineChoice, ...]:
-    """Return the settings that are stable on the scene's plant, the cheapest first, over `ticks` of the scenario.
+    """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
 
     Runs have the scenario's walls, limits, encoder steps, varying delays and net; verdicts are for constant delays
-    without a net. With friction the reference is refined until RK4 keeps `error`. Every run calls `progress`.
+    without a net. With friction, the reference is refined until its error is at most `error`. Every run calls
+    `progress`.
 
     Raises InputError if 60 million evaluations of the dynamics do not suffice, or if nothing moves.
     """
@@ -428,9 +429,9 @@ class CrossCheck:
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
-    """Repeat the run by RK4, which shares no matrix with the other engines, or by the exponential one if RK4 ran.
+    """Repeat the run with RK4, or with the exponential integrator if RK4 ran; RK4 shares no matrix with other engines.
 
-    `simulation` is the loop that ran, with its net. Positions are compared up to the earlier end of both runs.
+    `simulation` is the loop that ran, with its net. Positions are compared up to the end of the shorter run.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
@@ -478,7 +479,7 @@ def _refined(
 
 
 def _missed(gaps: Sequence[float]) -> float:
-    """Return a bound of the finest run's error from the differences of successive runs; inf for less than three."""
+    """Bound the finest run's error by the differences of successive runs; inf for less than three differences."""
     *_, first, second, last = math.inf, math.inf, *gaps
     if not math.isfinite(first + second + last):
         return math.inf
@@ -521,13 +522,13 @@ def _apart(own: Array, truth: Array) -> float:
 # The default integrator and number of substeps of a plant, and the map of an engine over one period.
 #
 # On a smooth scene the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
-# the continuous plant decide: the fastest weakly damped mode must be resolved (mode h <= 0.2), and the strongest
-# damping followed (rate h < 1). The number is doubled until the simulated loop has the verdict of the exact one.
+# the continuous plant decide: a step h must resolve the fastest weakly damped mode (mode h <= 0.2) and follow the
+# strongest damping (rate h < 1). The number is doubled until the simulated loop has the verdict of the exact loop.
 
-MOST = 10_000  # substeps
+MOST = 10_000  # largest number of substeps
 _MODE_LOST = "it damps fast modes away"
-_NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
-_UNIT = 1e-6  # length of basis states and inputs: the plant is linear, and every actuator limit is larger
+_NEUTRAL = 1e-6  # allowed excess of a spectral radius over 1; rounding splits a free plant's eigenvalues at 1 by 1e-8
+_UNIT = 1e-6  # length of basis states and inputs, below every actuator limit; the plant is linear
 
 
 def settle(
@@ -556,12 +557,12 @@ def settle(
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     """Return 1 for the exponential integrator on a smooth scene, else the least number that follows the plant.
 
-    The number is at least 4; the comment at the head of this section has the rule. Raises InputError if no number up
+    The number is at least 4; the comment at the head of this section states the rule. Raises InputError if no number up
     to 10000 suffices.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return 1
-    if integrator == "discrete":  # This integrator has more state than position and velocity, which `_agrees` maps.
+    if integrator == "discrete":  # `_agrees` maps position and velocity only, and this integrator has more state.
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
@@ -626,7 +627,7 @@ def _measured_hold(
 ) -> HeldPlant:
     """Return the map s[k+1] = A s[k] + B [w; f][k] of an engine, by stepping every basis state and input once.
 
-    Together with the force map this map has the growth rate that the engine simulates. The default of `T` [s] is the
+    Closed with the force map, this map has the growth rate that the engine simulates. The default of `T` [s] is the
     scenario's period.
     """
     period, simulation = simulation.scenario.T if T is None else T, simulation.even

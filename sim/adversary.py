@@ -1,13 +1,14 @@
 """Search for the worst passive human: a seeded global search over lossless chains for the largest growth of the loop.
 
-A lossless chain of masses and springs can present any reactance at the frequency where the loop is weakest, and takes
-no energy out. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above that, errors of the matrix
-exponential would decide.
+A lossless chain of masses and springs takes no energy out, and can present any reactance at the frequency where the
+loop is weakest. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above 3 kHz, errors of the matrix
+exponential would decide the verdict.
 
 The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is larger unless v is constant
-between samples. For a sinusoid, |dx|^2 / T is (sin x / x)^2 of the integral, with x = pi f T. The condition therefore
-requires too much damping by about this factor at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 %
-at 8 Hz (loops with long delays). No search has found an unstable human within this gap; outside most searches do.
+between samples. For a sinusoid, |dx|^2 / T is (sin x / x)^2 times the integral, with x = pi f T. The condition
+therefore requires too much damping by about this factor at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms,
+0.03 % at 8 Hz (loops with long delays). No search has found an unstable human within this gap; most searches find one
+if the damping is below the gap.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; roundin
 class _Pass(NamedTuple):
     """One search over modes above a frequency: slower modes of a lossless hand barely decay and hide a growing one."""
 
-    links: int  # of each arm; a single mass and spring present every reactance at one frequency
+    links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
     min_frequency_hz: float  # modes below it are ignored
     held: bool = False  # one person holds all devices; body and cross spring present every reactance matrix
 
@@ -52,12 +53,12 @@ class Worst:
     """The worst humans of a search."""
 
     humans: tuple[Hand, ...]
-    persons: tuple[Person, ...]  # who hold several devices
+    persons: tuple[Person, ...]  # persons who hold several devices
     spectral_radius: float
     growth: float  # [1/s]
     frequency_hz: float
-    evaluated: int  # sets of humans
-    mechanics: Sequence[Mechanics] = ()  # of devices with guaranteed bounds, which the search varies within them
+    evaluated: int  # number of sets of humans
+    mechanics: Sequence[Mechanics] = ()  # worst mechanics within the devices' guaranteed bounds, if all have bounds
 
     @property
     def destabilises(self) -> bool:
@@ -159,7 +160,7 @@ def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
     """Convert logarithms of masses and stiffnesses, (2 devices links, nsim), to lossless humans.
 
     If one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. If all
-    devices have guaranteed bounds, the last _WITHIN rows of each device place its mechanics within them.
+    devices have guaranteed bounds, the last rows, _WITHIN per device, are the arguments u of `Mechanics.within`.
     """
     arms = 2 * len(devices) * kind.links
     x, within = np.split(x, [arms + 3 * kind.held])
@@ -175,7 +176,7 @@ def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
 
 
 def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
-    """Return the loops in periods of the longest length, with forces that latch as late as possible."""
+    """Return the loops with the longest period and with forces that latch as late as possible."""
     late = None if scenario.latency is None else [most for _, most in scenario.latency]
     return exact_loops(variants(scenario.device, crowd), F, scenario.longest_period, late)
 

@@ -1,8 +1,8 @@
 """Comparison of couplings with the same devices and hands, from no coupling to the optimal one.
 
 The couplings are none, the paper's gains for the paper's loop, and the spring-dampers for any passive environment and
-for this environment. The optimal coupling is included if it is quick to find. Each is assessed with its proof and
-drives the same hands in the exact engine.
+for this environment. The optimal coupling is included if it is quick to find. Each coupling is assessed with its proof
+and drives the same hands in the exact engine.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Alternative:
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)
     trace: Trace | None = off_table("left out", None)  # of the exact engine
-    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of the ideal environment for that motion
+    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of the ideal environment for trace's motion
     until_s: float | None = off_table("left out", None)  # time from which the trace is not credible
 
     @property
@@ -78,7 +78,7 @@ def alternatives(
     """Run the scenario with each coupling that is possible in its loop.
 
     Scenarios with ranges get couplings for any environment only. Scenarios with walls get no optimal coupling, because
-    it contains a linear model. `also` is a user's own condition, by which all couplings are judged, too.
+    it contains a linear model. `also` is a user's own condition; if given, it judges every coupling, too.
 
     Raises:
         InputError: the delays switch.

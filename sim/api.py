@@ -1,4 +1,4 @@
-"""`simulate` and `validate` for scripts, as in the commands sim.run and sim.validate. SI units."""
+"""`simulate` and `validate` for scripts, with the results of the commands sim.run and sim.validate. SI units."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ScenarioRun:
     period: Period | None  # of the worst switching of the delays; None for constant delays
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # with defaults filled in
-    remarks: list[str]  # on a requested number of substeps
+    remarks: list[str]  # remarks on the number of substeps that the user requested
     trace: Trace
     wall_s: float
     seed: int
@@ -78,8 +78,8 @@ def run_scenario(
 ) -> ScenarioRun:
     """Close the loop for the scenario's duration, for `sim.run` and `simulate`.
 
-    With `lag`, rho (m,) [N/m], forces leave through a limiter; `net` stands between the forces and the devices. Raises
-    InputError for impossible settings.
+    `lag` is rho (m,) [N/m] of the limiter through which forces leave, or None to clip them. `net` stands between the
+    forces and the devices. Raises InputError for impossible settings.
     """
     simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
@@ -133,7 +133,8 @@ def simulate(
             [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes it
             passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for any
             environment, with psi = 0.
-        energy_budget: W0 [J] of the shell (default 0), or, without `environment`, the energy budget of the devices.
+        energy_budget: W0 [J] of the shell (default 0, in a MuJoCo scene START_J). Without a shell, the energy budget of
+            the devices; None is no budget.
         limiter: False to clip forces. By default forces leave through the limiter that the coupling's guarantee
             covers, if there is one (`meta["assessment"]["force_limits"]`).
 
@@ -214,12 +215,12 @@ def validate(
     limiter: bool = True,
     traces: str = "sampled",
 ) -> crowds.Findings:
-    """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
+    """Let `humans` sets of random passive humans, one human per device, hold the devices without voluntary motion.
 
     Args:
         scenario: The loop. The verdict of a loop with walls is that of its worst frozen contact state.
         coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
-        humans: Number of draws from `scenario.population`; draw i depends on `seed` and i alone.
+        humans: Number of sets, drawn from `scenario.population`; set i depends on `seed` and i alone.
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
             engine and makes one engine for each set of humans.
@@ -227,8 +228,8 @@ def validate(
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.
-        traces: Which hands the other engine than the exact one simulates, too: "sampled" (those nearest to the limit,
-            the lossless ones and 64 at random), or "all".
+        traces: Which hands MuJoCo, or your own engine, simulates beside the exact engine: "sampled" (those nearest to
+            the stability limit, the lossless ones and 64 at random), or "all".
 
     Returns:
         Findings with n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop

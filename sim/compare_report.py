@@ -20,7 +20,10 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """Return the damping that a coupling needs within ten percent; for an optimal one, also the cost of a redesign."""
+    """Return a coupling's requirement in environments that differ by 10 %; if it filters forces, also a design's price.
+
+    The price is that of a design for all these environments.
+    """
     filters_forces = coupling.in_series(loop.T) is not None
     return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
 

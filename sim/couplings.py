@@ -41,7 +41,7 @@ def choose(
     limiter: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Chosen:
-    """Return the coupling of a case; by default a spring-damper is designed.
+    """Return the coupling `name` of a case; by default design a spring-damper, or a moving average in a MuJoCo scene.
 
     See design.designs.design_by_kind for `condition`, `limiter` and `progress`.
 
@@ -53,7 +53,7 @@ def choose(
     except (DesignFailed, InputError):
         raise
     except ValueError as error:
-        if place_of(error):  # in a class of the user's own
+        if place_of(error):  # The user's own class raised the error.
             raise
         raise InputError(str(error)) from None
     return replace(chosen, own=own)
@@ -68,7 +68,7 @@ def _choose(
     limiter: bool | None,
     progress: Callable[[str, int, int], None],
 ) -> Chosen:
-    """Return the coupling for the condition of a name, or for the user's own condition `own` of that name."""
+    """Return the coupling `name` for the condition named `condition`, or for the user's own condition `own`."""
     if case == "none":
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
@@ -141,11 +141,12 @@ def from_file(
         stored: The content of the file.
         loop: The loop in which the coupling is used.
         kind: The name of the coupling in reports.
-        own: A condition of the user's own, for a certificate of that name.
-        coupling: The coupling of the file, if it was built for another T.
+        own: The user's own condition, which verifies a certificate of the same name.
+        coupling: The file's coupling if the caller has built it, for example for another T.
 
     Returns:
-        The choice. Its `certificate` holds for the loop of the file, which may be another one: `assess` compares them.
+        The choice. Its `certificate` holds for the loop of the file, which may differ from `loop`: `assess` compares
+        both loops.
     """
     claim, coupling = stored.certificate, coupling or stored.built()
     # A condition of the user's own has to be given again.
@@ -206,7 +207,7 @@ def assessed(
     """Assess the chosen coupling in the loop of a scenario, as it will run.
 
     Args:
-        scenario: Its ranges, delays, periods and force limits must all be covered by a guarantee.
+        scenario: The scenario. A guarantee must cover all its ranges, delays, periods and force limits.
         case: The reference delays, "none", "I" or "II".
         chosen: The coupling with its proofs.
         environment: The environment that runs instead of the scenario's (design.assessment.assess).

@@ -1,9 +1,9 @@
 """Validate a loop with many random passive humans, by both engines, in batches over processes.
 
-Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result is
-that of a single run, bit for bit. MuJoCo's verdict is by the map of its Runge-Kutta integrator, which shares only the
-model with the exact engine. Traces in MuJoCo use the exponential integrator, at a fifth of the cost. The exact engine
-simulates all humans, MuJoCo a sample (`_witnessed`). Workers end with the process that started them.
+Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result
+equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4 integrator, which
+shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a fifth of the cost. The
+exact engine simulates all humans, MuJoCo a sample (`_witnessed`). Workers end with the process that started them.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from haptic_loop.sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
 _BATCH = 500  # humans that are decided together
-_NEAREST = 8  # of each group of alike humans in a batch, which are nearest to the limit
-_AT_RANDOM = 64  # of all humans
+_NEAREST = 8  # size of the sample of each group of alike humans in a batch: those nearest to the stability limit
+_AT_RANDOM = 64  # size of the random sample of all humans
 
 
 # ---- random passive humans, each from its own seed
@@ -111,9 +111,9 @@ class Validation:
         return self.environments[index % len(self.environments)] if self.environments else None
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
-        """Draw the humans of these indices, joined as the scenario's persons join its devices.
+        """Draw the humans of these indices, and persons who hold the same devices as the scenario's persons.
 
-        A user's own population draws from the same seeds; its persons are those of the scenario, unchanged.
+        A user's own population draws from the same seeds; the scenario's persons are then used unchanged.
         """
         scenario = self.scenario
         if not isinstance(scenario.population, Population):
@@ -139,9 +139,9 @@ class Findings:
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
         frequency: (n,) frequency of that mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
-        trace: (n,) growth rate [1/s] on its trace, or on the exact one where no other was made.
+        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's own engine; if there is none, on the exact one.
         witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
-        trace_error: (n,) error of that rate [1/s]; a rate within it does not vote.
+        trace_error: (n,) error of `trace` [1/s]; a rate of smaller size gives no verdict.
         clipped: (n,) number of ticks with a force at its limit, on that trace.
         energy: (n,) least energy W(N) on the exact trace [J].
         audited: (n,) sum of the magnitudes that W adds up [J].
@@ -150,7 +150,7 @@ class Findings:
         mass: (n,) geometric mean over channels of all mass of a hand [kg].
         damping: (n,) geometric mean over channels of the least damping of a hand [N s/m].
         switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
-        switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace under these; nan also if the trace was clipped.
+        switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace for `switching`; nan also if the trace was clipped.
         simulated: The duration of all traces together [s].
         interrupted: Whether the keyboard interrupted the validation.
         lost: The reason why batches are missing although nobody interrupted, or "".
@@ -311,8 +311,8 @@ def _witnessed(
 ) -> NDArray[np.intp]:
     """Return the numbers of the humans of one group that the other engine simulates, too.
 
-    These are all lossless ones, the _NEAREST whose `growth` [1/s] is nearest to zero, and those of the _AT_RANDOM draws
-    of all humans. They depend on the question and the group alone, not on the number of processes.
+    These are all lossless humans, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of the random
+    sample of all humans. They depend on the question and the group alone, not on the number of processes.
     """
     if validation.all_traces:
         return np.arange(len(index))

@@ -10,7 +10,7 @@ checks the stepping.
 
 A hand's impedance (A, B, C, D) is no body of MuJoCo. Its state and force are part of the exponential step, which stays
 exact. For MuJoCo's own integrators each step lies between two exact half steps, in which impedance and masses interact
-while positions rest (Strang splitting). The splitting is of second order in the step and never active.
+while positions rest (Strang splitting). The splitting is of second order in the step and generates no energy.
 
 All engines read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
 timing (controller.delay) every tick has its own length, and late forces latch within the tick. The forces that the
@@ -81,7 +81,7 @@ class _Exact:
     run_block: RunBlock | None = None
 
     def back(self, k: int) -> None:
-        """The exact engines have no state of their own."""
+        """Do nothing, since the exact engines have no state of their own."""
 
     def troubled(self) -> bool:
         return False
@@ -117,7 +117,7 @@ class ExactEngine(_Exact):
 
 
 class OneByOne:
-    """One engine for all simulations of a buffer, made of an engine for each."""
+    """An engine that moves each simulation of a buffer by an engine of its own."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
         self._engines = engines
@@ -189,13 +189,13 @@ def least_substeps(integrator: str) -> int:
 
 
 def default_integrator(scene: Scene) -> str:
-    """Return "exponential" for a smooth scene, and "RK4" for friction, which is nearer there at equal cost."""
+    """Return "exponential" for a smooth scene, and "RK4" for one with friction, where RK4 errs less at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
     return "RK4" if rubs else EXPONENTIAL
 
 
 def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
-    """Return (seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
+    """Split a tick at its latch times: a list of (seconds, channels whose previous force still acts, (m,) or (0,))."""
     taus = np.array(late or ())
     ends = np.unique(np.concatenate([[0.0], taus, [T]]))
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
@@ -284,7 +284,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """Move from latch to latch; the next row also holds the acting forces after the state."""
+        """Return a function that moves a tick from latch to latch, and writes the held forces after the next state."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -340,7 +340,7 @@ class MujocoEngine:
         self._warnings = self.data.warning.number
         self.run_block: RunBlock | None = None
         stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
-        # MuJoCo solves friction from the solution before, which `back` cannot restore.
+        # MuJoCo solves friction with a warm start, which `back` cannot restore.
         self._smooth = default_integrator(scene) == EXPONENTIAL
         self._one_step = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
@@ -348,7 +348,7 @@ class MujocoEngine:
             T,
             substeps,
             ctrl=self.data.ctrl,
-            # one view of q and v, wherever MuJoCo has put them, so that one copy reads both
+            # The view spans q and v wherever MuJoCo has stored them, so that one copy reads both.
             state=as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
             size=len(scene.plant.A),
             qacc=self.data.qacc,
@@ -413,7 +413,7 @@ class MujocoEngine:
         return run_block
 
     def back(self, k: int) -> None:
-        """Put the plant into the state of row k, and forget the warnings since then."""
+        """Put the plant into the state of row k, and clear MuJoCo's warnings."""
         self._access.put(self._buffer, k)
         self._warnings[:] = 0
 
@@ -480,7 +480,7 @@ class MujocoBatchEngine:
         return bool(np.any(self.batch.warning))
 
 
-@lru_cache(64)  # runs of the same plant follow each other
+@lru_cache(64)  # Successive runs often have the same plant.
 def _step_of(plant: Plant, n: int, h: float) -> Array:
     """Return the step from [s; a] to s after h seconds, for one plant with n joints."""
     stacked = _stacked(plant)
