@@ -1,9 +1,10 @@
 """Drive several boards, each with a clock of its own, as one device (docs/hardware.md, "Two boards, two clocks").
 
-A step of the host takes one sample of every board and computes one force for each. Steps have the tick numbers of the
-board that leads. For each of the others a step stands for its next sample, or for the same sample again where its clock
-falls behind by a period. A tick of length zero takes no energy, whatever its force, so every board sees forces that are
-a whole number of steps old and ticks that are no longer than its own period: what a certificate for T_max covers.
+In a step, the host takes one sample of every board and computes one force for each. Steps are numbered by the ticks of
+the leading board. Each other board contributes its next sample, or repeats its last sample where its clock has fallen
+behind by a period. A repeated sample is a tick of length zero, in which no force exchanges energy. So every board sees
+forces that are a whole number of steps old, and ticks that are no longer than its own period. A certificate for T_max
+covers both.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from haptic_loop.hw.control import CLOCK_TOLERANCE
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.monitor import CommandMonitor
 
-_CLEARLY_FASTER = 1e-4  # part of a period that two clocks differ beyond the jitter of a measurement of a second
-_EARLY = 1 / 16  # part of a period by which a sample precedes the leading board's, so that jitter makes no step wait
-_TOO_EARLY = 1.5  # periods from which on its force may come too late
-_SMOOTHED = 31  # steps whose median is taken: a host that freezes for a few ticks does not count
-_KEPT = 8  # samples of a board that may still be needed
+_CLEARLY_FASTER = 1e-4  # relative difference of two clocks that a measurement over _COMPARED ticks tells from jitter
+_EARLY = 1 / 16  # [periods] least lead of a sample over the leading board's, so that no step waits because of jitter
+_TOO_EARLY = 1.5  # [periods] largest lead of a sample; with a longer one, the board's force may come too late
+_SMOOTHED = 31  # leads in a median, which a host that freezes for a few ticks does not change
+_KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
-_LONGEST = 5e-4  # [s] of one call
+_LONGEST = 5e-4  # [s] longest wait of one call
 _EXCHANGE = "exchange the ports, or the delays (--theta)"
 _FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SILENT, wire.Phase.DISARMED)
 
@@ -33,8 +34,8 @@ _FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SIL
 def ticks_behind(theta: Sequence[int], axes: Sequence[int]) -> tuple[int, ...]:
     """Return the ticks (m,) by which forces of each channel act later than the link's delay.
 
-    It is 0 for the board that leads, the first of those with the least delay, and 1 for the others. `theta` (m,) are
-    the delays of the channels [samples], `axes` the channels of each board.
+    The first board with the least delay leads. Its channels have 0, those of the other boards 1. `theta` (m,) are the
+    delays of the channels [samples], `axes` the numbers of channels of the boards.
     """
     owner = [i for i, n in enumerate(axes) for _ in range(n)]
     lead = min(range(len(axes)), key=lambda i: min(n for n, own in zip(theta, owner, strict=True) if own == i))
@@ -50,20 +51,20 @@ class _Board:
         self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
         self.last: wire.State | None = None  # None before it was configured
-        self.misses = 0  # the count in the sample of the last step
+        self.misses = 0  # State.misses in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
-        self._steps = self._shifted = 0  # steps since it was first paired; their number at the last shift
+        self._steps = self._shifted = 0  # steps since the board was first paired; their number at the last shift
 
     def configure(self, config: wire.Config) -> None:
         """Reset the board and send its part of a configuration."""
         theta = min(wire.MAX_THETA, config.theta + self.behind)
         self.config = config._replace(theta=theta, cap=config.cap[self.axes], slew=config.slew[self.axes])
         self.told = CommandMonitor(self.config)
-        self.answer: int | None = None  # of its ACK to the configuration
+        self.answer: int | None = None  # result in the board's ACK to the configuration
         self.last = None
         self.states: dict[int, tuple[wire.State, int]] = {}  # by tick: a sample and its time of arrival [us]
-        self.waited: dict[int, int] = {}  # [us] by source: from a sample to its answer
-        self.offset: int | None = None  # its tick number less the step's
+        self.waited: dict[int, int] = {}  # [us] by source: time from the arrival of a sample to its answer
+        self.offset: int | None = None  # the board's tick number minus the step's
         self._shift_at: int | None = None  # step from which on the offset is smaller by one
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
 
@@ -88,7 +89,7 @@ class _Board:
 
     def sample(self, step: int, at: int) -> wire.State | None:
         """Return the sample of a step that began at `at` [us], if it has come."""
-        if self.offset is None:  # the newest that is early enough
+        if self.offset is None:  # pair the step with the newest sample that is early enough
             early = [tick for tick, (_, came) in self.states.items() if at - came >= _EARLY * self.period]
             if self.behind and not early:
                 return None
@@ -100,7 +101,7 @@ class _Board:
     def follow(self, step: int, at: int, driving: bool) -> None:
         """Shift the pairing of steps so that samples precede the leading board's by less than a period.
 
-        Raises SafetyStop where that would take a period that is too long, or a clock that is not the slower one.
+        Raises SafetyStop where this clock is faster than the leading one, or slower by more than CLOCK_TOLERANCE.
         """
         assert self.offset is not None
         if self._shift_at is not None and wire.distance(step, self._shift_at) >= 0:
@@ -155,7 +156,7 @@ class _Board:
 
 
 def _forget(entries: dict[int, Any], count: int) -> None:
-    """Drop the oldest entries, and keep `kept`."""
+    """Drop the oldest entries, and keep the newest `count`."""
     while len(entries) > count:
         entries.pop(next(iter(entries)))
 
@@ -171,9 +172,9 @@ class Boards:
         clock: Callable[[], int],
         wait: Callable[[float], object],
     ) -> None:
-        """Take the boards with their numbers of axes, `behind` (m,) of `ticks_behind`, and `clock` [us].
+        """Take the boards, their numbers of axes, `behind` (m,) as `ticks_behind` returns it, and the `clock` [us].
 
-        `wait` returns when a board has sent something, at the latest after so many seconds.
+        `wait(seconds)` returns when a board has sent something, and after `seconds` at the latest.
         """
         ends = [sum(axes[: i + 1]) for i in range(len(axes))]
         self._boards = [
@@ -183,8 +184,8 @@ class Boards:
         self._lead = next(board for board in self._boards if not board.behind)
         self._clock, self._wait = clock, wait
         self._infos: list[wire.Info | None] = [None] * len(devices)
-        self._asked: wire.Config | None = None  # the configuration that no ACK has answered yet
-        self._step: int | None = None  # the last one
+        self._asked: wire.Config | None = None  # configuration that some board has not acknowledged yet
+        self._step: int | None = None  # number of the last step
         self._configured, self._driving, self._misses = False, False, 0
 
     @property
@@ -223,7 +224,7 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send every board its part of a configuration, with its delay beyond the leading board's."""
+        """Send every board its part of a configuration, whose theta includes the board's extra delay."""
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:
@@ -234,7 +235,7 @@ class Boards:
                     if board.answer is None:
                         board.answer = board.device.configure(board.config)
                     else:
-                        board.device.exchange(None)  # it already sends STATEs, which nobody needs later
+                        board.device.exchange(None)  # discard the STATEs that a configured board already sends
         answers = [board.answer for board in self._boards if board.answer is not None]
         if len(answers) < len(self._boards):
             self._wait(_LONGEST)
@@ -286,7 +287,7 @@ class Boards:
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
         """Return one STATE: the worst phase and margin, the sums of the counters, and the axes of all boards in order.
 
-        The phase is that of the last STATE of a board: a fault shows at once, whatever sample is used.
+        The phases come from the last STATE of every board, not from the samples of the step, so a fault shows at once.
         """
         last = [board.last for board in self._boards if board.last]
         worst = min(last, key=lambda state: _FAULTS.index(state.phase) if state.phase in _FAULTS else len(_FAULTS))
@@ -308,7 +309,7 @@ class Boards:
         )
 
     def _margin(self, samples: Sequence[wire.State]) -> int:
-        """Return the least margin of an answer; before forces act, as if it had not waited for another board."""
+        """Return the least margin of the boards' answers; before forces act, without their waits for other boards."""
         margins = []
         for board, state in zip(self._boards, samples, strict=True):
             if state.margin_us == wire.NO_MARGIN:
@@ -318,7 +319,7 @@ class Boards:
 
     @contextmanager
     def _together(self) -> Iterator[None]:
-        """Tell all boards to stop where one of them is gone."""
+        """Send STOP to all boards if the port of one of them is lost."""
         try:
             yield
         except PortLost:
@@ -328,7 +329,7 @@ class Boards:
 
 @contextmanager
 def _named(board: int) -> Iterator[None]:
-    """Say which board a fault is about."""
+    """Put the number of the board in front of a fault's message."""
     try:
         yield
     except wire.SafetyStop as fault:

@@ -36,11 +36,11 @@ from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, scene_of
 
-#: part of a period by which boards' clocks may differ, and T_max of their certificate is longer: a ceramic resonator's
+#: relative difference of boards' clocks that a certificate covers by a longer T_max: that of ceramic resonators
 CLOCK_TOLERANCE = 5e-3
-_SPEED_SECONDS = 0.01  # window of a speed estimate: one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # ticks in a row of changes of speed that no hand makes: 0.6 mm/tick each are 5 m/s at T = 1.2 ms
-_FALLBACK = ("spring-damper", "any-environment")  # a reserve coupling, where the requested one is not certified
+_SPEED_SECONDS = 0.01  # window of a speed estimate, in which one count of the coarsest encoder is 0.03 m/s
+_SHAKING = 10  # most ticks in a row whose speed changes by over 0.6 mm/tick: one way, ten make 5 m/s at T = 1.2 ms
+_FALLBACK = ("spring-damper", "any-environment")  # a reserve, where the requested kind is not certified
 
 
 class Controller(Protocol):
@@ -81,10 +81,10 @@ def host_controller(
 ) -> Controller:
     """Return the loop as the host runs it, at rest and without the delay of `link` ticks that the link adds.
 
-    Of several boards it adds link + `behind` (m,) ticks.
+    With several boards, the link adds `link` + `behind` (m,) ticks.
 
-    With `lag`, which is rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces, those of the channels of each
-    of `balls` as a vector. Raises ValueError where the link is slower than a delay of the loop.
+    With `lag`, the limiter's rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces. The channels of each slice
+    in `balls` are limited as one vector. Raises ValueError where the link is slower than a delay of the loop.
     """
     waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
     return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
@@ -116,8 +116,8 @@ class BudgetPlan:
     def of(cls, start: float, cap: float, delta: Sequence[float], units: Units, config: Config, T: float) -> BudgetPlan:
         """Return the plan for a device of this configuration.
 
-        The device holds a force for `hold` missed ticks, then ramps it to zero. Its slew rate lets an older force
-        last for ceil(cap / slew) further ticks that are not missed; after them the force is within those sent since.
+        The device holds a force for `hold` missed ticks, then ramps it to zero. Its slew rate lets an older force act
+        for ceil(cap / slew) further ticks that are not missed. After them, the force lies between forces sent since.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -126,7 +126,7 @@ class BudgetPlan:
 
 
 class SentBudget:
-    """The energy budget that limits shaped forces before they are sent. It rounds towards zero to whole steps."""
+    """The energy budget that limits shaped forces before they are sent. Limited forces are cut to whole steps."""
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
@@ -167,11 +167,13 @@ class SentBudget:
 class WorldController:
     """A MuJoCo scene behind a coupling, with an energy shell that accounts for the forces that are sent.
 
-    Each tick calls `step`, then `limit` with the forces after gain, caps and rounding to whole steps: the shell treats
-    these as a part of the environment. For a tick without an answer the shell books the force that the device holds.
+    Each tick calls `step`, then `limit` with the forces after gain, caps and rounding to whole steps. The shell treats
+    gain, caps and rounding as a part of the environment. For a tick without an answer, the shell books the force that
+    the device holds.
 
-    A force that tests a motor does not pass the coupling, so its energy is measured at the device, by an energy budget.
-    That budget starts with the energy of the shell, which is charged afterwards: both together give at most W0.
+    A force that tests a motor does not pass the coupling, so an energy budget measures its energy at the device. That
+    budget starts with the energy of the shell, and its spent energy is charged to the shell afterwards. So shell and
+    budget together give at most W0.
     """
 
     def __init__(
@@ -204,7 +206,7 @@ class WorldController:
         return wanted.tolist()
 
     def limit(self, steps: Sequence[int], unit: Sequence[float]) -> tuple[int, ...]:
-        """Return the whole steps that the shell allows of `steps`; one step is -`unit` (m,) [N]."""
+        """Reduce `steps` to whole steps that the shell allows; one step is -`unit` (m,) [N]."""
         each = -np.array(unit)[:, None]
         wanted = np.array(steps)[:, None] * each
         self._sent, _ = self.shell.limit(wanted, lambda f: np.where(f == wanted, f, np.trunc(f / each) * each))
@@ -215,7 +217,10 @@ class WorldController:
     def limit_test(
         self, plan: BudgetPlan, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int
     ) -> tuple[int, ...]:
-        """Return the steps of a test force that the energy of the shell allows; arguments as SentBudget.limit."""
+        """Return the steps of a test force that the energy of the shell allows.
+
+        The arguments beside `plan` are those of SentBudget.limit.
+        """
         if self._test is None:
             start, missed = float(self.shell.energy[0]), 0
             self._test = SentBudget(replace(plan, start=start, cap=max(start, self._start)))
@@ -257,7 +262,7 @@ class Arming:
     program: Armable
     config: Config  # configuration of the device
     budget: SentBudget | None = None
-    test_plan: BudgetPlan | None = None  # of the test forces in a world; None where its shell limits them too
+    test_plan: BudgetPlan | None = None  # for motor tests in a world; None where its shell limits them
 
 
 class Drive:
@@ -274,7 +279,7 @@ class Drive:
         expected: monitor.Expected,
         still: Sequence[int] | None = None,
     ) -> None:
-        """Take `still` (m,) [counts], the encoders' noise, and `expected`, the motions that the test compares."""
+        """Take `still` (m,) [counts], the encoders' noise, and `expected`, which predicts motions in its test."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
@@ -293,17 +298,17 @@ class Drive:
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
-        self._shaking = 0  # ticks in a row
+        self._shaking = 0  # ticks in a row with a jolt
         self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # boards have one each
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # each board has its own
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property
     def dead(self) -> str | None:
-        """A message about an axis that stands still although a force has acted on it for long; None without one."""
+        """A message about an axis that stands still although a force has acted on it for long, or None."""
         return self._encoders.dead
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
@@ -367,7 +372,7 @@ class Drive:
         ticks: int,
         test: tuple[float, ...] | None,
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return force (m,) [N] and steps that a world's account of energy allows; the scene rests during a test."""
+        """Return force (m,) [N] and steps that a world's energy accounts allow. During a test the scene sends none."""
         nothing, plan = (0,) * len(steps), self._test_plan
         pushes = plan is not None and test is not None and any(test)
         allowed = world.limit(nothing if pushes else steps, self.units.force_step)
@@ -416,9 +421,10 @@ def timed(
 ) -> tuple[Scenario, int]:
     """Return the scenario with the measured T_max and latency, and the ticks that the link takes.
 
-    A fraction `quantile` of the device's ticks is no longer than T_max, which is set only where it exceeds T. With
-    `at_once`, forces latch on arrival and the link takes 0 ticks; the latency then ranges from the least age to the
-    quantile of the ages, both widened by `guard_us` [us]. Raises SafetyStop where the latency reaches a period.
+    T_max becomes the length that a fraction `quantile` of the device's ticks does not exceed, where that is longer than
+    the scenario's T_max or T. With `at_once`, forces latch on arrival and the link takes 0 ticks. The latency then
+    ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both sides. Raises SafetyStop
+    where the latency reaches a period.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
@@ -525,8 +531,8 @@ def certified_coupling(
     """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: host clock).
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
-    them, with W0 = `start` [J]. With several boards, axes act `behind` (m,) ticks after the link's, and each board has
-    a clock of its own: the certificate is then for periods that are longer by CLOCK_TOLERANCE.
+    them, with W0 = `start` [J]. With several boards, forces act `behind` (m,) ticks later than `link`, and each board
+    has its own clock. The certificate is then for periods that are longer by CLOCK_TOLERANCE.
 
     Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """
@@ -590,14 +596,14 @@ def certified_couplings(
     return tuple(candidates)
 
 
-_EQUAL = 1e-6  # relative error of static stiffnesses: that at which the search of a design ends
+_EQUAL = 1e-6  # relative difference of static stiffnesses that counts as none: the tolerance of a design's search
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
     """Return whether `reserve` is softer at rest than `than` at longer delays, nowhere stiffer, and needs less damping.
 
-    Both couplings are compared in the loop with the reserve's delays. The stiffness is the coupling's K, or without
-    one the static stiffness that the devices feel.
+    Both couplings are compared in the loop with the reserve's delays. The stiffness is K, or, where
+    a coupling has no K, the static stiffness that the devices feel.
     """
     own, other = (each.assessment.gains for each in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))

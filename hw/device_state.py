@@ -2,14 +2,14 @@
 
 With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
 
-The machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py). There
-are two because a rehearsal must need no compiler, and because each is the other's test.
-docs/protocol.md has its rules. Forces are in steps, per axis, as tuples.
+This state machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
+There are two implementations because a rehearsal must not need a compiler, and because each tests the other.
+docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
 """
 
 from haptic_loop.hw import protocol as wire
 
-_SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
+_SLOTS = 16  # places for forces that wait for their tick: a power of two above MAX_THETA
 RUNNING = (wire.Phase.ARMED, wire.Phase.HOLDING, wire.Phase.RAMP)  # the motors may carry a force
 
 
@@ -17,7 +17,7 @@ class Device:
     """One microcontroller. Call tick() once per period, receive() when bytes come, estop() and fault() at any time."""
 
     def __init__(self, info: wire.Info) -> None:
-        """Raises ValueError where `info` cannot travel."""
+        """Begin silent. Raises ValueError where a field of `info` does not fit into its frame."""
         self.info = info
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
@@ -25,7 +25,7 @@ class Device:
         self.deadman = False  # whether a hand holds it; a firmware with a deadman sets it
         self.phase, self.cause = wire.Phase.SILENT, wire.Cause.NONE
         self.config: wire.Config | None = None
-        self.k, self.now = 0, 0  # this tick, and the clock at it [us]
+        self.k, self.now = 0, 0  # number of the current tick, and the clock [us] at its start
         self.zero = (0,) * info.axes
         self.asked, self.ack = False, b""  # whether to send INFO, and the ACK to send, at the next tick
         self.clear()
@@ -46,7 +46,7 @@ class Device:
         """Begin a period: return the forces that act from now on, and the bytes to send. `counts` was just sampled."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
         at_once = self.config is not None and not self.config.theta
-        slot = (self.k - at_once) % _SLOTS  # what came during the tick before has been latched, if anything came
+        slot = (self.k - at_once) % _SLOTS  # with theta = 0, a force of the tick before was latched as it came
         frame, self.slots[slot] = self.slots[slot], None
         if self.phase in (wire.Phase.DISARMED, wire.Phase.ARMED, wire.Phase.HOLDING):
             self.misses += frame is None
@@ -57,14 +57,14 @@ class Device:
         return self.applied, self._speak(counts)
 
     def take(self, frame: wire.Force | None) -> None:
-        """Apply the force for this tick, if one has come."""
+        """Apply the force for this tick while armed, or arm if the command is ARM."""
         if self.phase in (wire.Phase.ARMED, wire.Phase.HOLDING):
             self.latch(frame)
         elif self.phase == wire.Phase.DISARMED and frame is not None and frame.command == wire.Command.ARM:
             self.phase = wire.Phase.ARMED
 
     def latch(self, frame: wire.Force | None) -> None:
-        """Return the force for this tick. Without one the last force is held for `hold` ticks."""
+        """Apply the force of this tick. Without one, hold the last force for `hold` ticks, then halt."""
         assert self.config is not None
         if frame is None:
             self.phase = wire.Phase.HOLDING
@@ -136,7 +136,7 @@ class Device:
             self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
-        """Keep a force until its tick, if that is ahead, belongs to the tick answered, and has no force yet."""
+        """Store a force until its tick, if that tick is ahead, is theta after the answered one and has no force."""
         known = frame.command == wire.Command.RUN or (
             frame.command in (wire.Command.IDLE, wire.Command.ARM) and not any(frame.force)
         )
@@ -183,6 +183,6 @@ class Device:
 
 
 def _scaled(value: int, by: int, over: int) -> int:
-    """value * by / over, rounded towards zero as C does."""
+    """Return value * by / over, rounded towards zero as in C."""
     size = abs(value) * by // over
     return size if value >= 0 else -size

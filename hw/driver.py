@@ -1,4 +1,4 @@
-"""The operator (a person, or a rule in the place of one) and the driver, which together make a session's calls."""
+"""An operator, which decides when a session is armed and stopped, and a driver, which makes its calls of the device."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from haptic_loop.hw.limits import DRIVING, Stage
 from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.session import Said, Session
 
-_DEADMAN_US = 1_000_000  # after so long without a sign nobody is there
-_LET_GO_US = 5_000_000  # a person who moved a handle has let go of it by then, where the session arms by itself
+_DEADMAN_US = 1_000_000  # longest time without a sign of the user
+_LET_GO_US = 5_000_000  # time in which a person lets go of a handle before the session arms by itself
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 @dataclass
 class Operator:
-    """Play a person's part in a session: arming, the planned end, keys. It arms by itself at most once.
+    """Decide for a person when to arm and when to end a session, and act on keys. It arms by itself at most once.
 
     With a `deadman`, forces act only while the user gives a sign every second: any key, or a true answer of `deadman`.
     """
@@ -31,7 +31,7 @@ class Operator:
     _asked: bool = False  # auto_arm has been used up
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] when the user gave a sign last
-    _free_at: int = 0  # [us] before which it does not arm by itself
+    _free_at: int = 0  # [us] time from which on it may arm by itself
 
     def decide(self, session: Session, now: int) -> Said:
         """Return the messages that are due at `now` [us] in this stage."""

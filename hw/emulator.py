@@ -36,16 +36,16 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
 _BLOCK = 1000  # ticks of outside forces that are computed at once
-_SUBSTEPS = 8  # per tick where there is Coulomb friction
+_SUBSTEPS = 8  # steps of the plant per tick where there is Coulomb friction
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
-_REACH = 0.1  # [m] assumed: the workspace is +-10 cm
+_REACH = 0.1  # [m] assumed half of the workspace
 _SETTLED = 203  # ticks at full cap after which the person starts to move: the gain is at 1 by then
 _FARTHEST = 2**31 - 1  # [counts]
 
 
-#: kind -> (what VALUE is, least, most, default), for the line
+#: faults of the line: kind -> (what VALUE is, least, most, default)
 _LINE = {
     "flip": ("probability per frame that one bit is wrong", 0.0, 1.0, 0.01),
     "drop": ("probability per frame that it is lost", 0.0, 1.0, 0.1),
@@ -57,7 +57,7 @@ _LINE = {
     "jitter": ("mean of an exponential extra delay in seconds", 0.0, 10.0, 1e-4),
     "burst": ("seconds between two bursts, which bring every frame that waits", 1e-6, 1.0, 1e-3),
 }
-#: kind -> the same, for the device
+#: faults of the device: kind -> (what VALUE is, least, most, default)
 _DEVICE = {
     "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
     "unplug": ("no value", 0.0, 0.0, 0.0),
@@ -71,7 +71,7 @@ _DEVICE = {
     "cross": ("part of the force of motor 1 that motor 2 makes, too", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
-#: kind -> the same, for one axis of it
+#: faults of one axis of the device: kind -> (what VALUE is, least, most, default)
 _AXIS = {
     "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
     "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
@@ -145,7 +145,7 @@ class Line:
         self._faults = [u for u in faults if u.kind in _LINE and u.where in (direction, "both")]
         self._rng = np.random.default_rng([seed, direction == "up"])
         self._latency = latency_us
-        self._held: bytes | None = None  # a frame that lets the next one pass
+        self._held: bytes | None = None  # a frame that the next one overtakes
 
     def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
         """Return the times of arrival [us] and the bytes of a frame, with its faults."""
@@ -188,8 +188,8 @@ class Line:
 class _EmulatedPlant:
     """The devices and their passive humans between ticks, by the matrix exponential.
 
-    The person starts to move at the first tick after `begin`, and holds still while `still`, so that a session is armed
-    at rest. With `coulomb` [N] every motor has dry friction too, which is held for an eighth of a tick.
+    The person starts to move at the first tick after `begin`, and holds still while `still` is true, so that a session
+    is armed at rest. With `coulomb` [N] every motor also has dry friction, which is updated eight times a tick.
     """
 
     def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
@@ -202,7 +202,7 @@ class _EmulatedPlant:
         self._w = np.zeros(self.scene.outside)
         self._limit = np.array([device.force_limit for device in scenario.axis_devices])
         self.still = False
-        self.fastest = 0.0  # [m/s] of any motor, so far
+        self.fastest = 0.0  # [m/s] highest speed of any motor so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
 
     @property
@@ -220,7 +220,7 @@ class _EmulatedPlant:
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
         """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
 
-        What acts from outside is that of the tick, which `begins` or goes on.
+        Where a tick `begins`, its outside forces are computed; otherwise those of the last call act on.
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
@@ -245,15 +245,15 @@ class _EmulatedPlant:
 
 
 def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scenario:
-    """The scenario's devices without hands and without the tap.
+    """Return the scenario without hands and without the tap.
 
-    At each handle is a pure damper of `damping` [N s/m] or a `mass` [kg], which clamps it where it is large.
+    Each handle carries a damper of `damping` [N s/m] and a `mass` [kg]; a large one clamps the handle.
     """
     return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * scenario.channels, tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:
-    """The INFO of the emulated device: the scenario's devices, in the units of the wire."""
+    """Return the INFO of an emulated device: the scenario's devices, in the units of the wire."""
     r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
     encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
     step = _FORCE_STEP if scenario.unit == "m" else max(1, round(1e6 * max(limits) / 30000))
@@ -290,12 +290,12 @@ class Emulator:
         self.unplugged = False
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick in T
-        self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
-        self._motor: Array = np.ones(scenario.channels)  # part of a force that each makes
+        self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
+        self._motor: Array = np.ones(scenario.channels)  # part of its force that each motor makes
         self._swapped, self._crossed = False, 0.0
-        self._begun, self._rest, self._at_tick = 0, 0.0, False  # [us] of the tick; the share of it that is to come
+        self._begun, self._rest, self._at_tick = 0, 0.0, False  # start of the tick [us], its share to come, is it new
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
-        self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
+        self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: the shown count for a true one
         for fault in faults:
             if fault.kind in _AXIS and fault.axis >= scenario.channels:
                 raise ValueError(
@@ -305,7 +305,7 @@ class Emulator:
         self._ready = 0
 
     def since_armed(self, now: int) -> float | None:
-        """Seconds since the first arming."""
+        """Return the seconds since the first arming, or None before it."""
         return None if self.armed_at is None else 1e-6 * (now - self.armed_at)
 
     def receive(self, data: bytes, now: int) -> None:
@@ -329,7 +329,7 @@ class Emulator:
 
     def tick(self, now: int) -> bytes:
         """Begin a period: sample, latch, answer. `now` is the device's clock [us]; advance() must follow every tick."""
-        if self._rest:  # what is left of the tick before
+        if self._rest:  # finish the tick before
             self.plant.advance(-self.applied, self._rest, self._at_tick)
             self._rest = 0.0
         self._misbehave(now)
@@ -431,7 +431,7 @@ class Emulator:
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:
-    """The same device with a motor that drives `force` [steps] while armed, whatever FORCE says."""
+    """Make one motor of `device` apply `force` [steps] while armed, whatever FORCE says, and return the device."""
     obeys = device.latch
 
     def latch(frame: Force | None) -> None:

@@ -1,8 +1,8 @@
 """Drive devices of Force Dimension by their maker's library and its Python package. They have no clock.
 
 The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
-after the sample (theta = 0). The certificate is for what the host keeps, measured at zero force: periods up to T_max,
-and latencies within [t1, t2].
+after the sample (theta = 0). The certificate is for the periods up to T_max and the latencies within [t1, t2] that the
+host kept in a measurement at zero force.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from haptic_loop.hw.emulator import info_of
 from haptic_loop.hw.haptic_device import PortLost
 from haptic_loop.sim.scenario import InputError, Scenario
 
-FORCE_DIMENSION = "force-dimension"  # in place of a port
+FORCE_DIMENSION = "force-dimension"  # value of --port for these devices
 _PACKAGE = "forcedimension_core"
 _SATURATED = 2  # setForce returns this code when the motors cannot give the force
 _WATCHDOG = 160  # times 125 us: the device drops a force after 20 ms without a new one, if it has a watchdog
-_SPIN = 2e-4  # [s] the end of a wait is spent awake, because a sleep ends late
+_SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
 _SHORTEST = 0.75  # a period that follows a late one lasts at least this share of T
 
 
@@ -41,7 +41,7 @@ class _Library:
 
 
 def library() -> Any:
-    """Load the package, which needs the maker's library. Raises InputError without them."""
+    """Load the package, which needs the maker's library. Raises InputError if either is missing."""
     try:
         return _Library()
     except ImportError as error:
@@ -52,10 +52,11 @@ def library() -> Any:
 class ForceDimension:
     """Axes of one or several Force Dimension devices, clocked by this host.
 
-    The state machine is the firmware's (hw/device_state.py): armed by ARM, capped, slewed, ramped out.
+    The state machine is the firmware's (hw/device_state.py): it arms on ARM, limits forces and their slew rate, and
+    ramps out.
     """
 
-    errors = 0  # frames that cannot be read: there are no frames
+    errors = 0  # number of unreadable frames: there are no frames
 
     def __init__(
         self,
@@ -65,12 +66,12 @@ class ForceDimension:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Open the devices that `axes` names, such as "0x,1x" (default: the scenario's axes of the first ones).
+        """Open the devices that `axes` names, such as "0x,1x" (default: the scenario's axes, on the first devices).
 
         Raises InputError.
         """
         self._where = _axes(axes, scenario)
-        #: channels whose cap is that of the vector of a channel before
+        #: channels of a vector that share the cap of its first channel
         self._shared = {i for ball in scenario.limiter_limits[1] for i in range(ball.start + 1, ball.stop)}
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
@@ -85,7 +86,7 @@ class ForceDimension:
         first = next(iter(self._ids.values()))
         name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
         self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
-        self._sdk.enableExpertMode()  # which the watchdog needs
+        self._sdk.enableExpertMode()  # the watchdog needs expert mode
         self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
         self._device, self._decoder = Device(self._info), wire.Decoder()
         self._T = 1e-9 * self._info.period_ns
@@ -123,7 +124,7 @@ class ForceDimension:
         if force is not None:
             self._device.receive(wire.encode(force), came := self._now())
             self._write(self._device.applied)
-            if self._device.margin != wire.NO_MARGIN:  # of a force that acts: writing it takes time
+            if self._device.margin != wire.NO_MARGIN:  # a force acts only after it was written
                 self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
         while (left := self._due - self._clock()) > 0:
             self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)

@@ -1,24 +1,26 @@
-"""Damping of an axis by a balance of forces, and a bound on it that holds on rigs that are not ideal.
+"""Estimate the damping of an axis from a balance of forces, and bound it so that the bound holds on real rigs.
 
-The balance, with h a Gaussian window that both sides are filtered by (modulating functions, Shinbrot 1957):
+Both sides of the balance are filtered by a Gaussian window h (modulating functions, Shinbrot 1957):
 
     m x'' + b x' + p x''' + r x'''' + k x + f0 + f1 t + (1 + a D^2)(g + q x'|x'|) + periodic(x) = (1 + l D + a D^2) f
 
-with D = d/dt. The fit estimates m and b. k x is a cable, a spring or gravity that changes with position,
-f0 + f1 t a constant force and its drift. A handle (m2) behind a transmission (k12, d12) is a = m2/k12, l = d12/k12,
-p = a b + l m, r = a m1: polynomials, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier
-is l - tau and a + tau^2/2, so that it is not taken for negative damping. Derivatives are of h, never of the encoder; a
-force held for a tick is integrated exactly. All but a beside g is linear, so a fit takes milliseconds, and no state at
-the beginning is needed. Dry friction g(x') is c tanh(v/v0), and a part of it that is gone at speed (Stribeck), or a
-bristle that bends over some distance (Dahl). Which, is not known: all of _SLIPS and _BRISTLES are tried, and every one
-that fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, b is guaranteed.
-Periodic are forces that repeat with position (a motor's poles) and errors of the encoder that do (its eccentricity);
-their periods are looked for in what is left.
+with D = d/dt. The fit estimates m and b. The term k x stands for a cable, a spring or gravity that changes with
+position, f0 + f1 t for a constant force and its drift. A handle (m2) behind a transmission (k12, d12) gives a = m2/k12,
+l = d12/k12, p = a b + l m, r = a m1. All of these are polynomials, since both sides were multiplied by a s^2 + l s + 1.
+A lag tau of the amplifier changes l to l - tau and a to a + tau^2/2, so the fit does not take it for negative damping.
+The fit differentiates h, never the encoder, and integrates a force held for a tick exactly. The balance is linear in
+all parameters but the a beside g, so a fit takes milliseconds, and it needs no initial state.
 
-The bound is b less the scatter when tenths of the record are left out in turn, less a part of what noise as strong as
-the residual could make of b if all of it looked like damping; the least of all laws that fit.
+Dry friction g(x') is c tanh(v/v0), with a part that vanishes at speed (Stribeck), or a bristle that bends over some
+distance (Dahl). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits almost as well as
+the best counts in the bound, with a drag q >= 0. Of b and q, only b is guaranteed. The periodic term holds forces that
+repeat with position (a motor's poles) and encoder errors that do (its eccentricity). Their periods are searched in the
+residual.
 
-What friction dissipates per speed squared is least at high speed, where b alone is left: b is the guarantee.
+For one law, the bound is b minus two parts: its scatter when tenths of the record are left out in turn, and a share of
+the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit.
+
+The power that friction dissipates, per speed squared, is least at high speed, where only b is left. So b is guaranteed.
 """
 
 from __future__ import annotations
@@ -33,30 +35,30 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 
 _WINDOW = 0.012  # [s] least standard deviation of h, which halves the amplitude at 16 Hz
-_ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave: a coarse one has a longer window
-_SPEED_NOISE = 3e-4  # [m/s] allowed in the speed that decides friction; sets the shortest window for this encoder
-_SPACING = 0.4  # standard deviations of the window between two rows; the filtered signals have no finer detail
+_ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave; a coarse encoder gets a longer window
+_SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that decides friction; sets the shortest window
+_SPACING = 0.4  # distance of two rows in standard deviations of the window: filtered signals have no finer detail
 _NEARBY = 3.5  # standard deviations between a row and the nearest tick at which the balance does not hold
 _REACH = 6  # standard deviations at which a window is cut off
-_STILL = 0.02  # [s] within one count of which an encoder stands still
+_STILL = 0.02  # [s] an encoder that stays within one count for so long stands still
 #: [m/s] speed at which dry friction is at 3/4
 _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
 _BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction reverses by position (Dahl 1968)
 _STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
-_SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
-_SLIP = 0.002  # [m/s] of dry friction where its law is of another kind
+_SLOW, _WEAK = 0.2, 0.05  # share of a force that the window must pass; share of the strongest that need not pass
+_SLIP = 0.002  # [m/s] slip of dry friction where the best law is a bristle
 _BLOCKS = 10  # parts of the record that are left out in turn
 _HIDDEN = 0.03  # part of the damping that the residual could hide, subtracted from the bound
-#: error of the encoder's scale, which no recording shows: 20 um of eccentricity over part of a turn of 40 mm give 3e-3
+#: error of the encoder's scale, which no recording shows; 20 um of eccentricity over part of a turn of 40 mm give 3e-3
 SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows below which a record is too short
-_ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
+_ALMOST = 4.0  # largest log likelihood ratio of the best law to one that counts in the bound
 _ROUNDS = 3  # iterations that settle the transmission's part of friction
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
-_NEAR = np.geomspace(0.92, 1.09, 24)  # times the best one of these, once more
+_NEAR = np.geomspace(0.92, 1.09, 24)  # factors of the best of these periods, searched next
 _PERIODIC = 4  # most periodic disturbances in a fit
-_CHANCE = 2.0  # least gain of log likelihood beyond that of the best pair among noise
+_CHANCE = 2.0  # least gain of log likelihood beyond the gain of the best pair in pure noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
 
@@ -73,8 +75,8 @@ class Friction:
     drift: float  # [N/s] of the constant force
     static: float  # [N] Stribeck part of dry friction, which is gone at speed
     drag: float  # [N s2/m2]
-    slip: float  # [m/s] of dry friction's law that fits best; 0 where it reverses by position
-    reach: float  # [m] over which it does; 0 where it reverses by speed
+    slip: float  # [m/s] in the best law of dry friction; 0 where friction reverses by position
+    reach: float  # [m] over which dry friction reverses by position; 0 where it reverses by speed
     periods: tuple[float, ...]  # [m] of periodic disturbances that were found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b
@@ -128,7 +130,7 @@ def _bristle(x: Array, reach: float) -> Array:
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
-    """Return where the force is mostly slower than the window. Elsewhere unseen motion changes the friction."""
+    """Return where the window passes most of the force. Elsewhere, hidden motion changes the friction."""
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
@@ -143,13 +145,13 @@ class _Balance:
         self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T, noise**0.2), force
         self.x = x - x[0]
         self._reach = round(_REACH * self.sigma / T)
-        # g does not model the friction of a body that rests or dithers
+        # leave out rest and dither, whose friction g does not model
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
         spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
-        self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples behind so long a window
+        self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples that stay independent
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
         self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
@@ -214,7 +216,7 @@ class _Fit:
 
     @property
     def price(self) -> float:
-        """Akaike's penalty for friction that is not viscous, by which the simplest of equally good laws is chosen."""
+        """Akaike's penalty for friction that is not viscous. It selects the simplest of equally good laws."""
         return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
 
 
@@ -254,8 +256,8 @@ def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[flo
 def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
     """Return the periodic disturbances that explain the residual of the fit, strongest first.
 
-    Among noise the best of n pairs explains about 2 log n of `independent` parts. A pair counts if it explains _CHANCE
-    more.
+    In pure noise, the best of n pairs explains a share of 2 log(n) / `independent`. A pair counts if its gain of log
+    likelihood is larger by _CHANCE.
     """
     pairs: list[_Pair] = []
     grid = balance.waves(_PERIODS[np.ptp(balance.x) > _PERIODS])
@@ -263,7 +265,7 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
     while grid and len(pairs) < _PERIODIC:
         columns = np.hstack([fit.columns, *(pair.columns for pair in pairs)])
         _, near = _strongest(grid, columns, fit.residual)
-        # between two of the grid a long record loses count of the periods
+        # the grid is too coarse for a long record: search near its best period
         gain, pair = _strongest(balance.waves(near.period * _NEAR), columns, fit.residual)
         if gain < needed:
             break
@@ -309,7 +311,7 @@ def _speed_window(step: float, T: float) -> float:
     return max(T, (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3))
 
 
-#: power of the radius by which figures at the hand, in metres, become those of a rotary axis, in radians
+#: figures at the hand [m], times this power of the radius, are those of the rotary axis [rad]
 _SQUARED = "mass viscous stiffness delta thinning thinning_error lasting motor_mass handle_mass motor_mass_min"
 _SQUARED += " transmission_stiffness transmission_stiffness_max"
 _SQUARED += " transmission_damping transmission_damping_min transmission_damping_max"

@@ -1,8 +1,8 @@
 """The four calls that a session needs of a device. `Driver` in hw/driver.py makes them.
 
-A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
-(hw/force_dimension.py). No call waits for longer than a tick, because keys, signals and time-outs
-are handled between two calls.
+There are two implementations: a device at a serial port (docs/protocol.md), and a device that the host clocks
+(hw/force_dimension.py). No call waits for longer than a tick, because keys, signals and time-outs are handled between
+two calls.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Protocol
 
 from haptic_loop.hw import protocol as wire
 
-_RESEND = 0.1  # [s] after which a question is asked again
+_RESEND = 0.1  # [s] after which an unanswered question is sent again
 _STOPPING = 0.05  # [s] in which a device that was told to stop must rest
-_LONGEST_WAIT = 5e-4  # [s] of one call
+_LONGEST_WAIT = 5e-4  # [s] longest wait of one call
 
 
 class PortLost(OSError):
@@ -51,7 +51,7 @@ class BytePort(Protocol):
     """A port for bytes. Every method raises PortLost where the port is gone."""
 
     def wait(self, seconds: float) -> bool:
-        """Wait for bytes at most so many seconds, and return whether there are any."""
+        """Wait for bytes for at most `seconds`, and return whether there are any."""
         ...
 
     def read(self) -> bytes: ...
@@ -65,7 +65,7 @@ class BytePort(Protocol):
 
 
 class SerialDevice:
-    """A device at a serial port, which has the clock."""
+    """A device at a serial port. The device has the clock, not the host."""
 
     def __init__(
         self, port: BytePort, clock: Callable[[], float] = time.monotonic, patience: float = _LONGEST_WAIT
@@ -100,7 +100,7 @@ class SerialDevice:
     def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
             self.send(force)
-        message = self._next()  # one a call: a flood of other frames must not keep anybody from looking at the time
+        message = self._next()  # one message per call, so that a flood of other frames delays no time-out
         return message if isinstance(message, wire.State) else None
 
     def send(self, force: wire.Force) -> None:
@@ -113,13 +113,13 @@ class SerialDevice:
     def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
         """Repeat a question and return its answer. A device that drives meanwhile gets STOP."""
         now = self._clock()
-        if question != self._question:  # what came before is of no use
+        if question != self._question:  # no answer to this question can have come before it
             self._port.discard()
             self._waiting.clear()
             self._question, self._begun, self._asked = question, now, now - _RESEND
         if now - self._asked >= _RESEND:
             self._asked = now
-            self._write(b"\0" + wire.encode(question))  # the zero ends whatever was left in the line
+            self._write(b"\0" + wire.encode(question))  # the zero ends an incomplete frame in the line
         message = self._next()
         if isinstance(message, wire.State) and message.drives:
             self.stop(wire.Reason.FAULT)

@@ -1,14 +1,14 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
 
 The excitation is a chirp of a small force, slow motion at half of it, a swing that reaches the speed of a session, a
-chirp of the swing's force, then silence: a force that does not depend on the motion closes no loop, so no certificate
-is needed. Mass and friction come from the balance of forces (hw/friction.py), which must be one of viscous friction
-(hw/viscosity.py); the transmission comes from the spectra of what force is left and of the motion, by least squares.
+chirp of the swing's force, then silence. It does not depend on the motion, so it closes no loop and needs no
+certificate. Mass and friction come from the balance of forces (hw/friction.py); friction must be viscous
+(hw/viscosity.py). The transmission is fitted to the spectra of the motion and of the force less dry friction.
 """
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("identify")
@@ -27,37 +27,37 @@ from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, starts, viscosity
 from haptic_loop.sim.scenario import Scenario
 
-_SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
-_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; it takes so many times `seconds`
+_SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
+_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length in `seconds`
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest
-_CYCLES = 3  # of each of them
-_LEAD = 0.3  # [s] of zero force, in which the gain comes up
-_BAND_HZ = (20.0, 300.0)  # where the motion tells of a transmission
-_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # log m1, log m2, log k, log d, b, lag and delay
-_STEPS = 40  # of a fit
-_VAGUE = 0.3  # part of the motion that may stay unexplained: beyond, it is not this transmission
-_SPRUNG = 5.0  # [N/m] from which on it may be a hand: a cable has less
+_CYCLES = 3  # cycles of the swing at each amplitude
+_LEAD = 0.3  # [s] of zero force, while the gain rises
+_BAND_HZ = (20.0, 300.0)  # band in which the motion shows a transmission
+_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # least log m1, log m2, log k, log d, b, lag and delay
+_STEPS = 40  # most evaluations of a fit
+_VAGUE = 0.3  # largest unexplained part of the motion; with more, the fitted transmission is rejected
+_SPRUNG = 5.0  # [N/m] largest stiffness of a free axis with its cable; a hand has more
 _SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 
 
-# A force that does not depend on the motion: a chirp, then silence. What a device is identified with.
+# the excitation, a force that does not depend on the motion
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Forces fed back over time, as a program for a session. Open loop: it can make no passive person unstable."""
+    """A program for a session that plays forces fed back. In open loop it can make no passive person unstable."""
 
     signal: Array  # (ticks, m) [N]
     T: float  # [s]
     link: int  # [ticks]
-    margin_us: float = 0.0  # forces are late after their latch, not before
+    margin_us: float = 0.0  # a force is late only after its latch
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signal", frozen(self.signal, 2))
 
     @property
     def certified(self) -> bool:
-        """A force that the motion does not change closes no loop."""
+        """True, because a force that the motion does not change closes no loop."""
         return True
 
     @property
@@ -92,9 +92,9 @@ class Swing:
 
     @classmethod
     def of(cls, scenario: Scenario, speed: float, travel: float) -> Swing:
-        """A swing that reaches `speed` [m/s] within +-`travel` [m] where the scenario's masses and dampings are right.
+        """Return a swing that reaches `speed` [m/s] within +-`travel` [m] for the scenario's mass and damping.
 
-        No force is above the device's limit: such an axis stays slower.
+        Its forces stay within the device's limits; an axis that would need more stays slower.
         """
         w = speed / travel
         need = [
@@ -104,7 +104,7 @@ class Swing:
         return cls(tuple(need), w / (2 * np.pi))
 
     def signal(self, T: float) -> Array:
-        """Forces (ticks, m) [N]: whole cycles of a cosine at each of _LEVELS."""
+        """Return forces (ticks, m) [N]: whole cycles of a cosine at each of _LEVELS."""
         t = np.arange(round(_CYCLES / self.hz / T)) / round(_CYCLES / self.hz / T)
         wave = np.concatenate([level * np.cos(2 * np.pi * _CYCLES * t) for level in _LEVELS])
         return wave[:, None] * np.array(self.force)
@@ -119,13 +119,13 @@ def chirp(
     seconds: float,
     swing: Swing | None = None,
 ) -> Excitation:
-    """The force [N] that is played to a device: cosines of exponentially rising frequency, a swing, then silence.
+    """Return the force to play to a device: cosines of exponentially rising frequency, a swing, then silence.
 
     The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each
-    takes `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not
-    viscous, and the swing between them shows it at the speed of a session. A long cosine of the swing's force follows,
-    which shows how damping changes with frequency. Each part ends at a whole cycle, so that a free mass does not drift
-    away; the last one ends a quarter of a cycle later, so that the device is released with a speed.
+    takes `seconds`, and the silence takes half of that. Two slow motions at two levels of force show friction that is
+    not viscous, and the swing between them shows it at the speed of a session. A long cosine at the swing's force
+    follows the swing and shows how damping changes with frequency. Each part ends at a whole cycle, so that a free mass
+    does not drift away. The last one ends a quarter of a cycle later, so that the device is released while it moves.
     """
 
     def sweep(low: float, high: float, further: float = 0.0, times: int = 1) -> Array:
@@ -174,7 +174,7 @@ class Estimate:
 
 
 def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: float = 1.0) -> Estimate:
-    """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], period [s], encoder step [m].
+    """Fit one axis to displacements x (N,) [m] under motor forces (N,) [N] of period T [s], with encoder `step` [m].
 
     Radians and N m of an axis that a hand holds at the radius `lever` [m] are fitted as metres and N at the hand.
 
@@ -186,7 +186,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
     hand = lever * x, force / lever, T
     found = friction(*hand, lever * step)
     law, allowed = at_radius(found, lever), _SPRUNG * lever**2
-    # one that is too uncertain to exclude a hand is refused as well
+    # also refuse a stiffness that is too uncertain to exclude a hand
     if (most := law.stiffness + 2 * law.errors["stiffness"]) > allowed:
         raise ValueError(
             f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, at most {allowed:.3g} may be): a hand "
@@ -207,7 +207,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
     """Return the transmission that explains the spectrum of a record, or None.
 
-    The encoder is the motor's, where dry friction acts: the force less that friction drives a linear plant.
+    The encoder is at the motor, where dry friction acts. So the force less dry friction drives a linear plant.
     """
     import scipy
 
@@ -231,8 +231,8 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
     """Return warnings for axes with far more damping than INFO and the scenario declare.
 
-    The estimate of a correct device scatters about the declared value, and one bound in twenty lies above it, which
-    alone gives no warning.
+    Estimates of a correct device scatter about the declared value, and one bound in twenty lies above it. This scatter
+    gives no warning.
     """
     causes = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
@@ -247,9 +247,9 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
     """Return one estimate per axis from two or more recordings, and warnings if a hand damped only some of them.
 
-    The least damped sitting of an axis counts, with the least bound of all. A passive hand adds damping to a device,
-    and takes none away (docs/hardware.md): it is enough that one sitting was free of it. Raises ValueError where the
-    least damped sitting is alone: nobody knows then whether it was free.
+    Each axis has the estimate of its least damped sitting, and the least bound of all sittings. A passive hand adds
+    damping to a device and takes none away (docs/hardware.md), so one sitting without a hand is enough. Raises
+    ValueError where no other sitting agrees with the least damped one, because that one may not be free of a hand.
     """
     if len(sittings) < 2:
         raise ValueError("one sitting tells no hand that only damps from more damping of the device: take two")
@@ -292,7 +292,7 @@ def _declared(scenario: Scenario, session: Session) -> list[float]:
 
 
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
-    """Return the bounds, cut to the declared damping, because more may come from a hand."""
+    """Limit the bounds to the declared damping, because more may come from a hand."""
     said = _declared(scenario, session)
     return [
         replace(e, friction=replace(e.friction, delta=min(e.delta, limit)))
@@ -304,7 +304,7 @@ def records_of(recorder: Recorder, session: Session) -> list[tuple[Array, Array]
     """Return displacements [m] and forces [N], (N,) each, of every axis. Raises ValueError where ticks are missing."""
     link, units = recorder.link(), session.units
     missing = int((~link["received"]).sum())
-    if missing:  # which force acted then is not known for certain, and a wrong one makes a wrong bound
+    if missing:  # the force in a missing tick is uncertain, and a wrong force gives a wrong bound
         raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
     return [(link["x"][:, i], link["applied"][:, i] * units.force_step[i]) for i in range(recorder.channels)]
 
@@ -315,7 +315,7 @@ def estimate(
     scenario: Scenario,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> list[Estimate]:
-    """One estimate per axis from a recorded session. Raises ValueError naming the axis that gives none."""
+    """Return one estimate per axis of a recorded session. Raises ValueError naming an axis that gives none."""
     estimates, records = [], records_of(recorder, session)
     for i, device in enumerate(scenario.axis_devices):
         progress(i, scenario.channels, f"estimating axis {i + 1}")

@@ -34,7 +34,7 @@ _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the
 _COARSEST = 0.1  # largest encoder count, as a part of the largest displacement in a tick that a hand can make
 _LARGEST_MARGIN_US = 30_000  # ages are computed from margins, which are i16 in microseconds
 _ROUNDED = 1e-12  # relative error of the length of a vector that is limited
-_HOLD, _RAMP_US = 4, 5000  # ticks and then microseconds in which a device without answers holds and releases a force
+_HOLD, _RAMP_US = 4, 5000  # [ticks] for which a device without answers holds a force, then [us] of its ramp to zero
 
 
 class Stage(StrEnum):
@@ -77,7 +77,7 @@ def _require_finite(force: Sequence[float]) -> None:
 class SafetyLimits:
     """The host's limits on forces and motion. The device has its own force limits in its firmware."""
 
-    cap: tuple[float, ...]  # (m,) [N] largest force, of a vector its largest length
+    cap: tuple[float, ...]  # (m,) [N] largest force, or largest length of a vector
     slew: float = 2000.0  # [N/s] fastest change of a force
     jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
@@ -87,7 +87,7 @@ class SafetyLimits:
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold for ever; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole
-    lever: float = 1.0  # [m] of rotary devices, whose ranges are those of a hand at this radius
+    lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the allowed ranges
 
     def __post_init__(self) -> None:
         r = self.lever
@@ -115,7 +115,8 @@ class SafetyLimits:
     ) -> _Shaped:
         """Return the force to send for `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
-        A vector keeps its direction at its cap, and moves straight on at the slew rate of its fastest axis.
+        A vector that is capped keeps its direction. A vector with an axis above the slew rate moves straight towards
+        its goal, with that axis at the slew rate.
         `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
         `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
         """
@@ -147,7 +148,7 @@ class SafetyLimits:
         return _Shaped(tuple(force), clipped, slowed)
 
     def capped(self, forces: NDArray[np.float64], at: float = 1.0) -> NDArray[np.bool_]:
-        """Return where forces (ticks, m) [N] reach the share `at` of their caps, axes of a vector together."""
+        """Return where forces (ticks, m) [N] reach the share `at` of their caps; axes of a vector count as one."""
         size = np.abs(forces)
         for first, end in self.vectors:
             size[:, first:end] = (1 + _ROUNDED) * np.linalg.norm(forces[:, first:end], axis=1, keepdims=True)
@@ -165,7 +166,8 @@ class SafetyLimits:
         """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass can do.
 
         `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
-        whose speed changed by more than a fifth of that, which two counts of the coarsest encoder show, or None.
+        whose speed changed by more than a fifth of `jump` per tick, or None. Two counts of the coarsest allowed encoder
+        are a fifth.
         """
         shaken = None
         for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
@@ -257,7 +259,7 @@ class Gain:
 class Heat:
     """A thermal model (I2t) of every motor: a first-order lag with time constant tau of the squared force.
 
-    A constant force F reaches the square of the continuous force after -tau ln(1 - (F_continuous / F)^2).
+    Under a constant force F, the lag's output reaches F_continuous^2 after -tau ln(1 - (F_continuous / F)^2).
     """
 
     def __init__(self, limits: SafetyLimits, T: float) -> None:
@@ -348,9 +350,9 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """Return the theta [ticks] of the measurement, the longest that a margin can express.
+    """Return theta [ticks] for the measurement: the longest for which a margin can state every age.
 
-    Raises ValueError where T [s] is too long for any.
+    Raises ValueError where T [s] is too long for theta = 1.
     """
     theta = min(MAX_THETA, int(_LARGEST_MARGIN_US / (1e6 * T)))
     if theta < 1:

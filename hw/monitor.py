@@ -1,10 +1,10 @@
-"""Check that link and device keep to the agreement: measured delay, clock, lateness, applied forces.
+"""Check that link and device behave as the certificate assumes: measured delay, clock, lateness, applied forces.
 
-The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the device's
-clock is compared with its tick number, and so is the host's; answers that come late or never are counted; and the force
-that the device reports is compared with what it was sent. By docs/protocol.md a device has no choice there: in ARMED it
-moves from its last force towards the one for this tick, within slew and growing cap; in HOLDING it keeps the last one;
-in DISARMED there is none.
+The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the clocks of
+device and host are compared with the tick number, late and missing answers are counted, and the force that the device
+reports is compared with the force that it was sent. docs/protocol.md determines that force: in ARMED the device moves
+from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps its last force;
+in DISARMED it applies none.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import Scenario
 
-_STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
-_INFERRED = 0.005  # part of ages: half of what the usual quantile leaves
-_MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
-_UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
-_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
+_STATES_PER_ANSWER = 8  # most STATEs per measured age: a USB frame may bring several FORCEs, but one margin is told
+_INFERRED = 0.005  # largest share of inferred ages: half of what the usual quantile leaves out
+_MEASURED_TOLERANCE = 0.01  # relative error of the device's clock against T, over the measurement
+_UNTOLD = 0.9  # largest share of STATEs without a margin; a USB frame may carry several
+_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # relative clock error over a block; a busy host blurs its own
 _BLOCK = 200  # ticks over which a clock is compared
 _CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
-_REMEMBERED = 64  # forces on their way, of which at most theta matter
-_ROUNDING = 1  # [steps] by which a firmware may round differently
-_PATIENCE = 5  # ticks in a row
-_CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
-_IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
-_HEAVIEST = 2.5  # [kg] of hand and handle
-_TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # [N] in the last of the blocks, and half a period [s]
-_TEST_BEFORE = 0.012  # [s] without a force
-_TEST_RATIO = 2.0  # between a motion and the expected one
-_DEGREE = 5  # of the polynomials that contain a hand's own motion: 1 % is left of 2 Hz
-_FIT = 0.8  # of the power: a free handle moved by a hand has 0.93 or more, a held one at most 0.5
-_LATE = 0.75  # [ticks] by which an axis may answer later than agreed: amplifiers do; no certificate covers a whole one
-_CROSS = 0.25  # of the expected motion that another axis may show: less passes through a table
-_ALIVE = 0.06  # of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, a dead motor shows 0.03
-_PUSHED = 0.5  # of the strongest test force: less is no test
-_STRONG = 2  # the block with which the test at the end begins
-_REST = 0.1  # [s] within which a handle rests at least once
-_PRESSING, _PRESSED = 0.3, 0.5  # [N], [s]
-_FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
+_REMEMBERED = 64  # latest forces that are stored, of which at most theta still matter
+_ROUNDING = 1  # [steps] by which the rounding of a firmware may differ
+_PATIENCE = 5  # wrong ticks in a row at which a session stops
+_CHANGE = 1.0  # [N] change of force that moves any handle, unless it is against a stop
+_IMPULSE = 0.1  # [N s] most of such a change over time without a motion: 100 ms of 1 N, 20 ms of 5 N
+_HEAVIEST = 2.5  # [kg] largest mass of hand and handle
+_TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
+_TEST_BEFORE = 0.012  # [s] at zero force before the test
+_TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
+_DEGREE = 5  # degree of the polynomials that remove a hand's own motion; 1 % of a motion at 2 Hz is left
+_FIT = 0.8  # least share of power with the expected shape: free handles in a moving hand have 0.93, held ones up to 0.5
+_LATE = 0.75  # [ticks] largest hidden delay: amplifiers have one, but no certificate covers a whole tick
+_CROSS = 0.25  # largest share of the expected motion on another axis; less may pass through a table
+_ALIVE = 0.06  # least share of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, no motor 0.03
+_PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
+_STRONG = 2  # first block of the test at the end of a session
+_REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
+_PRESSING, _PRESSED = 0.3, 0.5  # [N] force under which an encoder may stand still for this time [s]
+_FORGETTING = 8  # right ticks that cancel a wrong one: fewer let a session stop, also if wrong ticks are not in a row
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class LinkSettings:
     window: int = 200  # ticks over which misses are judged
     late: float = 0.1  # part of late answers above which the coupling is too fast for the link
     missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
-    test_encoders: bool = True  # by a small force at every arming
-    held: bool = True  # the scenario's hands hold the handles meanwhile, as in a rehearsal; else they are free
+    test_encoders: bool = True  # whether a small force tests the encoders at every arming
+    held: bool = True  # whether the scenario's hands hold the handles in this test, as in a rehearsal; else none does
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
     deadman: bool = False  # forces act only while the deadman at the device is held
@@ -80,16 +80,16 @@ class Ages:
 
     values: tuple[int, ...]
     missing: int = 0
-    ticks: tuple[int, ...] = ()  # [us] how long ticks of the device lasted, by its own clock
+    ticks: tuple[int, ...] = ()  # [us] lengths of the device's ticks by its own clock
 
     def longest_tick(self, T_us: float, q: float = 1.0) -> float:
-        """The length [us] that a fraction q of the ticks does not exceed; T where their clock tells no difference."""
+        """Return the length [us] that a fraction q of the ticks does not exceed, or T if the clock cannot tell them."""
         ordered = sorted(self.ticks)
         longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(longest) if longest > T_us + _CLOCK_US else T_us
 
     def quantile(self, q: float) -> int:
-        """The least age that a fraction q of forces does not exceed. Raises SafetyStop where so many never arrive."""
+        """Return the least age that a fraction q of forces does not exceed. Raises SafetyStop where fewer arrived."""
         ordered, everything = sorted(self.values), len(self.values) + self.missing
         place = min(everything - 1, int(q * everything))
         if place >= len(ordered):
@@ -98,7 +98,7 @@ class Ages:
         return ordered[place]
 
     def link_delay(self, T_us: float, q: float, guard_us: float) -> int:
-        """Return the ticks [>= 1] from a sample to its latch that a fraction q of the answers keeps, with a guard."""
+        """Return the least delay [ticks, >= 1] that covers the ages of a fraction q of the answers plus a guard."""
         return max(1, int(-(-(self.quantile(q) + guard_us) // T_us)))
 
     @property
@@ -108,7 +108,7 @@ class Ages:
 
 
 class AnswerAges:
-    """The ages of answers, by the number of the tick that each is for, from what STATEs tell.
+    """The ages of answers by the number of the tick that they answer, derived from STATEs.
 
     A STATE tells the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
     advances by n, and the answers that it skips are up to (n-1) T older. They count with that age, because the delay
@@ -150,18 +150,19 @@ class AnswerAges:
 class Measurement:
     """Measure the ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
 
-    Where too many ages are inferred, answers may have overtaken each other: a late one that comes together with a
-    younger one leaves no trace. Then a second round tells half as many ages exactly. Every STATE is still answered,
-    which keeps the load of the link, but most answers are for a wrong tick, so that the device ignores them, and those
-    that it takes are farther apart than the longest age. Their distances are random, to meet no burst more than others.
+    Where too many ages are inferred, answers may have overtaken each other: a late answer that comes together with a
+    younger one leaves no trace. Then a second round measures half as many ages exactly. Every STATE is still answered,
+    so that the load of the link is the same. But most answers are for a wrong tick, so that the device ignores them.
+    The answers that it takes are farther apart than the longest age. Their distances are random, so that bursts meet
+    all of them alike.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
         self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
         self._first: State | None = None
         self._last: State | None = None
-        self._tick = 0  # of the last STATE, never wrapped
-        self._ticks: list[int] = []  # [us]
+        self._tick = 0  # number of the last STATE, without wrap-around
+        self._ticks: list[int] = []  # [us] lengths of ticks
         self._apart = 1  # least distance of answers that the device takes; above 1 in the second round
         self._begin()
 
@@ -174,11 +175,11 @@ class Measurement:
         self.ignored: deque[int] = deque(maxlen=_REMEMBERED)  # latches whose answer the device ignores, modulo 2^16
 
     def delay(self) -> int:
-        """Return the ticks from the last STATE to the latch for which its answer is sent: theta, or ignored if more."""
+        """Return the ticks from the last STATE to its answer's latch: theta, or theta + 1, which the device ignores."""
         if self._sent is None or self._last is None:
             return self._theta
         meant = False
-        while self._next <= self._tick:  # one before this tick had no STATE, so its answer is missing
+        while self._next <= self._tick:  # a chosen tick without a STATE counts as a missing answer
             meant = self._next == self._tick
             self._sent.add(self._next)
             self._next += int(self._distances.integers(self._apart, 2 * self._apart))
@@ -195,7 +196,7 @@ class Measurement:
             self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
         self._last, self._tick = state, self._tick + passed
         self._states += 1
-        counted = self._states - 2 * self._theta  # earlier, the device misses answers to ticks before the first STATE
+        counted = self._states - 2 * self._theta  # before, the device misses answers to ticks before the first STATE
         if counted <= 0:
             return False
         tick = self._tick + distance(state.echo, state.tick)
@@ -224,7 +225,7 @@ class Measurement:
             self._answers.note_unanswered(range(self._tick - self._theta - missed + 1, self._tick - self._theta + 1))
         if margin is not None:
             self._answers.note(tick, margin)
-            self._missed -= margin < 0  # it was missed, but came after all
+            self._missed -= margin < 0  # a missed answer that comes late is not missing
 
     @property
     def ages(self) -> list[int]:
@@ -233,7 +234,7 @@ class Measurement:
 
     @property
     def missing(self) -> int:
-        """Answers that did not come, not even late."""
+        """Number of answers that never came."""
         if self._sent is None:
             return max(0, self._missed)
         decided = self._tick - 2 * self._theta
@@ -286,7 +287,7 @@ class LinkMonitor:
         """Clear the window after a new delay was configured."""
         self.last: State | None = None
         self.margin: int | None = None  # [us] of the answer that the last fresh STATE tells; None: no answer came
-        self.missed = 0  # ticks that the last fresh STATE tells of
+        self.missed = 0  # missed ticks that the last fresh STATE reports
         self._window: deque[_Tick] = deque()
         self._late = self._missed = self._untold = self._gaps = 0  # sums over the window; sum() takes too long
 
@@ -337,7 +338,7 @@ class LinkMonitor:
     def too_late(self) -> str | None:
         """Return a message if the link has become slower than the coupling was certified for, else None.
 
-        Shares are of a full window, however few ticks have passed. Raises SafetyStop where too little arrives.
+        Shares are relative to a full window, also before it is full. Raises SafetyStop where too few messages arrive.
         """
         window, most = self.settings.window, self.settings.missed
         late, missed = self._late / window, min(1.0, self._missed / window)
@@ -365,22 +366,22 @@ class _Tick(NamedTuple):
     odd: bool  # whether it counts in any of the sums
 
 
-# the clock: two are compared with the number of the tick, the device's own and the host's, since a device that
-# computes its clock from its ticks is found by the second one only
+# The clocks of device and host are both compared with the tick number. Only the host's clock reveals a device that
+# computes its clock from its ticks.
 
 
 @dataclass
 class _ClockDrift:
-    """Compare a clock with ticks of `T_us` in blocks, without the longest delay of each: a freeze is no drift."""
+    """Compare a clock with ticks of `T_us` in blocks. Each block excludes its longest delay: a freeze is no drift."""
 
     whose: str
     T_us: float
-    tolerance: float  # part of a block
+    tolerance: float  # largest drift, as a part of a block
     forgiven_us: float  # longest freeze that is left out
     _last: int | None = None
     _ticks: int = 0
-    _behind: float = 0.0  # [us] of the clock beyond ticks * T
-    _freeze: float = 0.0  # [us] the longest single part of it
+    _behind: float = 0.0  # [us] time of the clock minus ticks * T
+    _freeze: float = 0.0  # [us] longest delay of a single call in the block
 
     def note(self, at_us: int, ticks: int) -> None:
         """Process the clock `at_us` (modulo 2^32), `ticks` after the last call. Raises SafetyStop if it drifts."""
@@ -407,19 +408,19 @@ class ClockMonitor:
 
     def __init__(self, watchdog_us: int, T: float) -> None:
         T_us = 1e6 * T
-        self.most = max(1, int(watchdog_us / T_us))  # [ticks] that may be missing at once
+        self.most = max(1, int(watchdog_us / T_us))  # [ticks] largest advance from one STATE to the next
         self._device = _ClockDrift("its own", T_us, _DEVICE_TOLERANCE, watchdog_us)
         self._host = _ClockDrift("the host's", T_us, _HOST_TOLERANCE, watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
-        """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
+        """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` ticks after the previous one."""
         if ticks > self.most:
             raise SafetyStop(f"the tick number leapt by {ticks}, the watchdog allows {self.most}")
         self._device.note(state.t_us, ticks)
         self._host.note(now, ticks)
 
 
-# obedience: the force that the device says it applies
+# the force that the device reports
 
 
 class CommandMonitor:
@@ -430,7 +431,7 @@ class CommandMonitor:
         self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
         self._last: State | None = None
         self._ready = False  # whether the last STATE was not DISARMED
-        self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
+        self._run = (0, 0)  # least and largest possible number of forces latched since arming
         self._unlike = self._holding = 0
 
     def tell(self, tick: int, steps: tuple[int, ...]) -> None:
@@ -442,7 +443,7 @@ class CommandMonitor:
     def unlike(self, state: State, ticks: int) -> bool:
         """Return whether the device applies a force that it was not sent. A STATE after a gap is not judged.
 
-        Raises SafetyStop if that goes on.
+        Raises SafetyStop if the device continues to do so.
         """
         phase = state.phase
         self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
@@ -480,18 +481,18 @@ class CommandMonitor:
         )
 
 
-# encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder
+# Encoders. A hand that holds still looks like a disconnected cable, but no hand is as stiff as a dead encoder.
 
 
 class EncoderNoise:
     """The noise of every encoder at rest, while no force acts.
 
-    It is the least range of counts in 100 ms, so a person may move the handles as long as each of them rests once.
+    It is the least range of counts over windows of 100 ms. So a person may move a handle, if it also rests for one.
     """
 
     def __init__(self, axes: int, T: float) -> None:
         self._recent = [deque[int](maxlen=max(8, round(_REST / T))) for _ in range(axes)]
-        self.range = [0] * axes  # [counts] least in a window; before the first is full, nothing is known
+        self.range = [0] * axes  # [counts] least range of a full window; 0 before there is one
         self._known = [False] * axes
 
     def note(self, counts: Sequence[int]) -> None:
@@ -508,7 +509,7 @@ class EncoderNoise:
     def still(self) -> tuple[int, ...]:
         """Return the counts (m,) within which an encoder stands still: 1 without noise, as one channel may be broken.
 
-        Noise leaves twice the range of a tenth of a second in a longer one with a chance below 1e-6.
+        In a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
         """
         return tuple(1 if range_ <= 1 else 2 * range_ for range_ in self.range)
 
@@ -541,13 +542,13 @@ class EncoderTest:
 
     The force changes its sign every 30 ms, in blocks of 120 ms; each block is twice as strong as the one before. After
     a block, polynomials of degree 5 are removed from all positions: they contain what a hand does on purpose in this
-    time, 50 mm at 2 Hz included, and little of the answer. What is left must have the shape of the expected motion
-    (`_FIT` of its sum of squares), the sign of it, and its size within a factor of 2. A reversed motor or encoder has
-    the wrong sign, a wrong scale the wrong size; a dead encoder, a moved or a held handle has another shape. A motion
-    that comes later is one of a delay that nobody measures; friction and hands make it come earlier.
+    time, such as 50 mm at 2 Hz, and little of the answer. The rest must have the shape of the expected motion (`_FIT`
+    of its sum of squares), its sign, and its size within a factor of 2. A reversed motor or encoder has the wrong sign,
+    a wrong scale the wrong size. A dead encoder, and a moved or a held handle, have another shape. A motion that comes
+    later than expected shows a hidden delay, because friction and hands make it come earlier.
 
-    At the end of a session (`alive`) unknown hands may hold the handles and move them. It then suffices that the axis
-    swings in the rhythm of the force at any phase, which that of a dead motor does not.
+    At the end of a session (`alive`) unknown hands may hold the handles and move them. Then it suffices that the axis
+    swings in the rhythm of the force at any phase. An axis with a dead motor does not.
     """
 
     def __init__(
@@ -579,7 +580,7 @@ class EncoderTest:
         self._pushed = 0.0  # [N] largest force on the axis in this block
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
-        """Return the forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered.
+        """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.
 
         Raises SafetyStop, naming the axis, where an encoder answers in a wrong way, or not even to 1 N.
         """
@@ -607,7 +608,10 @@ class EncoderTest:
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
     def _compare(self) -> tuple[Array, Array, float, float]:
-        """Return size and fit (m,) of the motions against the expected one, the own size at any phase and its delay."""
+        """Compare all motions with the expected one.
+
+        Returns size and fit (m,) of all motions; size at any phase and delay [ticks] of the tested axis.
+        """
         t, expected, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
         parts = expected, np.cumsum(expected), np.gradient(expected, t)
@@ -616,7 +620,7 @@ class EncoderTest:
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
-        rounding = len(t) * np.square(self._units.encoder_step) / 12  # no motion
+        rounding = len(t) * np.square(self._units.encoder_step) / 12  # sum of squares without a motion
         own = np.maximum((moved**2).sum(axis=0) - rounding, rounding)
         fit = size**2 * power / own
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
@@ -669,10 +673,10 @@ class EncoderMonitor:
     """Check that encoders follow the force while it acts.
 
     No living hand holds a handle within one count under a changing force; an encoder with one broken channel still
-    toggles between two counts. The force that the device reports is compared with that at the last motion, and a change
-    of more than 1 N, or of half a weaker motor's force, is summed up over time. A mass M that a
-    change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long. Under
-    a force that does not change, of more than 0.3 N, no hand holds still for half a second: its tremor shows.
+    toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
+    of more than 1 N, or of half of a weak motor's force, are summed up over time. A mass M that a change F turns around
+    stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force of more
+    than 0.3 N, no hand holds still for half a second: its tremor shows.
     """
 
     def __init__(
@@ -684,16 +688,16 @@ class EncoderMonitor:
         lever: float = 1.0,
         cap: Sequence[float] = (),
     ) -> None:
-        """`still` (m,) [counts] are within noise; `lever` [m] turns a force into a torque, at most `cap` (m,) [N]."""
+        """Take `still` (m,) [counts] of noise, `lever` [m] of a rotary device, and `cap` (m,) [N]."""
         self._lever = lever
-        #: (m,) [N] what stands for 1 N: half of what a weak motor can do
+        #: (m,) [N] unit of force changes: 1 N, or half of the cap of a weak motor
         self._newton = [min(lever, most / 2) for most in cap] or [lever] * len(force_step)
         self._still = tuple(still or (1,) * len(force_step))
-        self._quiet = [0.0] * len(force_step)  # [s] under a force without a motion
+        self._quiet = [0.0] * len(force_step)  # [s] time under a force without a motion
         self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
         self._band: list[list[int]] | None = None
-        self._reference = [0.0] * len(force_step)  # [N] at the last motion
-        self._impulse = [0.0] * len(force_step)  # [N s] since then
+        self._reference = [0.0] * len(force_step)  # [N] force at the last motion
+        self._impulse = [0.0] * len(force_step)  # [N s] changes of force over time since the last motion
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
         """Raise SafetyStop where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""

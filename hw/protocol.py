@@ -48,7 +48,7 @@ class Cause(IntEnum):
     ESTOP_HOST = 6  # a STOP with reason ESTOP
 
 
-#: by value: what an enumeration takes ten times as long for, and a tick asks ten times
+#: members by value: ten times as fast as a look-up in the enumeration, which every tick does ten times
 _PHASES, _CAUSES = {int(phase): phase for phase in Phase}, {int(cause): cause for cause in Cause}
 
 
@@ -74,7 +74,7 @@ class Refused(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why the host stops. The device stops on any; ESTOP latches."""
+    """Why the host stops. The device stops for any reason; it latches ESTOP."""
 
     DONE = 0
     OPERATOR = 1
@@ -115,7 +115,7 @@ class Config(NamedTuple):
 
     theta: int  # a force answers tick k and is latched at tick k + theta; 0: as soon as it comes, within tick k
     hold: int  # ticks that the last force is held for when frames are missing
-    ramp: int  # ticks from there to zero
+    ramp: int  # ticks of the ramp from the held force to zero
     ramp_in: int  # ticks over which the cap grows from zero after arming; 0: at once
     cap: tuple[int, ...]  # [steps]
     slew: tuple[int, ...]  # [steps per tick]
@@ -126,13 +126,13 @@ class Config(NamedTuple):
 
     @property
     def due(self) -> int:
-        """Latest ticks after its sample at which a force may come, and after which a STATE shows it."""
+        """The ticks from a sample to the STATE that shows its force; the force may come until then."""
         return max(1, self.theta)
 
     def limited(self, run: int, last: Sequence[int], asked: Sequence[int]) -> tuple[int, ...]:
-        """Return the forces [steps] that the device applies for `asked` after `last`, the `run`-th time since arming.
+        """Return the forces [steps] that the device applies for `asked` after `last`, as the `run`-th since arming.
 
-        They are within the cap, which grows from zero after arming, and within the slew rate of the last forces.
+        They are within the cap, which grows from zero after arming, and differ from `last` by at most the slew rate.
         """
         caps: Sequence[int] = self.cap
         if run < self.ramp_in:
@@ -157,7 +157,7 @@ class State(NamedTuple):
     status: int  # phase, cause and deadman
     tick: int
     echo: int  # the source of the last FORCE that came
-    margin_us: int  # how long before its latch it came, negative: too late; NO_MARGIN: none came since the last STATE
+    margin_us: int  # time from the last FORCE to its latch, negative: too late; NO_MARGIN: none since the last STATE
     crc_errors: int  # frames that the device rejected, modulo 256
     misses: int  # ticks for which no FORCE was there in time, modulo 256
     t_us: int  # the device's clock at this tick, modulo 2^32
@@ -215,7 +215,7 @@ _TEXT = 16  # bytes of Info.firmware, ASCII, filled up with zeros
 
 
 class _Layout(NamedTuple):
-    """One kind of payload: type byte, struct codes of its fixed fields and of one axis, what each field may hold."""
+    """One kind of payload: type byte, struct codes of its fixed fields and of one axis, limits of each field."""
 
     code: int
     fixed: str
@@ -254,7 +254,7 @@ def _form(kind: type, axes: int) -> _Form:
     return _Form(kind, Struct("<B" + layout.fixed + layout.axis * axes), 1 + len(layout.limits) - columns, columns)
 
 
-#: by kind and number of axes (0 where a message has none) to write, by type byte and length to read
+#: forms for writing, by kind and number of axes (0 where a message has none); for reading, by type byte and length
 _FORMS = {
     (kind, n): _form(kind, n) for kind in _LAYOUTS for n in (range(1, _MAX_AXES + 1) if _LAYOUTS[kind].axis else (0,))
 }
@@ -264,7 +264,7 @@ _OVERHEAD = 6  # CRC-32, the COBS byte, the delimiter
 _MAX_WIRE = max(f.struct.size for f in _FORMS.values()) + _OVERHEAD
 _RESIDUE = crc32(bytes(4) + crc32(bytes(4)).to_bytes(4, "little"))  # CRC-32 over anything followed by its own CRC-32
 _STATUSES = frozenset(phase | cause << 4 | held for phase in Phase for cause in Cause for held in (0, DEADMAN))
-_CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent: every field looked at; State and Force leave it to struct
+_CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent, so every field is checked; struct checks State and Force
 
 
 def wire_bytes(kind: type, axes: int) -> int:
@@ -284,7 +284,7 @@ def encode(message: Message) -> bytes:
     return b"".join([_CODES[len(block)] + block for block in raw.split(b"\0")]) + b"\0"
 
 
-#: a COBS block is its length plus one, then its bytes; the zero behind it goes without saying
+#: first byte of a COBS block, its length plus one, by length; the zero after the block is not sent
 _CODES = [bytes((n + 1,)) for n in range(254)]
 
 
@@ -308,7 +308,7 @@ def pack(message: Message) -> bytes:
 
 
 def _check(message: Message) -> None:
-    """Raises ValueError for the first field that cannot travel."""
+    """Raise ValueError for the first field that does not fit into its frame."""
     layout, name = _LAYOUTS[type(message)], type(message).__name__
     fixed = len(layout.limits) - len(layout.axis)
     axes, values = None, tuple[Any, ...](message)
@@ -329,7 +329,7 @@ def _check(message: Message) -> None:
 
 
 def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
-    """Raises ValueError naming the field unless the value is an integer from limits[0] to limits[1]."""
+    """Raise ValueError naming the field unless the value is an integer from limits[0] to limits[1]."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -363,7 +363,7 @@ class Decoder:
 
     def __init__(self) -> None:
         self.crc_errors = 0
-        self.malformed = 0  # COBS does not come out, or no message has this type and length
+        self.malformed = 0  # frames with inconsistent COBS codes, or of a type and length that no message has
         self.oversize = 0  # longer than any frame
         self.tail = b""  # never longer than _MAX_WIRE
         self.skipping = False  # inside an oversize frame that is already counted
