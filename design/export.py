@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("export")
@@ -32,26 +32,28 @@ from haptic_loop.design.result import listed, switching_guarantee
 # can keep this order, so that an exported block repeats its test vector to the last bit. In single precision
 # coefficients, inputs and every operation are rounded to 24 bits.
 #
-# If a force exceeds its limit, the tick solves the box problem of controller.complementarity. It switches the first
-# wrong limit until none is wrong, which ends (docs/theory.md). The elimination keeps the order of the channels. It
-# needs no pivots, because all principal minors are positive. e then moves [y; z+] by its kick, and the sent forces are
-# set to f_e. If the force of a device is limited as a vector, the tick alternates two methods: Newton's method in
-# u = f + tau e, whose steps are undone unless they halve the residual, and the iteration of Douglas and Rachford, which
-# converges. A force that misses its tolerance after _MOST_STEPS is 0, and `unsolved` counts its tick.
+# If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity. The tick
+# switches the first wrong limit until none is wrong; the switching ends (docs/theory.md). The elimination keeps the
+# order of the channels and needs no pivots, because all principal minors are positive. The tick then adds KICK e to
+# [y; z+] and sets the sent forces to f.
+#
+# If the force of a device is limited as a vector, the tick first tries a step of Newton's method in u = f + tau e. If
+# this step does not halve the residual, the tick replaces the step by one of the Douglas-Rachford iteration, which
+# converges. A force that misses its tolerance after _MOST_STEPS steps is set to 0; `unsolved` counts these ticks.
 
 
 _TICKS = 64  # length of a test vector, longer than the delays and the fast modes of a loop
-_MOST_TURNS = 100_000  # switches in a tick's box problem; a handful are needed
+_MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 170 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector, relative to the limit; rounding is allowed in addition
-_BALL_ROUNDING = 16  # units in the last place of the terms of a residual
-_MOST_STEPS = 1000  # steps for a force vector; five are usual, 93 the most in well-conditioned random problems
+_BALL_ROUNDING = 16  # allowed rounding of a residual, in units in the last place of its largest terms
+_MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
 
 @dataclass(frozen=True)
 class _Signal:
-    """One side of a block: m numbers of one kind."""
+    """The input or the output of a block: m values of one quantity."""
 
     letter: str
     what: str  # quantity with its unit
@@ -90,7 +92,7 @@ class _Trial:
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """Return V(z), force to displacement. Raises ValueError if the coupling is no V in feedback."""
+    """Return V(z), force to displacement. Raises ValueError if the coupling is not a V in feedback around Psi E."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         reason = "this coupling is no V in feedback around the environment; --process exports the process with it"
@@ -157,7 +159,7 @@ def _with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
-    """Return normally distributed inputs and their outputs; a limiter acts on a third of the ticks."""
+    """Return normally distributed inputs and their outputs, scaled so that a limiter acts on a third of the ticks."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
@@ -227,7 +229,7 @@ def _box_matrix(limiter: Limiter) -> Array:
 
 
 def _turns(m: int) -> int:
-    """Return a bound of the number of switches after which the box problem is solved."""
+    """Return the largest number of switches in a box problem: 3^m, which always suffices, or _MOST_TURNS if less."""
     return min(3**m, _MOST_TURNS)
 
 
@@ -237,7 +239,7 @@ def _rounding(single: bool) -> float:
 
 
 def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Return (e, f) of f = q - M e as the C file computes it, operation by operation, in the precision of q."""
+    """Solve f = q - M e for (e, f) by the operations of the C file, in their order and in the precision of q."""
     m, real = len(q), type(q[0])
     zero, one = real(0), real(1)
     rounding = real(_rounding(real is np.float32))
@@ -283,7 +285,7 @@ def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any
 
 
 class _Balls(NamedTuple):
-    """The problem of limited vectors, with the channels in the order in which its blocks are solved."""
+    """The problem f = q - M e for limited force vectors, with the channels in the order in which blocks are solved."""
 
     at: list[int]  # (m,) channels
     first: list[int]  # (m,) first entry of the vector to which each entry belongs
@@ -313,7 +315,7 @@ class _Balls(NamedTuple):
 
 
 def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
-    """Write to x the solution of the rows [A, b] from begin to end, with b in column `end`, as the C file does."""
+    """Solve A x = b for entries begin to end of x, as the C file does; rows of `a` hold A, and b in column `end`."""
     for k in range(begin, end):
         pivot = k
         for i in range(k + 1, end):
@@ -332,7 +334,7 @@ def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
 
 
 def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Return (e, f) of f = q - M e as the C file computes it, operation by operation, in the precision of q."""
+    """Solve f = q - M e for (e, f) by the operations of the C file, in their order and in the precision of q."""
     at, first, last, ends, M, resolvent, tau, limit = problem
     m, real = len(q), type(q[0])
     zero, one, two = real(0), real(1), real(2)
@@ -529,7 +531,7 @@ int main(void)
 #endif /* HAPTIC_LOOP_$NAME */
 """)
 
-#: a coupling stands in a feedback loop that its user closes, so it can be asked before its input is known
+#: The user closes the feedback loop around an exported coupling and needs D and the free output to solve the loop.
 _FREE_DECLARED = """
 /* $y = free + D $u: the free part, before this tick's $u is known, and D, for solving u = x - $y, $u = E(u). */
 void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS]);
@@ -548,7 +550,7 @@ void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS])
 """
 
 
-#: the box problem, and what a tick does that asks for more than a limit
+#: C code of the box problem, for ticks in which a force would exceed its limit
 _LIMIT_DEFINED = """
 static ${real} ${name}_size(${real} a)
 {
@@ -607,7 +609,7 @@ static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_C
     }
 }
 """
-#: the problem of vectors that are limited
+#: C code for device forces that are limited as vectors
 _BALLS_DEFINED = """
 static ${real} ${name}_size(${real} a)
 {
@@ -774,7 +776,7 @@ $reached        }
 
 
 def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
-    """Return the text of the file; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
+    """Return the text of the C file. Its numbers are hexadecimal, so that compilers do not round decimals."""
     system, name, dtype = block.system, block.name, block.dtype
     words = {
         "name": name,

@@ -1,4 +1,4 @@
-"""The hands' sides and the facts of the environment's side of which conditions are composed (design.frame)."""
+"""The parts of a condition, composed by design.frame: a hands' side and facts of the environment's side."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Lti, as_like, constant_like
 from haptic_loop.design.frame import Collected, Demand, Input, Weights, even_damping, less_advance
 
-Values = Mapping[str, Sequence[Any]]  # of the multipliers, by name
+Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The numbers of one multiplier, which a search takes from [least, most] units each."""
+    """The numbers of one multiplier. A search keeps each number between `least` and `most` times its unit."""
 
-    name: str  # in files
+    name: str  # name of the multiplier in files
     units: tuple[float, ...]  # (n,); 0 for a number that is always 0
     expected: str  # the allowed values in words, for messages
     least: float  # if positive, the numbers must be positive
@@ -53,7 +53,7 @@ def longest(loop: Loop, T: Number) -> Any:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Hands' sides: the energy that every passive hand and its device dissipate, whatever forces act.
+# Hands' sides: lower bounds of the energy that passive hands and their devices dissipate under any forces.
 
 
 class HandsSide(ABC):
@@ -61,7 +61,7 @@ class HandsSide(ABC):
 
     @abstractmethod
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
-        """Return the inputs, with their shares of the displacement that a force multiplies."""
+        """Return the inputs, each with its weights in the displacement that a force multiplies (`Input.moved`)."""
 
     @abstractmethod
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
@@ -72,11 +72,11 @@ class HandsSide(ABC):
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Return the multipliers. A search has s times each of them as unknown, with the factor s on the damping."""
+        """Return the multipliers. A search's unknowns are s, the factor of the damping, and s times each multiplier."""
         return ()
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return matrices (k, n, n), linear in s and in s times the multipliers, that must be semidefinite."""
+        """Return matrices (k, n, n) that must be positive semidefinite; `values` are s times the multipliers."""
         return []
 
     def allowed(self, loop: Loop, values: Values) -> Values:
@@ -136,7 +136,7 @@ class Latency(HandsSide):
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return s - D Q D with D = diag(tau, T_max - tau)^(1/2), at _LATENCIES latencies of each range."""
+        """Return s I - D Q D with D = diag(tau, T_max - tau)^(1/2), at _LATENCIES latencies tau of each range."""
         bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
@@ -170,8 +170,8 @@ class Latency(HandsSide):
         return None
 
 
-_LATENCIES, _CLOSER = 9, 400  # samples of a range: in a search, and for scaling its result
-_DIGITS = 10  # of an entry of Q
+_LATENCIES, _CLOSER = 9, 400  # numbers of latencies sampled per range: in a search, and for scaling its result
+_DIGITS = 10  # significant digits of an entry of Q
 _LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4  # relative reductions of Q that are tried
 
 
@@ -186,7 +186,7 @@ def _ranges(loop: Loop) -> list[tuple[float, float]]:
 
 
 def _separate(loop: Loop, d: int) -> tuple[float, float]:
-    """Return decimals of at most 1/t2 and 1/(T_max - t1) [1/s], the diagonal Q; (0, 0) for a constant latency."""
+    """Return the diagonal Q, 1/t2 and 1/(T_max - t1) [1/s] rounded down; (0, 0) for a constant latency."""
     if d not in _varies(loop):
         return 0.0, 0.0
     (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
@@ -223,7 +223,7 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
 class PeriodCost(NamedTuple):
     """L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step, vb = (v + v+)/2; (m,) each.
 
-    In floating point or over Fractions, [N/m], [N s/m], [N s^2/m] and [N s^2/m].
+    The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m.
     """
 
     move: Any  # c0/(T - q)
@@ -266,7 +266,7 @@ def hands_side(loop: Loop) -> HandsSide:
 class Fact(ABC):
     """A property of the environment's side beyond one linear network with constant delays.
 
-    A user's own fact needs `enter` alone; docs/extending.md shows one.
+    A fact that a user adds must define only `enter`; docs/extending.md shows an example.
     """
 
     @abstractmethod
@@ -279,9 +279,9 @@ class Fact(ABC):
 
 
 class Walls(Fact):
-    """Walls that make and break contact, by the law of each wall at every tick, with multipliers a, c, d, m.
+    """Walls that make and break contact. The law of each wall at every tick has the multipliers a, c, d, m.
 
-    The inputs of a wall are u, the step of the depth h, and for a wall with a damper s >= 0, which is positive only
+    The inputs of a wall are u, the step of the depth h, and, if the wall has a damper, s >= 0, which is positive only
     when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
     """
 
@@ -323,11 +323,11 @@ class Walls(Fact):
 
 
 class Switching(Fact):
-    """Delays that switch within [lo, hi] at every tick and on every device, with alpha_i > 0 [N/m] per device.
+    """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
     A force that is late by n in [lo, hi] differs from the nominal one by at most half the width times the sum of the
     steps in between. The multiplier weighs this error w against the displacement that the force multiplies. The axes of
-    a device share its delay, so that the weight may be alpha_i Delta_i over the mean of Delta_i's diagonal.
+    a device share its delay, so that the weight may be the matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
@@ -366,9 +366,10 @@ _SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's di
 
 
 class Limiter(Fact):
-    """Forces that leave through the limiter of controller.law, of lag rho > 0 [N/m] per device.
+    """Forces that leave through the limiter of controller.law, with a constant rho > 0 [N/m] per device.
 
-    All axes of a device share rho and the multiplier c of each lag, which covers both a ball and a box of forces.
+    All axes of a device share rho and the multiplier c of each lag, so that the forces may be limited to a ball or a
+    box.
     """
 
     def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
@@ -425,8 +426,8 @@ def compose(
         facts: The facts of the environment's side.
         values: The multipliers by name.
         late: Whether the delays Theta have to be added; False if G contains them.
-        scaled: Whether the values of the hands' side are s times its multipliers, which makes the block affine in both.
-        hands: The hands' side; None for that of the loop.
+        scaled: Whether the hands' side's values are s times its multipliers, so that the block is affine in s and them.
+        hands: The hands' side; None for `hands_side(loop)`.
 
     Raises:
         ValueError: The values are no multipliers.

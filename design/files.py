@@ -83,7 +83,7 @@ class _Ledger:
 
     read: dict[Any, str] = field(default_factory=dict)  # place -> name of the file in messages
     named: dict[Any, str] = field(default_factory=dict)  # place -> option that names the file as output
-    written: set[Any] = field(default_factory=set)  # places
+    written: set[Any] = field(default_factory=set)  # places of the files that the command has written
 
 
 _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
@@ -129,7 +129,7 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
-    if content is None:  # A kernel file such as /proc/kmsg would block.
+    if content is None:  # A non-blocking read returns None for a kernel file such as /proc/kmsg without data.
         raise InputError(f"{named}: has nothing to read, expected a file with content")
     if len(content) > most:
         raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
@@ -143,7 +143,7 @@ def _without_waiting(path: str, flags: int) -> int:
 
 @contextmanager
 def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
-    """Open a regular file that no option writes. Raises InputError, also for errors while it is read."""
+    """Open a regular file that no option names as output. Raises InputError, also if a later read fails."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
@@ -185,7 +185,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{named}: not valid TOML: nested too deeply") from None
-    except ValueError as error:  # also for an integer of thousands of digits
+    except ValueError as error:  # tomllib also raises it for an integer of thousands of digits.
         raise InputError(f"{named}: not valid TOML: {error}") from None
 
 
@@ -251,14 +251,14 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
 
 
 def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
-    """Return the file of --out, or the default one in a new folder. Raises InputError."""
+    """Return the file of --out, or the default file, whose folder is created. Raises InputError."""
     if named is None:
         folder(Path(default).parent)
     return check_file("--out", Path(default if named is None else named), expected)
 
 
 def folder(path: Path) -> Path:
-    """Create a folder that files can be written to. Raises InputError."""
+    """Create a folder if it does not exist. Raises InputError if files cannot be written to it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         _try(path)
@@ -270,7 +270,7 @@ def folder(path: Path) -> Path:
 
 
 def _try(place: Path, name: str = "") -> None:
-    """Make a temporary file in a folder, with a name as long as `write` needs for the file `name`."""
+    """Create and delete a temporary file in a folder. Its name is as long as the one that `write` uses for `name`."""
     handle, temporary = tempfile.mkstemp(dir=place, prefix=f".{name}.")
     os.close(handle)
     os.unlink(temporary)
@@ -342,8 +342,8 @@ InJson = Literal["always", "if given", "inlined", "left out"]
 def off_table(json: InJson = "always", default: Any = MISSING) -> Any:
     """Return a dataclass field of a report that no table shows.
 
-    `json` says whether its JSON has the key `always`, only `if given` (not None), or `left out`; `inlined` puts the
-    keys of a nested report among the others.
+    `json` says when the report's JSON has the field: `always`, `if given` (the value is not None), or never (`left
+    out`). With `inlined` the keys of a nested report stand among those of the outer report.
     """
     return field(default=default, metadata={"json": json})
 
@@ -373,7 +373,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # such as from_, because `from` is a keyword
+            part[one.name.removesuffix("_")] = plain(value)  # `from` is a keyword, so its field is from_.
     return part
 
 

@@ -2,7 +2,7 @@
 
     complementarity   the procedure of Remark 5: cone complementarity as printed, with bisection on mu
     inner             inner convex approximation: feasible descent, no bisection (the default)
-    fixed-poles       one state per channel, diagonal; global for fixed poles, the poles by a simplex search
+    fixed-poles       one state per channel, diagonal; the global optimum for poles that a simplex search chooses
 
 All methods start from the structured spring-damper design and minimise ||W1 L W2||_inf (23). The returned coupling
 satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone.
@@ -134,7 +134,7 @@ def _passivity_storage(family: FixedOrder, p: Array) -> Array:
 
 
 def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
-    """Return the U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the largest margin."""
+    """Return the U = X^-1 > 0 of Lemma 3 that proves ||W1 L W2||_inf < mu with the largest margin."""
     G = family.weighted_loop(p) * (1 / mu)
     S = lmi.reachability_scaled(G)
     n, m = S.shape[0], G.inputs
@@ -169,7 +169,7 @@ class _Lemmas:
         self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
 
     def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
-        """Return the inequalities in unknowns with `parts` p - at, Q, Q^-1, U, U^-1 and mu^2."""
+        """Return the inequalities in the unknowns, which `parts` splits into p - at, Q, Q^-1, U, U^-1 and mu^2."""
 
         def passivity(v: Array) -> Array:
             p, Q, Y, *_ = parts(v)
@@ -213,10 +213,10 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # one, mu^2 enters linearly, and there is no bisection. In state coordinates with Q0 = I the tangent is 2I - Q.
 
 
-_Judge = Callable[[Array, float], bool]  # whether the coupling p is certified and its norm at most mu, from p alone
-_SETTLED = 1e-4  # relative improvement of the norm by a step below which the descent ends
+_Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu
+_SETTLED = 1e-4  # The descent ends after a step that improves the norm by less than this share.
 _FIRST_ROOM = 0.05  # relative room above the initial norm for the first certificate
-_LEAST, _MOST = 0.1, 1.99  # bounds on Q and U in coordinates where they were I, because unexcited states may degenerate
+_LEAST, _MOST = 0.1, 1.99  # bounds of Q and U, which were I before the step; unexcited states may degenerate
 
 
 def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
@@ -288,7 +288,7 @@ _WIDTH = 5e-3  # relative width at which the bisection ends
 
 
 def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """Return the best coupling and the number of SDPs; p is feasible for its norm."""
+    """Return the best coupling and the number of SDPs solved; the start p must be feasible for `norm`."""
     Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     if _singular(Q, U):
         return p, 0
@@ -306,7 +306,7 @@ def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: in
 
 
 def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> tuple[Array | None, int]:
-    """Return a coupling that is feasible for mu, or None, and the number of SDPs."""
+    """Return a coupling that is feasible for mu, or None, and the number of SDPs solved, at most `patience`."""
     sizes = (lemmas.LQ.shape[0],) * 2 + (lemmas.LU.shape[0],) * 2  # of Q, Y, U and X
     ends = np.cumsum([lemmas.at.size, *map(lmi.packed, sizes)])
 
@@ -347,7 +347,7 @@ _GAP = 1e-5  # relative gap between the norm on a refined sweep and the bound at
 
 
 class FixedPoles:
-    """The problem for one loop; binding frequencies are reused for the next poles."""
+    """The fixed-pole problem of one loop. The frequencies of the cuts are kept when the poles change."""
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None) -> None:
         self.shaping, self.phi, self.units = shaping, phi, _Units(shaping, phi)
@@ -410,7 +410,7 @@ class FixedPoles:
         blocks = [Inequality.of(passive, every), Inequality.of(storage, every), cuts]
 
         def certified(x: Array) -> bool:
-            """Return whether the coupling is certified, because a solver's tolerance could hide a violation."""
+            """Return whether a sweep certifies the coupling; the solver's tolerance could hide a violation."""
             return any_environment(self.units.si(unit(x)), self.shaping.loop, self.phi).certified
 
         x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)

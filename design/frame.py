@@ -32,7 +32,8 @@ from haptic_loop.design.exact import require_size
 class Demand(Generic[AnyBlock]):
     """free + s gain must be strictly positive real, with s = 1 for the available damping.
 
-    `static` are matrices that must be symmetric, by name; those in `semidefinite` also positive semidefinite.
+    `static` holds named matrices that must be symmetric. Those named in `semidefinite` must also be positive
+    semidefinite.
     """
 
     free: AnyBlock
@@ -53,7 +54,7 @@ class Demand(Generic[AnyBlock]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return Delta_D T/T_max [N s/m], (m,), the damping in even periods T that equals delta in periods up to T_max.
+    """Return Delta_D T/T_max (m,) [N s/m], the damping that represents delta when even periods T replace T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T: the force map is the same at every tick.
@@ -83,7 +84,7 @@ def product(p: Weights, q: Weights) -> list[Any]:
 
 
 def less_advance(p: Weights, follows: Any) -> list[Any]:
-    """Return the weights of (p(1/z) - follows z)/(z - 1) for p(1) = follows, which is causal.
+    """Return the weights of (p(1/z) - follows z)/(z - 1), which is causal because p(1) = follows.
 
     For p = z^-theta this is -(1 + 1/z + .. + z^-theta), the negative window of a delay.
     """
@@ -106,7 +107,7 @@ class Input:
 
 
 class Collected(Generic[AnyBlock]):
-    """The entries of hands' side and facts: inputs, weights of forces, rows, and constant terms."""
+    """The entries of the hands' side and the facts: inputs, weights of forces, rows, and constant terms."""
 
     def __init__(
         self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
@@ -120,7 +121,7 @@ class Collected(Generic[AnyBlock]):
         self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> input
         self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
-        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights), besides the response
+        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
         self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of df_e, scale)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight of dy, whether it is summed)
@@ -143,7 +144,7 @@ class Collected(Generic[AnyBlock]):
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Add the quadratic form of the hands' side, in displacements without the slip."""
+        """Add the quadratic form of the hands' side, in the displacements from which no slip is subtracted."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -162,7 +163,7 @@ class Collected(Generic[AnyBlock]):
         return len(self.places) - 1
 
     def of(self, name: str) -> dict[int, int]:
-        """Return the inputs of a name as device or wall -> number."""
+        """Return {channel or wall: number} of the inputs with this name."""
         return {place: i for (known, place), i in self.places.items() if known == name}
 
     def slip(self, channel: int) -> int:
@@ -261,7 +262,7 @@ class Collected(Generic[AnyBlock]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return (the block from inputs to x, p, added steps of forces and previous inputs; the previous inputs)."""
+        """Return the block from inputs to [x; p; added force steps; previous inputs], and the previous inputs used."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]

@@ -25,8 +25,8 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = _ER
     """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
     Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval is halved if
-    the two results differ by more than its share of `error`, relative to the integral. Rounding would cause halving
-    without end, so there is a least mean that counts, and only the worst intervals are halved if there are many.
+    the two results differ by more than its share of `error`, relative to the integral. Because rounding would cause
+    endless halving, means below _ROUNDING do not count. If too many intervals qualify, only the worst are halved.
     """
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
@@ -56,7 +56,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 
 
 # ----------------------------------------------------------------------------------------------------
-# `supremum` for many functions of frequency at once: one row each, refined between grid points together.
+# `suprema` does the work of `supremum` for many functions of frequency at once, with one row for each function.
 
 
 _PEAKS = 3  # highest local maxima of a row that are refined
@@ -66,7 +66,7 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 
 
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
-    """Return the largest value of each row (n,) over the frequencies `common` (k,) and its `own` (n, p).
+    """Return the supremum (n,) of each row, refined between its frequencies: `common` (k,) and its `own` (n, p).
 
     A row with a value that is not finite gives infinity.
     """
@@ -81,7 +81,7 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
     endless = ~np.isfinite(values).all(axis=1)
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
-    local = np.where((values > padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)  # once per plateau
+    local = np.where((values > padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)  # A plateau counts once.
     peaks = np.argsort(local, axis=1)[:, -_PEAKS:]
     left, right = _neighbours(grid, np.take_along_axis(grid, peaks, axis=1))
     top = values.max(axis=1)
@@ -103,15 +103,15 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
     return below, above
 
 
-#: [rad/sample] responses are even in w, so that 1e-4 stands for 0 to 1e-8; lower frequencies catch slow poles
+#: [rad/sample] Responses are even in w, so 1e-4 replaces 0 with an error of 1e-8; _BELOW catches slow poles.
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
-_EVEN = 192  # least number of even frequencies, and number of frequencies even in the logarithm
-_PER_LOBE = 24  # even frequencies for each lobe that a delay makes
+_EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced ones
+_PER_LOBE = 24  # evenly spaced frequencies for each lobe that a delay causes in the response
 _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
-    """Return frequencies for n systems: common ones (k,), and those around the poles (n, p) of each system, (n, j).
+    """Return the frequencies (k,) common to n systems, and those (n, j) around the poles (n, p) of each system.
 
     `delay` [samples] is the longest delay of the loop, which is the number of lobes in its response.
     """
@@ -128,7 +128,7 @@ _POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep
 
 
 def _sweep_cost(G: Lti) -> float:
-    """Return the approximate time of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
+    """Return the time of a sweep of G [s], correct to a factor of three; delays at the outputs of G cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
@@ -154,7 +154,7 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 
 
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
-    """Return sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
+    """Return sorted frequencies [rad/sample] in [low, high]: evenly spaced in w and in log w, dense around poles.
 
     A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. A repeated pole
     counts once, because two points that differ by rounding only could hide the peak beside them.
@@ -176,8 +176,8 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     A tick in double precision is a tick of a system whose coefficients have relative errors of (2n + 8) u (n states, u
     the unit), plus their differences to a system `meant` with the same states. With R = (zI - A)^-1 the errors dA, dB,
     dC, dD change the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|, which is large if big terms
-    cancel. The difference of both responses would be less useful. Beside a sharp resonance it is large if the peak
-    moves by its width, which happens already with the Schur form of badly scaled states.
+    cancel. The difference of both responses would be less useful: near a sharp resonance that difference is large as
+    soon as the peak moves by its width, and even a Schur form of badly scaled states moves the peak so far.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -250,7 +250,7 @@ def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
 
 
 def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
-    """Return the best of 17 points in each bracket: value, frequency, bracket of its neighbours, and largest peak.
+    """Return the best of 17 points per bracket: value, frequency, bracket of its neighbours, largest possible peak.
 
     Between its three points a parabola rises by at most a quarter of the drop to the lower neighbour. The largest
     possible peak is taken as four times that rise above the value.

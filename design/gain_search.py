@@ -1,11 +1,11 @@
-"""Spring-damper gains for one environment: a local search from several starts, with the condition at frequencies.
+"""Spring-damper gains for one environment, by a local search from several starts.
 
 The set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by sequential
 quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a violation
 are added, until the gains pass the sweep.
 
-The block of a condition is evaluated at G = 0 and G = I, and with its multiplier 0 and 1. It is affine in both, channel
-by channel, so these responses determine all its values and slopes.
+The block of a condition is evaluated at G = 0 and G = I, and with its multiplier 0 and 1. For each channel the block is
+affine in G and affine in the multiplier, so these responses determine all its values and slopes.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ if TYPE_CHECKING:  # slow to load
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
-_STUCK = 1e-3  # violation at the end of a search from which there is no feasible point nearby
-FEW = 12  # largest number of devices for which steps are cheap
-_ROUGH = 0.01  # violation that further steps can remove
+_STUCK = 1e-3  # A search that ends with a larger violation than this has no feasible point nearby.
+FEW = 12  # largest number of channels for which steps are cheap
+_ROUGH = 0.01  # largest violation that further steps can remove
 _DIFFERENCE = 1e-7  # step of finite differences in x
 
 
@@ -116,11 +116,11 @@ class SampledLoop:
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """Return the multiplier in x (active,) and its derivative by the unknowns, (active,) or a symmetric matrix."""
+        """Return the multiplier (active,) at x and its derivative by the unknowns, (active,) or a symmetric matrix."""
         return np.zeros(0), np.zeros(0)
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
-        """Return the limiter's multiplier c in x, or None."""
+        """Return the limiter's multiplier c at x, or None for conditions without a limiter."""
         return None
 
     def add(self, w: float) -> None:
@@ -184,14 +184,14 @@ class SampledLoop:
     def room(self, x: Array) -> Array:
         """Return the least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency; (k,) or (k + 1,).
 
-        With delay in the environment the loop can be unstable although the sampled condition holds, so the distance of
-        its poles from the circle is the last entry.
+        With delay in the environment the loop can be unstable although the sampled condition holds. The last entry is
+        then the distance of its poles from the unit circle.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """Return the gradient of `room`, with differences for the poles."""
+        """Return the gradient of `room`, with finite differences for the poles."""
         around, (_, v), (mu, moves) = self._around(x, "conditions"), self._least(x), self.mu(x)
         m, active = self.loop.channels, self.active
         Gv = np.einsum("kij,kj->ki", around.G, v[:, :m])
@@ -222,7 +222,7 @@ class SampledLoop:
         return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """Return the Hermitian part of the block: first corner (k, m, m), part below, diagonal of the last."""
+        """Return the Hermitian part of the block: upper left (k, m, m), lower left, diagonal of the lower right."""
         G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu
@@ -232,9 +232,9 @@ class SampledLoop:
         return first, below, fixed[:, m + 2 * p :].real
 
     def _least(self, x: Array) -> tuple[Array, Complex]:
-        """Return the least eigenvalue (k,) of the block and its vector v (k, m + active), cached for the last x.
+        """Return the block's least eigenvalue (k,) and its eigenvector v (k, m + active), cached for the last x.
 
-        It uses the Schur complement of the last corner, which is diagonal and positive.
+        They are those of the Schur complement of the lower right part, which is diagonal and positive.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -247,7 +247,7 @@ class SampledLoop:
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
-        """Return the distance of the poles from the circle beyond _CLOSEST_POLE."""
+        """Return the distance of the poles from the unit circle, less _CLOSEST_POLE."""
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
@@ -264,7 +264,10 @@ class SampledLoop:
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """Return each device's first channel, and the mean over its axes (m, m), because its axes share a multiplier."""
+    """Return the first channel of each device, and the matrix (m, m) of the mean over its axes, which share c or alpha.
+
+    The matrix maps one number per channel to the mean over the device of that channel.
+    """
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
 
@@ -358,7 +361,7 @@ class KnownDeviceLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.active.size, np.log(self._first)))
 
     def beta(self, x: Array) -> Array:
-        """Return beta (m,) [s] in x."""
+        """Return beta (m,) [s] at x."""
         return (np.exp(x[2 * self.loop.channels :]) * self.largest)[self.device]
 
     def judged(self, x: Array) -> Requirement:
@@ -393,7 +396,7 @@ class KnownDeviceLoop(SampledLoop):
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """Return the gradient of `room`, with differences for beta and the poles."""
+        """Return the gradient of `room`, with finite differences for beta and the poles."""
         room, v, below = self._complement(x)
         around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
         left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]
@@ -432,8 +435,8 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop, and every start gets its own copy. For more than FEW devices the first optimum is returned
-    (`likeliest_first`), because steps are expensive and the start hardly matters.
+    `sampled` makes the loop, and every start gets a copy. For more than FEW channels the first optimum is returned,
+    because steps are expensive and the start hardly matters; `likeliest_first` sorts the starts.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None
@@ -453,7 +456,7 @@ def least_rms(
 
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
-    """Return the points after a few steps from each start, ordered by mismatch, with infeasible ones last."""
+    """Return the gains after a few steps from each start, sorted by mismatch, with infeasible gains last."""
     points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]).x for start in starts]
     points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
     return [sampled.coupling(x) for x in points]

@@ -31,7 +31,7 @@ class EncoderSteps:
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which are reported only
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None before walls, where nothing is proved
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, where nothing is proved
     covered: bool
     words: str
 
@@ -69,5 +69,5 @@ class EncoderSteps:
 
 
 def held_torques(loop: Loop) -> str | None:
-    """Return the remark that no condition counts torques held by a moving device, or None for devices of one axis."""
+    """Return the remark that conditions ignore the change of pose while torques are held; None without `loop.axes`."""
     return "not charged: forces count as held in space while the pose moves on" if loop.axes else None
