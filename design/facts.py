@@ -366,10 +366,10 @@ _SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's di
 
 
 class Limiter(Fact):
-    """Forces that leave through the limiter of controller.law, with a constant rho > 0 [N/m] per device.
+    """Forces that leave through the limiter of controller.law, which has the lag rho > 0 [N/m] on each device.
 
-    All axes of a device share rho and the multiplier c of each lag, so that the forces may be limited to a ball or a
-    box.
+    The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights, so
+    that the force of a device may be limited to a ball or to a box.
     """
 
     def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
@@ -418,7 +418,7 @@ def compose(
     scaled: bool = False,
     hands: HandsSide | None = None,
 ) -> Demand[Block]:
-    """Return the block of the loop's hands' side with these facts, at these values of their multipliers.
+    """Return the block of the loop's hands' side with these facts, at these multipliers, which are not checked.
 
     Args:
         G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and ways into the walls.
@@ -428,9 +428,6 @@ def compose(
         late: Whether the delays Theta have to be added; False if G contains them.
         scaled: Whether the hands' side's values are s times its multipliers, so that the block is affine in s and them.
         hands: The hands' side; None for `hands_side(loop)`.
-
-    Raises:
-        ValueError: The values are no multipliers.
     """
     values = values or {}
     path: list[Weights] = [(1,)] * loop.channels
@@ -485,8 +482,8 @@ def compose_any(
 ) -> Demand[Block]:
     """Return the block of the loop's hands' side for any passive object behind the coupling V, without delay psi.
 
-    The inputs are those of hands and facts and, last, df_e, the steps of the sent forces. The row of df_e is
-    V(1)/2 - (V - V(1))/(z-1). Raises ValueError for values that are no multipliers.
+    The inputs are those of the hands' side and the facts, followed by df_e, the steps of the sent forces. The row of
+    df_e is V(1)/2 - (V - V(1))/(z-1). The multipliers `values` are not checked.
     """
     values, hands, T = values or {}, hands or hands_side(loop), V.T
     path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))

@@ -2,12 +2,13 @@
 
 this-environment assumes a hand of any stiffness at the motor's shaft. Behind a transmission (a spring of at most k and
 a damper of at least b, in parallel) no hand is stiffer than the transmission, and the mass of the motor keeps its speed
-continuous. With P = k^2/b and any beta > 0 [s] the motor, its transmission and every passive hand behind it satisfy,
-over each period in which the force f is held,
+continuous. Let P = k^2/b, let beta > 0 [s] be any number, and let the force f be held in each period. Then the motor,
+its transmission and every passive hand behind the transmission satisfy
 
     sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
 
-with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx and the speeds v, v+ at both ends.
+with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx in a period, and the speeds v, v+ at its
+ends.
 docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
 design.necessary has a lower bound for all conditions on these devices.
 """
@@ -88,7 +89,7 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """Return the beta (m,) [s] at which c0 or c2 vanishes for devices of damping `share` Delta."""
+    """Return the least beta (m,) [s] at which c0 or c2 is 0, for devices with the damping `share` Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
@@ -104,7 +105,7 @@ _SERIES = 0.03  # Below it the truncated series has the error 2e-14, above it ca
 
 
 def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
-    """Return the least cost of a period for devices of damping `share` Delta, (..., m) in floating point.
+    """Return a lower bound of the cost L of a period for devices with the damping `share` Delta, (..., m), as floats.
 
     For periods in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2). Entries are
     nan if beta is too large for this damping.
@@ -120,16 +121,16 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Full levels. Bounds of mass and transmission are numbers, so that no orthogonal Q_i of a device changes them. In
-# coordinates with a diagonal Delta the theorem holds unchanged, with one beta for all axes of a device.
+# Matrix levels. The bounds of mass and transmission are scalars, so that an orthogonal change of a device's coordinates
+# does not change them. In coordinates with a diagonal Delta the theorem holds, with one beta for all axes of a device.
 
-_SKEW_BITS = 32  # fractional bits of a skew matrix: Q' Delta Q is then diagonal to about 1e-9 of the damping
+_SKEW_BITS = 32  # fractional bits of the skew matrix S; they make Q' Delta Q diagonal to about 1e-9 of the damping
 _JACOBI_SWEEPS = 12  # converges quadratically: 6 axes need about five
-_BELOW = 1e-11  # relative distance of decimals d below the exact diagonal
+_BELOW = 1e-11  # relative distance of d below its exact bound, which covers rounding
 
 
 def straightened(loop: Loop) -> Loop:
-    """Return the loop with the diagonal levels d that `principal_axes` finds; itself if its levels are diagonal."""
+    """Return the loop with the diagonal levels d of `principal_axes`; the loop itself if it has no matrix levels."""
     if loop.levels is None:
         return loop
     parts = [principal_axes(level) for level in loop.levels]
@@ -137,7 +138,7 @@ def straightened(loop: Loop) -> Loop:
 
 
 def _turned(G: Lti, loop: Loop) -> Lti:
-    """Return the map of `Multiplied.map` in the coordinates of `straightened`; further inputs and outputs stay."""
+    """Return the map G in the coordinates of `straightened`; inputs and outputs of walls stay as they are."""
     if loop.levels is None:
         return G
     Q = np.eye(G.inputs, dtype=int).astype(object)
@@ -151,14 +152,14 @@ def _turned(G: Lti, loop: Loop) -> Lti:
 def principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
     """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
 
-    Q is the Cayley transform of a rational skew matrix S, hence exactly orthogonal. The eigenvectors come from Jacobi's
-    rotations. Their additions, products and roots have the same rounding on every machine, so that a proof can be
-    checked on another one. d lies below the diagonal of Q' Delta Q by its Gershgorin radii.
+    Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
+    Jacobi's rotations, because additions, products and roots round alike on every machine, so that a proof can be
+    checked on another machine. d is the diagonal of Q' Delta Q less the Gershgorin radii.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)
     for p, q in [*itertools.combinations(range(n), 2)] * _JACOBI_SWEEPS:
-        if abs(A[p, q]) > 1e-40 * abs(A).max():  # tau would overflow
+        if abs(A[p, q]) > 1e-40 * abs(A).max():  # otherwise tau could overflow
             tau = (A[q, q] - A[p, p]) / (2 * A[p, q])
             t = np.copysign(1.0, tau) / (abs(tau) + np.sqrt(1 + tau * tau))
             c = 1 / np.sqrt(1 + t * t)
@@ -178,13 +179,13 @@ def principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
 
 
 _BITS = 320  # precision of the balls (intervals) that enclose q
-_MOST_ULPS = 8  # largest distance of q from its bounds; rounding the midpoint of a ball needs one
+_MOST_ULPS = 8  # largest distance between q and its bounds, in units in the last place; one is usually enough
 
 
 def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return decimals [s] below q of the shortest period and above q of the longest period, (m,) each.
+    """Return decimals [s] below q(shortest period) and decimals above q(longest period), (m,) each.
 
-    q = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the damping of the loop. Raises NotProved for a beta that is too large.
+    q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the loop's damping. Raises NotProved if beta is too large.
     """
     import flint
 
@@ -197,7 +198,7 @@ def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], t
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the nearest double whose shortest decimal lies beyond the ball."""
+    """Return the first double from the ball's midpoint `towards` an end whose decimal is `beyond` the ball."""
     import flint
 
     value = float(ball.mid())
@@ -209,7 +210,7 @@ def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> fl
 
 
 def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
-    """Raise NotProved unless below < q(T1) and q(T2) < above on every channel, by balls that contain q."""
+    """Raise NotProved unless interval arithmetic shows below < q(T1) and q(T2) < above on every channel."""
     import flint
 
     m = loop.channels
@@ -224,7 +225,7 @@ def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], abo
 
 
 def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
-    """Return q of the shortest and of the longest period as balls, for each channel. Raises NotProved."""
+    """Return (q(shortest period), q(longest period)) as balls for each channel. Raises NotProved for a wrong beta."""
     import flint
 
     exact = loop.period(True)
@@ -274,21 +275,21 @@ def exact_cost(
 # ----------------------------------------------------------------------------------------------------
 # The required damping s Delta: the least s for which some beta and multipliers satisfy the block with the same bounds.
 #
-# L is the least value of an integral that is linear in c0 and c2. Both are concave in (s, beta), so L is concave. The
-# other entries are affine in beta and in the multipliers if switching delays are weighed by 1/alpha. A tangent of a
-# concave block bounds it from above. Tangents at the binding frequencies make a linear matrix inequality, whose least s
-# bounds the required s from below.
+# L is the least value of an integral that is linear in c0 and c2. Since c0 and c2 are concave in (s, beta), so is L.
+# The other entries are affine in beta and in the multipliers if the multiplier of switching delays is taken as 1/alpha.
+# A tangent of a concave block bounds the block from above. The tangents at the binding frequencies form a linear matrix
+# inequality, whose least s bounds the required s from below.
 
-_LARGEST_ETA = 0.9999  # largest share of the largest beta, at which c0 or c2 would be zero
-_LEAST_ETA = 1e-5  # least share, at which this-environment requires the same damping to five digits
-_BISECTIONS = 52  # of an interval of shares, to 2e-16 of its length
-_TOGETHER = 100  # matrices that take hardly longer together than one, so that few frequencies get several halvings
-_WORST, _IN_A_CUT = 6, 28  # frequencies at which the least share is located, and bisections of each
-_VIOLATED = 3  # frequencies of a round at which tangents are added
+_LARGEST_ETA = 0.9999  # largest beta that is tried, relative to `largest_beta`, where c0 or c2 is 0
+_LEAST_ETA = 1e-5  # least such ratio, at which this-environment requires the same damping to five digits
+_BISECTIONS = 52  # bisections of an interval of shares, down to 2e-16 of its length
+_TOGETHER = 100  # So many matrices take hardly longer than one, so a step may try several shares per frequency.
+_WORST, _IN_A_CUT = 6, 28  # frequencies at which a cut locates the least share, and number of bisections there
+_VIOLATED = 3  # number of frequencies at which a round adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
 _GAP = 3e-6  # relative gap between the best share and the bound at which the search ends
-_WEIGHTS = 1e4  # largest factor or divisor of 1/alpha against its unit
-_DIGITS = 7  # digits of beta and multipliers, which the exact proof uses as they are printed
+_WEIGHTS = 1e4  # 1/alpha is searched from 1/_WEIGHTS to _WEIGHTS of its unit
+_DIGITS = 7  # digits of beta and multipliers; the exact proof uses these rounded values
 
 
 class Best(NamedTuple):
@@ -302,7 +303,9 @@ class Best(NamedTuple):
 
 
 class Sweep:
-    """The block of Theorem B in the environments of a loop, without L, which contains the share of the damping.
+    """The block of Theorem B in the environments of a loop, for sweeps over frequency.
+
+    The block without L is independent of the share of the damping; L is added for each share.
 
     Args:
         loop: The loop.
@@ -327,7 +330,7 @@ class Sweep:
         self.moves = [np.arange(m), 2 * m + np.arange(m)] if limited else [np.arange(m)]
 
     def idle(self, environment: int, beta: Any, values: Sequence[float] | None = None) -> Demand[Lti]:
-        """Return the demand without L."""
+        """Return the demand without L, at beta (m,) [s] and the multipliers `values`."""
         named = named_parts(self.unknowns, self.usual if values is None else values)
         return self.form(self.maps[environment], named, KnownMotor(PeriodCost(*np.zeros((4, len(beta)))), beta))
 
@@ -381,9 +384,10 @@ class Sweep:
 
 
 class _Search:
-    """The search for beta and multipliers: x = (beta [s], multipliers in their units, or 1/alpha in its, share).
+    """The search for beta and multipliers.
 
-    All axes of a device have one beta, so that its bounds may be those of matrices.
+    The unknowns are x = (beta [s] per device, multipliers in their units, share of the damping). The multiplier alpha
+    of switching delays is replaced by 1/alpha. All axes of a device have one beta, as matrix levels require.
     """
 
     def __init__(self, sweep: Sweep, high: float) -> None:
@@ -448,7 +452,7 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n) as a concave function of x, with inputs w scaled by 1/alpha over that in `at`."""
+        """Return the block (k, n, n), concave in x because inputs w are scaled by 1/alpha relative to that in `at`."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:
@@ -473,9 +477,9 @@ class _Search:
         return root * constant, root * slopes
 
     def least(self, x: Array, most: float) -> tuple[float, tuple[int, int] | None]:
-        """Return the least share below `most` at beta and multipliers of x (inf if none), and its binding place.
+        """Return the least share below `most` at beta and multipliers of x, and where it binds.
 
-        The place is (environment, index of the frequency), or None.
+        The share is inf if there is none below `most`. The place is (environment, index of the frequency), or None.
         """
         beta, share, binding = self.beta(x), self.sweep.floor(self.beta(x)), None
         for e, (z, parts) in enumerate(self.sampled):
@@ -538,7 +542,7 @@ class _Search:
         return best._replace(bound=min(bound, best.share)) if best.beta else best._replace(share=np.inf)
 
     def swept(self, x: Array) -> Best:
-        """Return the share of beta and multipliers of x, rounded, by a refined sweep."""
+        """Return the share at beta and multipliers of x after their rounding, by a refined sweep."""
         beta = tuple(float(f"{b:.{_DIGITS}g}") for b in self.beta(x))
         values = tuple(float(f"{v:.{_DIGITS}g}") for v in self.values(x))
         return Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
@@ -550,7 +554,7 @@ class _Search:
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
 
     def cut(self, x: Array, binding: tuple[int, int] | None = None) -> None:
-        """Add tangents at x, at the `binding` place or at the frequencies of least room."""
+        """Add tangents at x for the place `binding`, or for the frequencies of least room if it is None."""
         places = [binding] if binding else self.lowest(x)
         for e, at in places:
             z, parts = self.sampled[e]
@@ -566,7 +570,7 @@ class _Search:
         return [(e, int(at)) for _, e, at in sorted(minima)[:_VIOLATED]]
 
     def solved(self, least: float) -> Array:
-        """Return the x of least share under the tangents. Raises DesignFailed."""
+        """Return the x of least share that satisfies all tangents. Raises DesignFailed if the solver finds none."""
         sweep, m = self.sweep, self.m
         weights = np.where(self.inverse, 1 / least, 1.0)
         unit = np.concatenate([self.largest(least), weights, [least]])
@@ -590,12 +594,12 @@ class _Search:
 
 
 _ETAS = (0.03, 0.3, 0.1, 0.9)  # shares of the largest beta for the first tangents; the search begins at the second
-_SLACK = 0.002  # least eigenvalue of a tangent, with entries of about one, from which it is dropped
-_BETWEEN = 1e-4  # relative excess of the share between the sampled frequencies at which a frequency is added
+_SLACK = 0.002  # A tangent with a larger least eigenvalue (its entries are about one) is dropped.
+_BETWEEN = 1e-4  # A frequency is added if the share exceeds that at the sampled frequencies by more, relatively.
 
 
 def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
-    """Return the entries 11, 21 (twice the Hermitian one) and 22 of L on (dx, v) at z (k,), shapes (k, m)."""
+    """Return the entries 11, 22 and twice the entry 21 of the form L on (dx, v) at z (k,), in the order 11, 21, 22."""
     turn, cosine = 1 + 1 / z[:, None], z.real[:, None]
     return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
 
@@ -615,7 +619,7 @@ def with_cost(idle: Complex, z: Complex, cost: PeriodCost, moves: Sequence[NDArr
 
 
 def positive(H: Complex) -> NDArray[np.bool_]:
-    """Return whether Hermitian matrices (..., n, n) are positive, by their pivots."""
+    """Return whether Hermitian matrices (..., n, n) are positive definite, from the signs of their pivots."""
     H, holds = H.copy(), np.ones(H.shape[:-2], dtype=bool)
     for i in range(H.shape[-1]):
         pivot = H[..., i, i].real
@@ -639,13 +643,14 @@ _MOST_SHARE = 1e3  # largest share of the damping to which a beta on file is swe
 class KnownDevice(Condition):
     """Stability in the environment of the loop for every passive hand, on devices within their guaranteed bounds.
 
-    The multiplier has beta, a lower and an upper bound of q, one number each per channel, and then the multipliers of
-    the facts. The first three are 0 if the condition without these bounds, `plain`, requires less damping.
+    The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number each per channel, and of
+    the facts' multipliers. The first three are 0 if the condition `plain`, which ignores the device bounds, requires
+    less damping.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
     covers = ("psi", "T_max", "varying_delay", "walls", "ranges")
-    plain: Multiplied = THIS_ENVIRONMENT  # the limit for beta -> 0, with the same facts
+    plain: Multiplied = THIS_ENVIRONMENT  # the condition with the same facts for beta -> 0
 
     def beyond(self, loop: Loop) -> str | None:
         if not loop.known_devices:
@@ -682,7 +687,7 @@ class KnownDevice(Condition):
         )
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block at the loop's own damping; it does not scale with s."""
+        """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m, straight = loop.channels, straightened(loop)
@@ -767,10 +772,10 @@ class KnownDevice(Condition):
         return sweep.response(0, beta, tuple(values[3 * m :]), max(_MOST_SHARE, 2 * sweep.floor(beta)))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the required share of the damping for a stack of couplings, (n,), to three hundredths, on a grid.
+        """Return the required share of the damping (n,) for a stack of couplings, to three hundredths, on a grid.
 
-        Shares between _LEAST_DRAWN and that of the plain condition are tried with the betas of _DRAWN, the same part of
-        the largest beta on every channel. The grid is coarse because a map needs thousands of couplings.
+        Shares between _LEAST_DRAWN and that of the plain condition are tried with beta = _DRAWN times the largest beta
+        of each channel. The grid is coarse because a map needs thousands of couplings.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):
@@ -785,7 +790,7 @@ class KnownDevice(Condition):
         return np.minimum(np.where(enough, high, plain), plain)
 
     def _drawn(self, loop: Loop, coupling: Coupling, n: int) -> Callable[[Array], NDArray[np.bool_]]:
-        """Return the function from shares (n,) to whether a beta of _DRAWN serves each coupling, (n,)."""
+        """Return the function: shares (n,) -> whether some beta of _DRAWN satisfies the block of each coupling (n,)."""
         half, m = _DRAWN_POINTS // 2, loop.channels
         w = np.sort(np.concatenate([np.geomspace(1e-3, np.pi, half), np.linspace(0.011, np.pi, half)]))
         z, none = on_circle(w), PeriodCost(*np.zeros((4, m)))
@@ -830,7 +835,7 @@ class KnownDevice(Condition):
 
 
 class LimitedKnownDevice(KnownDevice):
-    """known-device also while forces are limited, by the limiter of `limiter` (design.environments.LimitedForces)."""
+    """The condition known-device for forces that a limiter limits (design.environments.LimitedForces)."""
 
     name, covers = "limiter", KnownDevice.covers
 
@@ -875,7 +880,7 @@ class _KnownDeviceAny(KnownDevice):
 _LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of shares of the damping in a map
 _DRAWN_STEPS = 10  # halvings of the logarithm of this range, to 0.6 %
 _DRAWN = np.concatenate([np.geomspace(0.003, 0.5, 18), [0.62, 0.74, 0.85, 0.93, 0.98, 0.9995]])
-_DRAWN_POINTS = 240  # even frequencies, and even in their logarithm
+_DRAWN_POINTS = 240  # number of frequencies, half of them evenly and half logarithmically spaced
 
 
 def described(loop: Loop) -> str:

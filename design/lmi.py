@@ -1,4 +1,4 @@
-"""The paper's matrix inequalities, one function per equation, with a remedy where the printed strict form is empty.
+"""The paper's matrix inequalities, one function per equation, with remedies for two that no matrix can satisfy.
 
 Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every function returns a symmetric matrix that must
 be positive (semi)definite; its arguments are numbers or cvxpy expressions.
@@ -93,8 +93,8 @@ Complex = NDArray[np.complex128]
 class Shaping:
     """L (22) of a loop, evaluated fast for many couplings.
 
-    W1 weighs L from the left and the diagonal W2 from the right; the defaults are the identity and `_low_pass`. Raises
-    ValueError for weights that do not fit, and for an environment that is active.
+    L is multiplied by W1 from the left and by the diagonal W2 from the right. The defaults are the identity and
+    `_low_pass`. Raises ValueError for weights that do not fit, and for an active environment.
     """
 
     def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
@@ -184,7 +184,7 @@ def reachability_scaled(G: Lti) -> Array:
         warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
         try:
             W = scipy.linalg.solve_discrete_lyapunov(A, W)
-        except scipy.linalg.LinAlgWarning:  # a stiff block: the sum of A^k B B' A'^k, by doubling
+        except scipy.linalg.LinAlgWarning:  # for a stiff block: sum A^k B B' A'^k by doubling the number of terms
             while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
@@ -201,10 +201,10 @@ def _root(A: Array, B: Array) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A gain at sampled frequencies, affine in real variables, with cutting planes.
+# A bound on a gain that is affine in real variables, at sampled frequencies, with cutting planes.
 #
-# A problem over all frequencies has infinitely many constraints, of which few bind. It is solved at some frequencies,
-# the result is checked by a refined sweep, and the worst frequency is added.
+# A problem over all frequencies has infinitely many constraints, of which few bind. The problem is solved at some
+# frequencies, a refined sweep checks the result, and the worst frequency is added.
 
 
 def gain_block(
@@ -235,7 +235,7 @@ _ROOM = 1e-6
 
 
 def least_phi(loop: Loop) -> Array | None:
-    """Return `least_multiplier`, verified at every frequency, or None for psi = 0, which needs none."""
+    """Return Phi (N,) of `least_multiplier`, verified at every frequency, or None for psi = 0, which needs no Phi."""
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
@@ -244,17 +244,17 @@ def least_phi(loop: Loop) -> Array | None:
     return phi
 
 
-_MOST_STATES = 30  # states of E-hat up to which the least trace is computed: 42 take ten seconds, 400 20 GB
+_MOST_STATES = 30  # The least trace is computed up to so many states of E-hat: 42 take ten seconds, 400 take 20 GB.
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return a diagonal Phi (N,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, with least trace for few states.
+    """Return a diagonal Phi < Delta_D (N,) [N s/m] with E-hat + Phi passive; with few states, that of least trace.
 
     Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
-    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # of unit diagonal
+    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # has a unit diagonal
     least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
     each, root = least, np.linalg.inv(np.linalg.cholesky(level))
     if loop.levels:
@@ -264,7 +264,7 @@ def least_multiplier(loop: Loop) -> Array:
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
         return max(each, 0.0) * delta
-    # Phi is at most halfway to Delta_D: the least trace alone may touch Delta_D.
+    # Phi is bounded halfway between its least value and Delta_D, because the least trace alone could reach Delta_D.
     return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
 
 
@@ -293,10 +293,10 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
 
 
 class _AnyEnvironment(Multiplied):
-    """Theorem 4 of the paper: stability in every passive environment; for psi >= 1 in the loop's environment only.
+    """Theorem 4 of the paper: stability in every passive environment, or for psi >= 1 in the loop's environment only.
 
-    For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only;
-    latency and switching delays use the block of design.facts.compose_any.
+    For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only.
+    A latency and switching delays use the block of design.facts.compose_any.
     """
 
     name, source, separable = "any-environment", "the paper's Theorem 4", True
@@ -367,7 +367,7 @@ class _AnyEnvironment(Multiplied):
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
 
         def demand(V: Sampled) -> Demand[Sampled]:
-            """Return the block, with the default multipliers of a latency in a range and of switching delays."""
+            """Return the block, with default multipliers for a latency that varies and for switching delays."""
             if _in_frame(loop):
                 return self.block(V, loop, self.usual(None, loop))
             return conditions.any_environment_demand(V, loop, multiplier)
@@ -409,7 +409,7 @@ class _AnyEnvironment(Multiplied):
             spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
             mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
             alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
-            closed = self.required_of(V, loop, alpha)  # A search finds no room near the stiffest coupling.
+            closed = self.required_of(V, loop, alpha)  # The search may miss this alpha near the stiffest coupling.
             return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
         demand = self.block(V, loop)
         if not V.is_stable():
@@ -454,7 +454,8 @@ ANY_ENVIRONMENT = _AnyEnvironment()
 def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
     """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling for any environment.
 
-    It minimises the mean of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha) with the mean window vt (docs/theory.md).
+    This alpha minimises the mean over frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), where vt is the mean
+    window and h = (hi - lo)/2 (docs/theory.md).
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)
@@ -491,7 +492,7 @@ class Ports(NamedTuple):
 
 
 def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
-    """Return the negative of (2), x'Px - x+'Px+ + supply as a quadratic form of (x, u); both this and P must be > 0."""
+    """Return the matrix of x'Px - x+'Px+ + supply in (x, u), the negative of (2); this matrix and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
     state = P - A.T @ P @ A - C1.T @ Delta @ C1
@@ -502,7 +503,7 @@ def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
 def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
     """Return [[Y, R'], [R, S]] of (3), which is affine in A, B, C, D, so that these may be unknowns.
 
-    With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is Lemma 1 (Sigma None: Delta = 0).
+    With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is equivalent to Lemma 1. Sigma = None means Delta = 0.
     """
     A, B, C2, D2, C1, D1 = G
     n = Q.shape[0]
@@ -519,7 +520,7 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
 
 
 def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
-    """Return the matrix of Lemma 3 and (24): with X = U^-1 it is positive iff ||G||_inf < mu; mu2 = mu^2 is scalar."""
+    """Return the matrix of Lemma 3 and (24). With X = U^-1 the matrix is positive iff ||G||_inf < mu; mu2 = mu^2."""
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
         [X, np.zeros((n, m)), A.T, C.T],

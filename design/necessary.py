@@ -2,11 +2,11 @@
 
 Let a linear motor (mass m, damping delta) stand before a spring k and a damper b. As the passive hand varies, the
 sampled response to a held force fills a disk, because the hand's response at each alias w_n = (w + 2 pi n)/T is
-arbitrary. The loop is stable for every passive hand if no response in the disk makes it singular, and if it is stable
-with the far end of the transmission held. With one channel, or channels with equal devices, some lossless hand attains
-every point of the disk. The considered device has the least mass and damping, the stiffest spring and the least damper.
-Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the
-proof.
+arbitrary. The loop is stable for every passive hand if no response in the disk makes the loop singular, and if the loop
+is stable with the far end of the transmission held. With one channel, or channels with equal devices, every point of
+the disk is attained by some lossless hand. The device considered is that of least mass, least damping, stiffest spring
+and least damper within the bounds. Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one
+channel. docs/theory.md has the proof.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: flo
 
     sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n), S2 = sum g_n conj(a_n)/(w_n^2 c_n), a_n = delta + j m w_n,
     g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. Both are rational in W = w_n^2 with the denominator
-    b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2, and sums of partial fractions are cotangents.
+    b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2. The sums of their partial fractions are cotangents.
     """
     high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
     root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))
     W1, W2 = (-middle - root) / (2 * high), (-middle + root) / (2 * high)
-    W2 = np.where(np.abs(W2) < np.abs(W1), low / (high * W1), W2)  # without cancellation
+    W2 = np.where(np.abs(W2) < np.abs(W1), low / (high * W1), W2)  # This form of the smaller root avoids cancellation.
 
     def sums(W: Any) -> tuple[Any, Any]:
         """Return the sums of 1/(w_n^2 - W) and of w_n/(w_n^2 - W)."""
@@ -103,7 +103,7 @@ def necessary_share(F: Lti, loop: Loop) -> _Necessary:
 
 @dataclass(frozen=True)
 class LeftOver:
-    """The necessary damping of Theorem A beside the proved one; the difference is the possible gain of better proofs.
+    """The damping that Theorem A requires and the proved one; better proofs can gain at most the difference.
 
     Attributes:
         required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less.
@@ -138,7 +138,8 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
         return None
     equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
     if walls and not equal:
-        return None  # Walls give a lower bound, and unlike devices a sufficient figure; together they give neither.
+        # With walls the share is only necessary, with unequal devices only sufficient; with both it is neither.
+        return None
     try:
         maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]
     except SingularLoop:

@@ -47,7 +47,7 @@ _LOADED: dict[Path, ModuleType] = {}
 
 
 def _loaded(option: str, text: str, file: Path) -> ModuleType:
-    """Run the file once, as the module of its name, so that worker processes find its classes."""
+    """Import the file once, as a module with the file's name, so that worker processes find its classes."""
     if file in _LOADED:
         return _LOADED[file]
     other = sys.modules.get(file.stem)
@@ -80,7 +80,11 @@ def reach(folder: str) -> None:
 
 
 def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:
-    """Call a user's own class or function. Raises InputError, beginning with `what`, if it refuses the arguments."""
+    """Call a user's own class or function.
+
+    Raises InputError, beginning with `what`, for an error that the user's code did not raise itself (such as wrong
+    arguments).
+    """
     try:
         return make(*args, **options)
     except Exception as error:
@@ -91,7 +95,7 @@ def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) ->
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Return whether our validation raised the error, so that a traceback adds nothing."""
+    """Return whether a `raise` of this package raised the error; a traceback is then of no use."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return last.filename.startswith(_OURS) and (last.line or "").startswith("raise ")
 
@@ -99,7 +103,7 @@ def is_refusal(error: BaseException) -> bool:
 def place_of(error: BaseException) -> str | None:
     """Return the innermost line of the user's own code in the traceback, as `FILE, line N`, or None.
 
-    User's own code is every file that belongs neither to this package nor to the Python installation.
+    A file is the user's own code if it belongs neither to this package nor to the Python installation.
     """
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_OTHERS)]
     return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else None

@@ -26,14 +26,14 @@ KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-d
 PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDITIONS)
 
 
-#: the environments of this-environment in a loop with walls
+#: the environments for which this-environment holds in a loop with walls, in words
 MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
 
-#: Share of the available damping that no verdict uses. Figures of a sweep differ by up to 1e-10 between kernels of
-#: linear algebra, and by up to 2e-8 with a solver's multiplier: within the band the answer is "not certified".
+#: Share of the available damping that must be left over. Figures of a sweep differ by up to 1e-10 between
+#: linear-algebra kernels, and by up to 2e-8 with a solver's multiplier.
 GUARD = 1e-7
 
 
@@ -60,7 +60,7 @@ class Requirement(Generic[C]):
         multiplier: The multiplier of the figure, for a condition with multipliers.
         bound: Lower bound of the ratio over all multipliers, at the frequencies of the search.
         guarantee: The environments for which the condition holds, in words.
-        lag: (m,) rho [N/m] of a limiter that the condition covers without further proof.
+        lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
     """
 
     condition: C

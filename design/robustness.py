@@ -27,22 +27,22 @@ class Robustness:
     """The worst requirement of a coupling in environments whose parameters differ by `percent`."""
 
     percent: float
-    required_over_available: float  # damping, in the worst environment
+    required_over_available: float  # required over available damping in the worst environment
     where: str  # the parameter that differs in the worst environment, with its sign
     certified: bool  # whether the condition holds in the worst environment
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A design that is safe at all `vertices`, too. The search has a small budget, so its price is an upper bound."""
+    """Figures of a coupling that is safe at all `vertices`. The budget is small, so the price is an upper bound."""
 
     mismatch_db: float  # in the nominal environment
-    price_db: float  # mismatch less that of the nominal design
+    price_db: float  # mismatch minus the mismatch of the nominal design
     g: float  # rendered share of the stiffness
     worst: float  # largest required over available damping at the vertices
     states: int  # of the loop
     environments: int  # number of vertices, including the nominal environment
-    proved: int  # environments with an exact proof; the others, beyond the budget for proofs, are swept
+    proved: int  # number of environments with an exact proof; the budget allows only sweeps for the others
     reason: str | None = None  # why the next environment is not proved
 
 
@@ -117,9 +117,9 @@ def robustness(
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """Return the worst requirement within ten percent, or None.
+    """Return the worst requirement within ten percent.
 
-    None is for walls, for environments given by a block, and for amounts within ten percent of the largest allowed.
+    Returns None for walls, for environments given by a block, and if a stiffness or mass plus ten percent is too large.
     """
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None

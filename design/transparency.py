@@ -20,7 +20,7 @@ _ROUNDING = 1e-10  # relative to the environment; responses that differ by less 
 
 @dataclass(frozen=True)
 class Transparency:
-    """Figures of the mismatch M = F - Lambda E; ratios, not decibels: 1 (0 dB) is as wrong as feeling nothing.
+    """Figures of the mismatch M = F - Lambda E, as ratios. A mismatch of 1 (0 dB) is that of F = 0, no force at all.
 
     Attributes:
         tau: Ratio (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1].
@@ -45,7 +45,7 @@ class Transparency:
 
     @property
     def mismatch_db(self) -> float:
-        """`relative_mismatch` in decibels; 0 dB is as wrong as feeling nothing."""
+        """`relative_mismatch` in decibels; 0 dB is the mismatch without any force."""
         return decibels(self.relative_mismatch)
 
     @property
@@ -84,7 +84,7 @@ def silent(E: Lti) -> bool:
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """Compute the figures of the force map F against Lambda E. Raises ValueError where E is zero."""
+    """Compute the figures of the force map F against Lambda E. Raises ValueError if E is zero."""
     if silent(environment):
         raise ValueError(NO_FORCE)
     target = delay(lam, F.T) @ environment
@@ -115,7 +115,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     peak, _ = supremum(lambda w: sizes(w)[0], grid)
     least, _ = supremum(lambda w: -sizes(w)[2], grid)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
-    rounding = 1e-9 * float(np.abs(environment.D).max())  # a zero stiffness is the difference of larger numbers
+    rounding = 1e-9 * float(np.abs(environment.D).max())  # A zero stiffness is computed as a difference.
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     worst = supremum(relative, grid)[0]
     if worst < _ROUNDING:

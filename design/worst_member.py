@@ -1,9 +1,9 @@
 """Search the ranges of an environment for the member in which a coupling needs the most damping.
 
 The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
-stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or
-a face, which points drawn evenly from the ranges never hit. So the search tries, for every set of contacts that may be
-present, all edges, the faces and the inside. A compass search then continues from the worst points.
+stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or a
+face, which uniformly drawn points never hit. For every set of contacts that may be present, the search therefore tries
+points on all edges, on faces and inside. A compass search then continues from the worst points.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
 
 _SEED = 0xFACE
-_MANY = 7  # with more parameters, vertices and edges are drawn at random, too
-_APART, _SAME = 0.2, 0.05  # least distance between starts of the compass search, between maxima
+_MANY = 7  # With more parameters than this, points at vertices and on edges are drawn at random.
+_APART, _SAME = 0.2, 0.05  # least distances between two starts of the compass search and between two maxima
 _FIRST, _LAST = 1 / 16, 1 / 128  # first and last step of the compass search, in widths of the ranges
 
 SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
@@ -46,8 +46,8 @@ class Searched:
     """The local maxima that a search found, the worst first."""
 
     worst: tuple[_Worst, ...]
-    tried: int  # number of members
-    ended: bool = False  # True: the budget of work ended the search early
+    tried: int  # number of members tried
+    ended: bool = False  # whether the budget of work or the user's time limit ended the search early
 
 
 def search(
@@ -59,8 +59,8 @@ def search(
 ) -> Searched:
     """Find the members of these regions at which `ratio` is largest.
 
-    The search ends early when it has done `work` units of counted work, or when `over` returns True because the time
-    that a user allowed is over. It then returns the worst of the members that it has tried.
+    The search ends early when it has done `work` units of counted work, or when `over` returns True because the user's
+    time limit has passed. The result then contains only maxima of the members tried so far.
     """
     ended, until = False, spent_after(work)
     points = [list(_points(region)) for region in regions]
@@ -118,7 +118,7 @@ def _points(region: Region) -> Iterator[Array]:
                 yield np.insert(np.array(others), i, x)
     if n == 1:
         return
-    for _ in range(budgets.RANGE_DRAWN):  # each coordinate is an end of its range with probability 1/2
+    for _ in range(budgets.RANGE_DRAWN):  # With probability 1/2 a coordinate is an end of its range.
         between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
         yield np.where(coin, between, end)
 
@@ -133,8 +133,8 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
-    """Climb along the axes of the unit cube, and halve the step where no neighbour is larger."""
-    step = 1.0 if point.size > _MANY else _FIRST  # with many parameters not all vertices were tried before
+    """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
+    step = 1.0 if point.size > _MANY else _FIRST  # With many parameters not all vertices were tried before.
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]
@@ -155,7 +155,7 @@ def search_ranges(
 ) -> Searched:
     """Find the members of the loop's ranges in which the coupling needs the most damping.
 
-    `ratio` returns required over available damping in the loop of a member; None for this-environment without facts.
+    `ratio` returns required over available damping in the loop of a member. None stands for that of this-environment.
     """
     assert loop.ranges
     parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
