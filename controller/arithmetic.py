@@ -80,7 +80,8 @@ def within(
 ) -> Iterator[None]:
     """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
 
-    More work raises TooLong, and so does work after `clock` returns True: the time limit of a user is over then.
+    Work beyond this limit raises TooLong. So does any work after `clock` returns True, because the user's time limit is
+    over.
     """
     before = _counter.most, _counter.message, _counter.over
     if units < math.inf and spent_after(units) < _counter.most:
@@ -155,7 +156,7 @@ def numbers(values: ArrayLike, T: Number) -> Any:
 
 
 def fractions(value: Any) -> Any:
-    """Copy an array as Fractions."""
+    """Return a read-only array of Fractions; `value` itself if it is one."""
     array = np.asarray(value, dtype=object)
     known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
     if known and all(type(v) is Fraction for v in value.ravel()):

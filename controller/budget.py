@@ -23,12 +23,13 @@ it, and a tick without a report counts with its largest loss.
 
 *Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. After summation by parts sum a'de is at most
 q/2 for every newton by which the acting force changes, and |dx| is at least the measured one less q. So a tick with the
-measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel. Its largest loss is
-r(a) + 2 q |a|, and the argument above holds with these two. A constant force costs nothing if the encoder dithers.
+measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel. The largest loss of the
+tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss. A constant force costs nothing if
+the encoder dithers.
 
-Not covered are devices whose damping is less than delta, and hands that are not passive. Periods that vary are covered
-with T as the largest one. docs/energy-budget.md has the proofs, and conditions under which the budget never acts. The
-arrays are (m, nsim): channels and simulations.
+The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
+that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
+acts. The arrays are (m, nsim): channels and simulations.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ class Packets:
     """Range of the ages of the forces that a tick uses, (m,) each [samples]."""
 
     lo: ArrayLike
-    hi: ArrayLike | None = None  # default: always lo
+    hi: ArrayLike | None = None  # None: hi = lo
     hold: int = 0  # further ticks for which a device holds a force whose successors are lost
 
 

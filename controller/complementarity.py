@@ -160,7 +160,7 @@ class BoxProblem(_Problem):
         return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
     def _listed(self, q: Array) -> tuple[Array, Array]:
-        """Return (v, f) of the active set with the largest slack, since only the solution's is nonnegative."""
+        """Return (v, f) of the active set with the largest slack; only the slack of the solution is nonnegative."""
         signs, by_q, by_one, room, room_one = self._candidates
         n, k = q.shape
         best = (room @ q + room_one).reshape(len(signs), 2 * n, k).min(axis=1).argmax(axis=0)
@@ -170,7 +170,7 @@ class BoxProblem(_Problem):
         return v, np.minimum(np.maximum(f, self.lower[:, None]), self.upper[:, None])
 
     def _pivoted(self, q: Array) -> Array:
-        """Solve for v by principal pivoting: change all wrong signs at once, or only the first one if that cycles.
+        """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
 
         Changing only the first wrong sign ends for every P-matrix M. Index n changes only if all others are right for
         its present sign. By uniqueness index n then has each of its three signs at most once. Between two changes of
@@ -227,9 +227,9 @@ class BallProblem(_Problem):
 
     The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
     diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in
-    u = f + v tau, which starts from the radial scaling of q. If it fails, a single vector is found by bisection, and
-    several vectors by an iteration of Douglas and Rachford. If these leave more than `_RESIDUAL`, f is set to 0, and
-    the failure is counted.
+    u = f + v tau, which starts from the radial scaling of q. If this iteration fails, a block of one vector is solved
+    by bisection, and a block of several vectors by the Douglas-Rachford iteration. If the residual is still too large,
+    f is set to 0, and the failure is counted.
 
     Raises:
         SingularLoop: A block's symmetric part has a negative eigenvalue.
@@ -237,7 +237,7 @@ class BallProblem(_Problem):
 
     limit: Array  # (n,) the same for all entries of a vector; inf without a limit
     balls: tuple[int, ...]  # sizes of the vectors
-    unsolved: list[int] = field(default_factory=lambda: [0])  # how often no force was found
+    unsolved: list[int] = field(default_factory=lambda: [0])  # number of failures
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "M", frozen(self.M, 2))

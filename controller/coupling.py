@@ -32,9 +32,9 @@ class Coupling:
     A subclass defines `compliance` and `form`. It overrides `around` if it is not a V in negative feedback.
     """
 
-    kind: ClassVar[str] = "own"  # its name in reports
-    holds_model: ClassVar[bool] = False  # whether it contains a linear model of the environment, which excludes walls
-    one_period: ClassVar[bool] = False  # whether its coefficients are valid only for the T of its design
+    kind: ClassVar[str] = "own"  # name of the class in reports
+    holds_model: ClassVar[bool] = False  # whether couplings contain a linear environment model, which excludes walls
+    one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
         """Return (I + Psi E V)^-1 Psi E for `environment` = Psi E. The last `further` ports (walls) have no coupling.
@@ -68,7 +68,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return the V that results if the internal model stays `model`; None for a coupling without a model."""
+        """Return the V that is equivalent if the internal model is `model`; None for a coupling without a model."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -122,11 +122,11 @@ class NoCoupling(Coupling):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SpringDamper(ReadOnly, Coupling):
-    """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26). Leading axes hold many couplings.
+    """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26). Leading axes of K and B hold many couplings.
 
-    The damper may act on a filtered velocity: backward Euler of B s/(tau s + 1), which is a damper in series with a
-    spring of stiffness B/tau and therefore passive. Then 1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with
-    beta = tau/(tau + T).
+    The damper may act on a filtered velocity. It is then the backward Euler discretisation of B s/(tau s + 1), which is
+    a damper in series with a spring of stiffness B/tau and therefore passive. In this case
+    1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with beta = tau/(tau + T).
     """
 
     K: Array  # (..., m) [N/m]
@@ -353,7 +353,7 @@ class Compliance(Coupling):
 
 
 def _decimals(M: Array, digits: int) -> Array:
-    """Return M rounded to a decimal place, its largest entry to this many digits."""
+    """Return M, all entries rounded to the decimal place that leaves `digits` digits of the largest entry."""
     return np.round(M, digits - 1 - int(np.floor(np.log10(np.abs(M).max(initial=1e-300)))))
 
 

@@ -182,8 +182,8 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def draw(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None = None) -> Ticks:
         """Draw the delays (ticks, m) of the packets of one run, in samples or LOST.
 
-        `given` are the delays (rows, m), repeated, for the patterns that depend on the loop: theta for constant, and
-        the worst sequence of a search for adversarial. Raises ValueError if these patterns lack them.
+        The patterns "constant" and "adversarial" depend on the loop and repeat the delays `given` (rows, m): theta for
+        "constant", and the worst sequence of a search for "adversarial". Raises ValueError if they lack `given`.
         """
         delays = self._delays(rng, ticks, given)
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
@@ -219,7 +219,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 # Times of ticks and forces that are not multiples of T. Tick k measures x[k] at its beginning and lasts T_k. The force
 # f_i[k], which is computed from x[k], acts from the time tau_i[k] after this beginning. Until then f_i[k-1] acts.
 
-_PERIODS, _LATENCIES = 9, 3  # number of evenly spaced values of a range that are drawn, so that few maps are needed
+_PERIODS, _LATENCIES = 9, 3  # numbers of different values that are drawn from a range, so that few maps are needed
 
 
 class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -311,7 +311,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """Return a timing of `ticks` ticks; None if all are even and forces latch at their beginning.
+    """Return a timing of `ticks` ticks; None if every period is T and forces latch at the beginning of their tick.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -45,7 +45,7 @@ _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice ch
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the direction with length 1. Raises ValueError where all its entries are zero."""
+    """Return the direction scaled to length 1. Raises ValueError if all entries are about 0 or one is 1e9 or more."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
         raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9 that are not all 0")
     length = float(np.linalg.norm(direction))
@@ -455,7 +455,7 @@ class Network(
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
-        """Return the lengths that a part acts on, one or one for each coordinate, as nodes with coefficients."""
+        """Return the lengths that a part acts on, as (node, coefficient) pairs: one, or one for each coordinate."""
         direction = part.along if isinstance(part, Spring) else part.normal
         ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
         count = len(ends[0][0]) if ends else 0
@@ -666,7 +666,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """Return the network with touching walls, by default all, as two-sided springs, and without the other walls."""
+    """Return the network with two-sided springs in place of the touching walls (by default all), and no other wall."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping, along=w.normal) for w, on in walls)

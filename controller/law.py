@@ -46,8 +46,8 @@ State = tuple[bool, ...]  # which walls touch
 class Law(ReadOnly):
     """The map of a tick from positions to forces: the linear block of a loop, and walls that push.
 
-    `sent` is the block from [x; p] to [f_e; y] before Theta. The walls compute p from y. The state holds that of the
-    block with its delays, then h [m], the depth in each wall at the previous tick.
+    `sent` is the block from [x; p] to [f_e; y] before Theta. The walls compute p from y. The state consists of the
+    state of the block with its delays, and of h [m], the depth in each wall at the previous tick.
     Raises SingularLoop if the walls' forces are not unique.
     """
 
@@ -109,7 +109,7 @@ class Law(ReadOnly):
 
     @cached_property
     def _block(self) -> Lti:
-        """The block [x; p] -> [f; y], including the unknowns of a tick."""
+        """The block [x; p] -> [f; y]. The inputs p are the unknowns of a tick."""
         return self._delayed(self.sent)
 
     @cached_property
@@ -225,7 +225,7 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
 # The limiter acts before Theta, so that delayed forces are limited forces. While no force reaches its limit, e = 0.
-# With the forces without slip, f_free, and the feedthrough D_G the limiter solves
+# Let f_free be the forces without slip, and D_G the feedthrough of G. The limiter solves
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
@@ -241,8 +241,8 @@ def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
 class Limiter(Law):
     """A law whose forces f_e are limited by a slip e before Theta.
 
-    The state holds that of `sent`, e [m] at the previous tick, the delay lines of Theta, and h [m] of the walls.
-    Raises SingularLoop if the limited forces are not unique.
+    The state consists of the state of `sent`, e [m] at the previous tick, the delay lines of Theta, and h [m] of the
+    walls. Raises SingularLoop if the limited forces are not unique.
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector

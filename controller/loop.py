@@ -85,7 +85,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and largest latency of forces after kT
     T_min: _Positive | None = None  # [s] shortest period, for the known-device condition
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
-    axes: tuple[int, ...] | None = None  # number of channels of each device; None: one
+    axes: tuple[int, ...] | None = None  # number of channels of each device; None: one each
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
     unit: PositionUnit = "m"  # of positions; "rad": N m, N m s/rad and kg m2 stand for N, N s/m and kg
 
@@ -325,7 +325,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.varying_delay or DelayRange(self.theta, self.theta)
 
 
-#: The key and the value of the last G over Fractions, which a proof reads three times and which takes most of its work
+#: The key and the value of the last G over Fractions. A proof reads G three times, and computing G is most of its work.
 _exactly: list[Any] = [(None,) * 4, None]
 
 

@@ -94,8 +94,8 @@ def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
 def _norms(G: Lti) -> list[tuple[Array, Array]]:
     """Return pairs L, L^-1 (n, n) of coordinates L^-1 x of the states in which the resolvent's norm is computed.
 
-    Every L gives a valid bound, and the best one is used. L is I, and a root of the states' covariance under noise,
-    in whose coordinates the norm is often smaller.
+    Every L gives a valid bound, and the best bound is used. The first L is I. The second L is a root of the states'
+    covariance under noise; in its coordinates the norm is often smaller.
     """
     import scipy.linalg  # slow to load
 

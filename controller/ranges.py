@@ -61,7 +61,7 @@ class Region:
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
-    at: Callable[[str, Array], Member]  # a name, and a point between low and high
+    at: Callable[[str, Array], Member]  # (name, point between low and high) -> the member at this point
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
@@ -84,9 +84,9 @@ def number_of_vertices(network: Network, ranges: Ranges) -> int:
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     """Return the corner of every part: all combinations, or 128 that contain every combination of any three ends.
 
-    The 128 combinations are the words of a linear code. Each bit of a corner's number is the parity of the word's
-    number and the mask of this bit. All masks have the highest bit, so that no sum of two is a third one. Any three
-    masks are therefore independent.
+    The 128 combinations are the words of a linear code. Each bit of a corner's number is the parity of the bitwise AND
+    of the word's number and a mask. All masks have the highest bit, so that the sum of two masks is never a mask. Any
+    three masks are therefore independent.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -113,9 +113,10 @@ def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
 
 
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
-    """Draw `count` environments uniformly from the ranges; a contact that may be absent is so with probability 1/2.
+    """Draw `count` environments uniformly from the ranges.
 
-    A larger count adds environments to the same first ones.
+    A contact that may be absent is absent with probability 1/2. A larger count adds environments to the same first
+    ones.
     """
     parts, rng = _parts(network, ranges), np.random.default_rng(seed)
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
@@ -135,7 +136,7 @@ class _Part:
 
     place: str  # a spring's ends, or a node
     corners: tuple[Spring | float, ...]
-    own: Spring | float  # the part of the environment
+    own: Spring | float  # the part as it is in the environment
     draw: Callable[[np.random.Generator], Spring | float]
     states: tuple[_State, ...]  # present, and absent if it may be
 

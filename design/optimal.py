@@ -40,11 +40,12 @@ _SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
 _FEWEST_TAPS = {True: 22, False: 14}  # taps from which a small gain ends the search; the key is `_Search.simply`
-_KEPT_STIFFNESS = 0.5  # A solution is rejected below this share of the largest static stiffness of earlier best ones.
-_FELT_STIFFNESS = 0.02  # Below this share of the environment's stiffness only `_Search.merit` decides.
+_KEPT_STIFFNESS = 0.5  # A solution is rejected if it renders less than this share of an earlier best one's stiffness.
+_FELT_STIFFNESS = 0.02  # No such floor applies below this share of the environment's static stiffness.
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # Starting (beta, c) of a limiter; only the first if psi = 0.
 _HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
-_TOLERATED = 0.02  # An environment enters the program if it exceeds the damping by more; scaling covers less.
+# An environment enters the program if it needs more than 1 + _TOLERATED times the damping; scaling covers less.
+_TOLERATED = 0.02
 _SEARCHED = 0.2  # least share of --seconds for the search between the vertices of ranges
 
 
@@ -119,8 +120,8 @@ def design(
 
     With ranges around the environment, this-environment holds at every vertex and at every point that the search
     between the vertices visits. With a range of delays, any switching within the range is safe.
-    If no optimal coupling can be proved or its mismatch is large, the environment scaled down and the best
-    spring-damper are candidates, too. The function returns the best of them.
+    If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
+    environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
     Raises ValueError for a loop with walls, and for an environment that is unsafe with any damping because it is not
     passive.
@@ -177,8 +178,8 @@ def design(
     return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
 
 
-_ETAS = 0.15, 0.3, 0.5  # of the largest beta; the mismatch is flat around its minimum, the same share on every channel
-_SCALINGS = 6  # Each takes MARGIN off the forces.
+_ETAS = 0.15, 0.3, 0.5  # tried shares of the largest beta, equal on all channels; the mismatch hardly depends on them
+_SCALINGS = 6  # most scalings of the forces; each reduces them by at least MARGIN
 
 
 def _for_known_devices(
@@ -186,9 +187,10 @@ def _for_known_devices(
 ) -> Optimal:
     """Return the best coupling under known-device, or under this-environment if that is better.
 
-    The block is affine in the forces for fixed beta and multipliers of facts. The filter over the smallest basis is
-    solved for three values of beta; larger bases take the best one, the vertex of a parabola, and the multipliers of
-    the last filter. The beta of the last filter's least requirement would leave the filter where it is.
+    For fixed beta and fixed multipliers of the facts the block is affine in the forces. The filter over the smallest
+    basis is designed for three values of beta. For larger bases beta is the minimum of a parabola through their merits,
+    and the multipliers are those of the last accepted filter. The beta with which that filter requires the least
+    damping would be no better, because the program would return the same filter.
 
     Raises ValueError as `design`, and for a loop that known-device does not cover.
     """
@@ -244,7 +246,7 @@ class _Search:
     bare: float  # largest share of the damping that an environment needs without a coupling
     started: float  # clock time [s] of the start, for the report and for --seconds
     spent: int  # counted work at the start
-    condition: Condition = THIS_ENVIRONMENT  # that judges and proves couplings
+    condition: Condition = THIS_ENVIRONMENT  # the condition that judges and proves couplings
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options) -> _Search:
@@ -522,18 +524,18 @@ class _Search:
         return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
 
     def proved_elsewhere(self, plain: Optimal) -> Optimal:
-        """Return `plain` under the search's own condition where it is proved there."""
+        """Return `plain` with a proof of the search's condition, or `plain` as it is if this proof fails."""
         candidate = self._proved(self._assessed(plain.coupling, plain.g), None)
         return candidate if candidate.proved else plain
 
     def multipliers(self, coupling: Coupling) -> tuple[float, ...]:
-        """Return the multipliers of facts with which known-device asks least of a coupling, or the usual ones."""
+        """Return the facts' multipliers with which known-device requires the least damping, or the default ones."""
         found = self.known.required(self.loop, coupling).multiplier
         usual = [value for each in self.known.unknowns(self.loop) for value in each.start or each.units]
         return tuple(found[3 * self.loop.channels :] if found else usual)
 
     def over_known(self, eta: float, multipliers: Sequence[float], error: float, taps: int, poles: int) -> Optimal:
-        """Return the optimum over a basis for beta, a share `eta` of the largest one, and multipliers of the facts."""
+        """Return the optimum over a basis for beta = `eta` times the largest beta and these facts' multipliers."""
         loop, (case, *_) = self.loop, self.cases
         largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # Axes of a device have one beta.
         beta = np.array(loop.per_channel((eta * largest).tolist()))
@@ -570,7 +572,8 @@ class _Search:
     def _assessed(self, coupling: Coupling, g: float, multiplier: Sequence[float] | None = None) -> Optimal:
         """Return the coupling with its figures and its swept requirement, without a proof.
 
-        known-device sweeps with beta, no bounds of q and multipliers in `multiplier`, or searches them.
+        For known-device `multiplier` has beta, zeros for the bounds of q, and the facts' multipliers. With None they
+        are searched.
         """
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)

@@ -44,10 +44,10 @@ _EDGED_OF_MANY = 6  # least number of taps for these sections with more than two
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; they are small because the error may jump at the end
 # Up to FULL channels every force has a filter to every device. With further constraints the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
-_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than _RICH channels
+_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the relative mismatch, up to _RICH channels and above
 HIGH_HZ = 100.0  # Above this frequency a soft row or a cap keeps the force low.
 SOFT = 0.05, 0.3  # The soft row's weight is SOFT[0] min(mismatch so far, SOFT[1]).
-_EVEN = 0.002  # weight of the error relative to the force of each motion, which may be small
+_EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
 _LEAST_FORCE = 0.01  # floor of this force, as a share of the largest force
 _SMALL = 1e-5  # weight of the coefficients; some have no other effect if the environment has no inverse
 _DECIMALS = 10
@@ -262,9 +262,10 @@ class Span:
 def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int = FULL) -> Span:
     """Return a basis of taps, real poles, and the modes of E and of its inverse.
 
-    The real poles are evenly spaced in the logarithm of the time constant. All poles are decimals. Large bases for at
-    most _RICH channels also have slower poles, and sections at the band's end. With more than `full` channels every
-    device has a filter of its own force and one of the sum of all forces, and only the latter has the fast modes.
+    The real poles are evenly spaced in the logarithm of the time constant. All poles are rounded to decimals. Large
+    bases for at most _RICH channels also have slower poles, and sections at the band's end. With more than `full`
+    channels every device has a filter of its own force and a filter of the sum of all forces. Only the latter has the
+    fast modes.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])

@@ -61,9 +61,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
 # block of `any_environment_demand` is k/2 + b, that of the damping is |Theta-hat W|^2, and the row of a multiplier is
 # 2 (1 - Theta-hat W). By a Schur complement this is affine in (k, b), without conservatism.
 #
-# `lemma1` makes it one matrix inequality whose unknowns are half of its entries. With more than _MOST_STORED unknowns
-# the inequality is imposed at frequencies, in (k, b) alone, and again where the solution violates it. Both ways end at
-# the same gains.
+# `lemma1` turns this condition into one matrix inequality, whose unknowns are half of its entries. With more than
+# _MOST_STORED unknowns the condition in (k, b) alone is imposed at sampled frequencies, and frequencies at which the
+# solution violates the condition are added. Both methods give the same gains.
 
 
 _MOST_STORED = 180  # largest number of unknowns besides the gains, of all channels
@@ -76,10 +76,10 @@ class _Channel:
     """The gains (k, b) of one device, in units of its usable damping."""
 
     theta: int
-    shortage: float  # phi of its multiplier, 0 if psi = 0
+    shortage: float  # the channel's phi over its usable damping; 0 if psi = 0
 
     def rows(self, gains: Array) -> Lti:
-        """Return c with k/2 + b >= |c|^2 on |z| = 1; its C and D are affine in the gains, its A and B are fixed."""
+        """Return the block c of the condition k/2 + b >= |c|^2 on |z| = 1; only its C and D depend on the gains."""
         k, b = gains
         late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
         window = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
@@ -212,7 +212,7 @@ def design(
     Args:
         loop: The devices, their delays and the environment.
         condition: The name of a condition.
-        starts: Gains at which a search starts. They need not be feasible, and there are default ones.
+        starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
         switching: The least and largest delays (lo, hi) [samples] of the forces, if the delays switch.
         limiter: Whether the proof covers limited forces too; that of any-environment always does.
         band_hz: The band of the rms mismatch [Hz].
@@ -237,9 +237,9 @@ def design(
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-_DIGITS = 5  # digits of the gains of many devices, finer than RESERVE: with all digits exact proofs take minutes
+_DIGITS = 5  # digits of the gains of more than FEW channels, finer than RESERVE; with all digits proofs take minutes
 _SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
-_MOST_ANY, _MOST_LIMITED = 48, 32  # largest number of devices whose search ends within half a minute
+_MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a search ends within half a minute
 
 
 def _require_few(loop: Loop, most: int, what: str) -> None:
@@ -304,7 +304,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
-    """Return gains of many devices with few digits, so that a proof stays short."""
+    """Return the coupling, with _DIGITS digits of the gains for more than FEW channels, so that a proof stays short."""
     if coupling.K.size <= FEW:
         return coupling
     K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
@@ -404,9 +404,9 @@ def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Arr
 def _stiffest_known(loop: Loop) -> Design:
     """Return the stiffest spring-damper that known-device-any certifies; the objective is the sum of K [N/m].
 
-    He[V/(1-z)] > chi is Re W > chi |W|^2 |1 - 1/z|^2/T with W = K/D + B and Re W = K T/2 + B: a convex set of (K, B)
-    for each beta, on which the largest K for a given B is the least root of a quadratic over frequency. B and beta are
-    searched.
+    Let D = (1 - 1/z)/T and W = K/D + B, so that V = 1/(D W) and Re W = K T/2 + B. Then He[V/(1-z)] > chi is
+    Re W > chi |W|^2 |1 - 1/z|^2/T, a convex set of (K, B) for each beta. For a given B the largest K is the least upper
+    root of a quadratic over all frequencies. B and beta are searched.
     """
     if reason := KNOWN_DEVICE_ANY.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
@@ -424,9 +424,9 @@ def _stiffest_known(loop: Loop) -> Design:
 
 
 def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
-    """Return K [N/m] and B [N s/m] of each axis of a device, stiffest before any environment, with a design's reserve.
+    """Return K [N/m] and B [N s/m] of each axis of a device, of largest sum of K for any environment.
 
-    All axes have one beta.
+    The share _STIFF_RESERVE of the damping stays unused. All axes have one beta.
     """
     from scipy.optimize import minimize_scalar  # slow to load
 
@@ -479,11 +479,11 @@ _SLACK = 2e-4  # constant above chi, relative to the largest chi; truncation may
 
 
 def _stiffest_linear(loop: Loop) -> Design:
-    """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum in N/m.
+    """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum of 1/V_i(1) [N/m].
 
-    V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has He[V/(1-z)] = chi, with the Fourier coefficients chi_k of chi and
-    V(1) = 2 chi_0; no linear coupling is stiffer, since V(1)/2 is the mean of He[V/(1-z)]. The series ends where the
-    rest is below half of the added constant.
+    With the Fourier coefficients chi_k of chi and V(1) = 2 chi_0, V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has
+    He[V/(1-z)] = chi. No linear coupling is stiffer, because V(1)/2 is the mean of He[V/(1-z)]. A small constant is
+    added, and the series is cut off where the omitted terms sum to less than half of this constant.
     """
     from scipy.optimize import minimize_scalar  # slow to load
 
@@ -503,7 +503,7 @@ def _stiffest_linear(loop: Loop) -> Design:
         each += _limits(axes, float(optimum.x), z, RESERVE)
     for limits in each:
         series = np.fft.rfft(limits).real / _TAPS
-        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # sums of the terms from each one on
+        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # bound of each term and all later ones
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
         coefficients = series[1:count]
         weights = -2 * np.diff(np.append(coefficients, 0.0), prepend=0.0)
@@ -519,7 +519,7 @@ def _stiffest_linear(loop: Loop) -> Design:
     return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", stiffness, requirement, 0, wall_s)
 
 
-_TAP_DIGITS = 12  # digits of a coefficient; their error is far below the slack
+_TAP_DIGITS = 12  # digits of a coefficient; the rounding error is far below _SLACK
 _STIFF_RESERVE = 1e-3  # unused share of the damping, for rounded gains and frequencies between the imposed ones
 _STIFF_DIGITS = 6
 
@@ -539,11 +539,11 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-_SPARE_OF_SLOW_WORLDS = 0.25  # then ringing decays by a factor of 0.5 (theta = 1) or 0.55 (theta = 2) from tick to tick
+_SPARE_OF_SLOW_WORLDS = 0.25  # With this e ringing decays per tick by a factor of 0.5 (theta = 1) or 0.55 (theta = 2).
 
 
 def _spare(loop: Loop) -> float:
-    """Return e of `moving_average`: a rounding reserve, or more where the world stands still between its steps."""
+    """Return e of `moving_average`: a rounding reserve, or more if the world stands still between its steps."""
     world = loop.environment.world
     return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
 
@@ -551,10 +551,10 @@ def _spare(loop: Loop) -> float:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
-    V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. With the constant
-    e n^2 T/(2 delta) added, n = theta + 1, it requires delta/(1 + e) where the sum is largest, and less elsewhere. The
-    zeros of the sum lie on the unit circle, so without e the force against an object at rest rings without decay. A
-    world that steps at every n-th tick is at rest in between, so e is larger for it.
+    V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. Let n = theta + 1. With the
+    constant e n^2 T/(2 delta) added, V requires delta/(1 + e) where the sum is largest, and less elsewhere. The zeros
+    of the sum lie on the unit circle, so without e the force against an object at rest rings without decay. A world
+    that does not step at every tick is at rest between its steps, so e is larger for such a world.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -683,7 +683,7 @@ def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> Array:
     """Return the gains of the set nearest to `start`, or the stiffest ones of the set."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
-    if start is not None:  # minimise t with |gains - wanted| <= t
+    if start is not None:  # minimise t with |gains - target| <= t
         target = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
         cost = np.append(np.zeros(2 * N), 1.0)
 
