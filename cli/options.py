@@ -144,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         own = "your own environment in place of the scenario's: a Network, or a class with contacts and E(T) or parts()"
         loop.add_argument("--environment", metavar="FILE.py:NAME", help=own)
         for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
-            what = f"{what} delay per channel [samples]; one is for all"
+            what = f"{what} delay of each device [samples]; one is for all"
             loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
         damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
