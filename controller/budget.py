@@ -3,9 +3,9 @@
     EnergyBudget        before the delays, at the port of the devices
     Shell               at the port of the environment, behind a coupling that is certified for any environment
 
-*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where a[k] is
-the force that acts in [kT, (k+1)T) (the device feels -a) and dx[k] = x[k+1] - x[k]. With delta' = (1 - eps) delta
-the budget computes
+*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0. Here a[k] is
+the force that acts in [kT, (k+1)T), of which the device feels -a[k], and dx[k] = x[k+1] - x[k]. With
+delta' = (1 - eps) delta the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
@@ -21,8 +21,8 @@ device must set its force to zero. The largest loss of tick t is the largest r o
 R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
 it, and a tick without a report counts with its largest loss.
 
-*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. After summation by parts sum a'de is at most
-q/2 for every newton by which the acting force changes, and |dx| is at least the measured one less q. So a tick with the
+*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. By summation by parts, sum a'de is at most q/2
+times the total change of the acting force. |dx| is at least the measured |dx| minus q. So a tick with the
 measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel. The largest loss of the
 tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss. A constant force costs nothing if
 the encoder dithers.

@@ -77,7 +77,7 @@ class Complementarity(_Problem):
 
 @dataclass(frozen=True, eq=False)
 class BoxProblem(_Problem):
-    """f = q - M v with lower <= f <= upper, v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
+    """f = q - M v with lower <= f <= upper; v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
 
     If M is a P-matrix, there is exactly one solution for every q. Active sets on which M is singular, as for an
     environment without a connection to ground, are skipped. f is still unique then.

@@ -54,7 +54,7 @@ class Coupling:
         return environment.feedback(as_like(environment, V))
 
     def compliance(self, T: Number) -> Lti | None:
-        """Return V(z) in the arithmetic of T, or None if the coupling is no V in feedback."""
+        """Return V(z) in the arithmetic of T, or None if the coupling is not a V in feedback around Psi E."""
         return Lti.diag(*channels) if (channels := self.channels(T)) else None
 
     def channels(self, T: Number) -> list[Lti] | None:

@@ -1,8 +1,8 @@
 """Virtual environments: spring-damper-mass networks, discretised by backward Euler.
 
 Nodes are contacts (whose displacements the devices impose), internal nodes (free) and the ground.
-With Z(s) = M s^2 + D s + K the dynamic stiffness of the network, the map from contact displacements
-to the forces that the devices feel (with a minus sign) is Z_cc - Z_ci Z_ii^-1 Z_ic, at s = (z-1)/(Tz).
+The dynamic stiffness of the network is Z(s) = M s^2 + D s + K, at s = (z-1)/(Tz). The map from contact displacements
+to forces is E = Z_cc - Z_ci Z_ii^-1 Z_ic; the devices feel these forces with a minus sign.
 """
 
 from __future__ import annotations
@@ -520,8 +520,8 @@ class Networks(Environment):
 def environment(network: Network, T: Number) -> Lti:
     """Return E(z) from contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz), without walls.
 
-    Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
-    for v at every tick. The states are q- and v- of the internal nodes, and past values for the contact dampers and
+    Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v. Every tick solves
+    this equation for v. The states are q- and v- of the internal nodes, and past values for the contact dampers and
     masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor connections.
     """
     adrift = _adrift(network, network.springs)
@@ -591,7 +591,7 @@ _SLACK = 1e-9  # smaller stiffnesses, relative to the largest one, come from the
 
 
 def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
-    """Raise ValueError if springs hold a body in some directions only, and these are no coordinate directions."""
+    """Raise ValueError if springs leave a body free in a direction that is not a coordinate direction."""
     adrift = _adrift(network, network.springs)
     loose = {i for group in adrift for i in group}
     held = [i for i in range(len(names)) if i not in loose]

@@ -52,7 +52,7 @@ class Law(ReadOnly):
     """
 
     sent: Lti  # m + w inputs and outputs
-    theta: tuple[int, ...] = ()  # (m,) delays of the forces [samples]; () is no delay
+    theta: tuple[int, ...] = ()  # (m,) delays of the forces [samples]; () means no delay
     walls: tuple[Wall, ...] = ()
 
     def __post_init__(self) -> None:

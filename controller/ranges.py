@@ -204,7 +204,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
 
 
 def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
-    """Return the state of a present spring; a range of width 0 is no coordinate."""
+    """Return the state of a present spring. A range of width 0 does not become a coordinate of the region."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:

@@ -281,8 +281,8 @@ class Fact(ABC):
 class Walls(Fact):
     """Walls that make and break contact. The law of each wall at every tick has the multipliers a, c, d, m.
 
-    The inputs of a wall are u, the step of the depth h, and, if the wall has a damper, s >= 0, which is positive only
-    when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
+    An input of every wall is u, the step of the depth h. A wall with a damper has one more input, s >= 0, which is
+    positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
     """
 
     def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:

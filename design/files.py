@@ -1,8 +1,8 @@
 """Reading files of limited size, writing files atomically, and text for messages.
 
 Folders that the user names (--out DIR) and default folders (out/..) are created. The folder of a file that the user
-names (--json, --video, --out FILE) must exist, so that a typing error creates none. Within `one_command` a file is
-either read or written, and written for one option only; the second use is refused.
+names (--json, --video, --out FILE) must exist, so that a typing error creates no folder. Within `one_command` a file
+may be either read or written, and written for one option only; any other use is refused.
 """
 
 from __future__ import annotations

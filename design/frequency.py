@@ -157,7 +157,7 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     """Return sorted frequencies [rad/sample] in [low, high]: evenly spaced in w and in log w, dense around poles.
 
     A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. A repeated pole
-    counts once, because two points that differ by rounding only could hide the peak beside them.
+    counts once, because two points that differ by rounding only would make the bracket of a peak there too narrow.
     """
     even = np.linspace(low, high, points)
     logarithmic = np.geomspace(low, high, points)
@@ -173,11 +173,13 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
     """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
-    A tick in double precision is a tick of a system whose coefficients have relative errors of (2n + 8) u (n states, u
-    the unit), plus their differences to a system `meant` with the same states. With R = (zI - A)^-1 the errors dA, dB,
-    dC, dD change the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|, which is large if big terms
-    cancel. The difference of both responses would be less useful: near a sharp resonance that difference is large as
-    soon as the peak moves by its width, and even a Schur form of badly scaled states moves the peak so far.
+    A tick in double precision is an exact tick of a system with slightly different coefficients. Their relative errors
+    are at most (2n + 8) u for n states and the unit u. The differences between G and a system `meant` with the same
+    states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
+    |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
+
+    The difference of both responses would be less useful. Near a sharp resonance that difference is large as soon as
+    the peak moves by its width. Even a Schur form of badly scaled states moves the peak so far.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (

@@ -1,9 +1,9 @@
 """Conditions for devices with a known motor mass and a known lossy transmission (Theorem B).
 
-this-environment assumes a hand of any stiffness at the motor's shaft. Behind a transmission (a spring of at most k and
-a damper of at least b, in parallel) no hand is stiffer than the transmission, and the mass of the motor keeps its speed
-continuous. Let P = k^2/b, let beta > 0 [s] be any number, and let the force f be held in each period. Then the motor,
-its transmission and every passive hand behind the transmission satisfy
+this-environment assumes a hand of any stiffness at the motor's shaft. The devices here have a transmission, a spring of
+at most k and a damper of at least b in parallel. No hand behind it is stiffer than the transmission, and the mass of
+the motor keeps its speed continuous. Let P = k^2/b, let beta > 0 [s] be any number, and let the force f be held in each
+period. Then the motor, its transmission and every passive hand behind the transmission satisfy
 
     sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
 
@@ -712,7 +712,7 @@ class KnownDevice(Condition):
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the requirement with the best beta and multipliers, or with `multiplier`.
 
-        One beta and one set of multipliers serve all members of ranges.
+        All members of ranges have the same beta and the same multipliers.
         """
         if reason := self.beyond(loop) or self.without(coupling):
             return refusal(self.name, loop.delta, reason)

@@ -1,12 +1,12 @@
 """The necessary damping of devices with known motor and transmission (Theorem A), by a sweep.
 
-Let a linear motor (mass m, damping delta) stand before a spring k and a damper b. As the passive hand varies, the
-sampled response to a held force fills a disk, because the hand's response at each alias w_n = (w + 2 pi n)/T is
-arbitrary. The loop is stable for every passive hand if no response in the disk makes the loop singular, and if the loop
-is stable with the far end of the transmission held. With one channel, or channels with equal devices, every point of
-the disk is attained by some lossless hand. The device considered is that of least mass, least damping, stiffest spring
-and least damper within the bounds. Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one
-channel. docs/theory.md has the proof.
+A linear motor (mass m, damping delta) is connected to the hand by a transmission, a spring k and a damper b in
+parallel. The response of a passive hand at each alias w_n = (w + 2 pi n)/T is arbitrary. Therefore the sampled
+responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
+conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
+held. With one channel, or channels with equal devices, every point of the disk is attained by some lossless hand. The
+device considered is that of least mass, least damping, stiffest spring and least damper within the bounds. Compare
+Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the proof.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from haptic_loop.design.result import Requirement
 def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
     """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m].
 
-    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n), S2 = sum g_n conj(a_n)/(w_n^2 c_n), a_n = delta + j m w_n,
-    g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. Both are rational in W = w_n^2 with the denominator
-    b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2. The sums of their partial fractions are cotangents.
+    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n). Here
+    a_n = delta + j m w_n, g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. The terms are rational in
+    W = w_n^2 with the denominator b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2. The sums of their partial
+    fractions are cotangents.
     """
     high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
     root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))

@@ -76,7 +76,7 @@ class Optimal(Design):
     """Best proved coupling, with the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
-    g: float = field(kw_only=True)  # F(1) = g E(1); for a coupling that is no force filter the ratio of the norms
+    g: float = field(kw_only=True)  # F(1) = g E(1); the ratio of the norms if the coupling is not a force filter
     states: int = field(kw_only=True)  # order of the loop
     certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
     bases: tuple[_BasisResult, ...] = field(kw_only=True, default=())

@@ -27,7 +27,7 @@ def named(option: str, text: str) -> Any:
     sys.path, for modules in the same folder and for worker processes.
 
     Raises:
-        InputError: `text` names no file or no object in it, or the file is no valid Python.
+        InputError: The file or the object in it does not exist, or the file is not valid Python.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)

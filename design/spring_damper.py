@@ -57,9 +57,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
-# A channel has V = 1/W with W = k + b (1 - 1/z). After multiplication by W and its conjugate, the part of V in the
-# block of `any_environment_demand` is k/2 + b, that of the damping is |Theta-hat W|^2, and the row of a multiplier is
-# 2 (1 - Theta-hat W). By a Schur complement this is affine in (k, b), without conservatism.
+# A channel has V = 1/W with W = k + b (1 - 1/z). The block of `any_environment_demand` is multiplied by W and its
+# conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat W|^2, and the row of a multiplier is
+# 2 (1 - Theta-hat W). By a Schur complement the condition is affine in (k, b), without conservatism.
 #
 # `lemma1` turns this condition into one matrix inequality, whose unknowns are half of its entries. With more than
 # _MOST_STORED unknowns the condition in (k, b) alone is imposed at sampled frequencies, and frequencies at which the
@@ -161,8 +161,8 @@ class GainSet:
 # ----------------------------------------------------------------------------------------------------
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
 #
-# With g = k + b (1 - 1/z) per channel the norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1: L g
-# is affine in the gains, and g* g is replaced by its tangent at the previous gains, which lies below it. So no step
+# Let g = k + b (1 - 1/z) per channel. The norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
+# L g is affine in the gains. g* g is replaced by its tangent at the previous gains, which lies below g* g. So no step
 # increases the norm, and mu^2 enters linearly, without bisection.
 
 
