@@ -1,1 +1,1 @@
-"""The closed loop: scenarios, engines, runs, and what a run is worth."""
+"""The closed loop: scenarios, engines, runs, and the verdicts and errors of runs."""

@@ -44,7 +44,7 @@ class HeldDevices:
     T: float  # [s]
     #: (index of each human, humans, plant, positions of motors and handles in the plant's state)
     groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
-    late: tuple[float, ...] | None = None  # (m,) [s] from the tick to the latch of the forces; None if they coincide
+    late: tuple[float, ...] | None = None  # (m,) [s] from the tick to the latch of the forces; None: latch at ticks
 
     @classmethod
     def drawn(
@@ -83,9 +83,10 @@ class HeldDevices:
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Return two growth rates (n,) [1/s] for every human: of the dominant mode, and of that above a frequency.
+        """Return the growth (n,) [1/s] of the dominant mode with every human, and of the dominant mode that is fast.
 
-        Humans for which `humans` (n,) is false are skipped; their growth is -inf.
+        A fast mode has at least `min_frequency_hz`. Humans for which `humans` (n,) is false are skipped; their growth
+        is -inf.
         """
         n = len(self)
         everything, turning = np.full((2, n), -np.inf)
@@ -101,7 +102,7 @@ class HeldDevices:
     def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:
         """Return the dominant mode above a frequency with one human, as a state [s; z].
 
-        It is scaled so that the motor or handle that moves most moves by 1 m.
+        The mode is scaled so that the motor or handle with the largest motion moves by 1 m.
         """
         (_, _, plants, seen), i = self._place(human)
         values, vectors = np.linalg.eig(close(HeldPlant(plants.A[i], plants.B[i], plants.C, plants.T), F).A)
@@ -133,17 +134,18 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The human that is nearest to
-# oscillating, by the exact linear loop, holds the devices. The loop starts on that mode, so far out that Coulomb
-# friction does not hold it. The hand presses with a constant force, which grows smoothly. The end of the trace decides.
+# Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
+# whose exact linear loop is nearest to oscillating. The loop starts in the mode of that human, with an amplitude at
+# which Coulomb friction does not hold it. The hand presses with a force that starts smoothly and then stays constant.
+# The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
 _START = 1e-3  # [m] displacement of the motor or handle that moves most, at the start
-_BLOCK = 64  # ticks between two looks at the keyboard
-DECIDED = 0.2  # [1/s] a linear growth nearer to zero does not show within a trace
+_BLOCK = 64  # ticks in one block
+DECIDED = 0.2  # [1/s] a linear growth rate nearer to zero cannot be seen within a trace
 UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear growth is nearer to zero than DECIDED
 
 
@@ -175,7 +177,7 @@ class Points:
     oscillates: NDArray[np.bool_]  # to the end of the trace
     amplitude: Array  # [m] of the oscillation; inf: diverged
     frequency_hz: Array  # [Hz] of the oscillation; nan: diverged
-    growth: Array  # [1/s] of the exact loop's dominant mode, swinging or running away
+    growth: Array  # [1/s] of the exact loop's dominant mode among those that oscillate visibly or run away
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
@@ -244,7 +246,7 @@ def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan)
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)
-        runs_away = fastest > plan.runaway_growth  # even without an oscillation
+        runs_away = fastest > plan.runaway_growth  # The mode may diverge without an oscillation.
         shown = np.where(runs_away, fastest, swinging)
         human = int(np.argmax(shown))
         mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)

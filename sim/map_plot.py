@@ -37,7 +37,7 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     """Plot stiffness over damping: cells for the population, lines for certificates' edges, symbols for MuJoCo."""
     figure = Figure((8, 5.6), layout="constrained")
-    axes = figure.subplots()  # areas in place of a grid
+    axes = figure.subplots()  # There are no grid lines, since areas show the cells.
     about_environment = report.fixed is not None
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
@@ -77,7 +77,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
-        # On the edge the required damping is the available one; far from the edge values are only kept finite.
+        # On the edge the required damping equals the available one; `clip` keeps values far from the edge finite.
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:

@@ -42,14 +42,14 @@ class EnergyNet:
 
     start: float  # W0 [J]
     cap: float = np.inf  # largest stored energy [J]
-    guarantee: str | None = None  # what an assessment of this run guarantees
+    guarantee: str | None = None  # the guarantee of this run, in words
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a fresh budget for `nsim` runs. Raises InputError for impossible numbers."""
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
-        packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # a longer tick may lose more
+        packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # least dissipation delta |dx|^2 / T
         settings: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         try:
             budget = EnergyBudget(
@@ -71,7 +71,7 @@ class Plugged:
 
     force: Callable[[Array], Array]  # positions that the port would have without a force, (m,) [m] -> force (m,) [N]
     start: float = 0.0  # W0 [J]
-    guarantee: str | None = None  # what an assessment of this run guarantees, or why it guarantees nothing
+    guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a fresh shell for `nsim` runs. Raises ValueError for a loop in which no shell is known."""
@@ -189,7 +189,7 @@ def _answer(forces: Any, channels: int) -> Array:
 
 
 class _Shelled(_InLoop):
-    """An environment of the user's own, its force within the actuators' limits, and the shell."""
+    """A user's own environment behind a shell, with forces within the actuators' limits."""
 
     def __init__(self, shell: Shell, plugged: Plugged, process: Process) -> None:
         super().__init__(process)

@@ -26,7 +26,7 @@ from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
 
-Row = Comparison = Any  # sim.accuracy.Row and sim.compare_report.Comparison, whose imports would be a circle
+Row = Comparison = Any  # sim.accuracy.Row and sim.compare_report.Comparison, which would be circular imports
 
 
 class Run(Protocol):
@@ -41,13 +41,13 @@ class Run(Protocol):
     @property
     def x_handle(self) -> Array: ...  # (N, m) [m]
     @property
-    def names(self) -> tuple[str, ...]: ...  # (m,) of the channels, or none
+    def names(self) -> tuple[str, ...]: ...  # (m,) names of the channels, or () if they have numbers
 
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
 
-#: titles of pictures for the conditions for every device; other conditions are titled by their names
+#: titles of the conditions that apply to every device; other conditions have their names as titles
 TITLES = {"this-environment": "this environment", "any-environment": ANY}
 #: Okabe and Ito's palette, with a line style each
 STYLES: tuple[dict[str, Any], ...] = (
@@ -115,7 +115,7 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
 
 
 _PAGE = 7.16  # [inch] both columns of an IEEE page, and nearly those of other two-column papers
-_LEGEND = 0.8  # columns of a legend in a paper, relative to the screen and to the figure's width
+_LEGEND = 0.8  # columns of a legend in a paper, as a share of its entries if the figure does not shrink
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a figure of a paper
 
 
@@ -159,7 +159,7 @@ def _plain_numbers(axes: Any) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Runs, as in Figures 5 and 6.
 
-_SAME = 1e-6  # [%] bound of the rounding between two equal forces
+_SAME = 1e-6  # [%] smaller force errors are rounding: the two forces are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,8 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The zoom shows six periods of this frequency. It is left out if forces turn as sharply everywhere.
+        frequency_hz: The zoom shows six periods of this frequency. There is no zoom if forces turn as sharply in the
+            rest of the run.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -392,7 +393,10 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Return six periods in which the forces of the first `ticks` turn most sharply; more if they turn less often."""
+    """Return the six periods of the first `ticks` in which the forces turn most sharply.
+
+    The part is longer if no force has six turning points in six periods.
+    """
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
     width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
@@ -414,7 +418,7 @@ def _turns(f: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One of several runs with the same hands."""
+    """The picture of one of several runs with the same hands."""
 
     title: str
     trace: Run
@@ -423,9 +427,9 @@ class Panel:
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
-    """Plot the forces of several couplings on equal axes, each over the object's forces for that motion (pale).
+    """Plot the forces of several couplings on equal axes, one panel each; pale curves are the object's own forces.
 
-    The range of the axes is that of the credible ideal forces, so that oscillating forces may leave the panels.
+    The axes cover 1.5 times the ideal forces of the credible runs, so that oscillating forces may leave the panels.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
@@ -541,7 +545,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping
-    alike = len(set(available)) == 1  # Unlike devices are drawn as ratios.
+    alike = len(set(available)) == 1  # Devices with different damping are drawn as ratios.
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
     for axis, condition in zip(axes[0], names, strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)

@@ -47,7 +47,7 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderS
 
 
 def _shared(scenario: Scenario) -> list[float]:
-    """Return the divisor of a friction force on each channel: sqrt(n) if one number is that of n axes together."""
+    """Return the divisor of each channel's friction: sqrt(n) if one number is the friction of n axes together."""
     counts = [1 if isinstance(d.friction, tuple) else len(d.free) for d in scenario.device]
     return [count**0.5 for d, count in zip(scenario.device, counts, strict=True) for _ in d.free]
 
@@ -194,7 +194,7 @@ class _DelaysMet:
 
     @property
     def worst(self) -> _DelaysMet | _PeriodGrowth:
-        """The record of the growth: of the worst switching if it was searched, else of the run's delays."""
+        """The record that holds the decisive growth: the worst switching if it was searched, else the run's delays."""
         return self.period or self
 
     @property
@@ -211,7 +211,7 @@ def _verdict(growth: float) -> str:
 
 @dataclass(frozen=True)
 class VaryingDelays:
-    """Figures of varying delays; `met` belongs to a run with switching delays."""
+    """Figures of varying delays; `met` is None unless the delays switch."""
 
     span: DelaySpan = off_table("inlined")
     met: _DelaysMet | None = off_table("inlined")

@@ -56,7 +56,7 @@ _Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the h
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 
-_COPIES = 4  # largest number of copies of a trace from the run to its report
+_COPIES = 4  # largest number of copies of a trace that a run and its report keep in memory
 _SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
 _COLUMNS = 50  # numbers per tick that a report needs in memory even if the trace is on disk
 _BLOCK = 2048  # ticks between two checks of the clock, the keyboard and the numbers
@@ -70,7 +70,7 @@ class EngineSettings:
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # of MuJoCo
     substeps: int | None = None  # per period
-    error: float | None = None  # relative rms error of positions; the cheapest setting that keeps it is then chosen
+    error: float | None = None  # allowed relative rms error of positions, for which the cheapest setting is chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,11 @@ class Simulation:
     process: Process
     scene: Scene
     plant: HeldPlant  # for periods T and forces that latch in the middle of their range
-    timing: Timing | None = None  # of uneven ticks; None if all ticks are alike
+    timing: Timing | None = None  # begin and latch times of ticks; None if all ticks are alike and forces latch at them
 
     @cached_property
     def loop(self) -> Loop:
-        """The loop of designs; the reference delays do not matter."""
+        """The loop as designs see it. Its reference delays are those of case I, and do not matter here."""
         return self.scenario.loop("I")
 
     @cached_property
@@ -116,7 +116,7 @@ class Simulation:
     def held_by(
         self, humans: tuple[Hand, ...], persons: tuple[Person, ...], mechanics: Sequence[Mechanics] = ()
     ) -> Simulation:
-        """Return the simulation with other hands and without voluntary motion; `mechanics` replaces the devices'."""
+        """Return the simulation with other hands; `mechanics` replaces the mechanics of the devices, if given."""
         devices = self.scenario.device
         if mechanics:
             devices = tuple(map(Mechanics.of, mechanics, devices))
@@ -140,11 +140,11 @@ class Simulation:
 
 
 def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
-    """Build both sides of the loop; with `lag`, rho (m,) [N/m], forces leave through a limiter and are not clipped.
+    """Build both sides of the loop: the computer's process and the plant.
 
-    `seed` draws periods and latencies where they vary.
-    Raises SingularLoop if the algebraic loop of environment and coupling has no solution, InputError for walls and a
-    coupling without a compliance V.
+    `lag` is rho (m,) [N/m] of the limiter through which forces leave; with None, forces are clipped. `seed` is the seed
+    of varying periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no
+    solution, and InputError for walls with a coupling that holds a linear model.
     """
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
@@ -173,7 +173,7 @@ def run(
 
     Args:
         simulation: The loop.
-        engine: An engine, its class, or its name, for its default step.
+        engine: An engine, its class, or the name of an engine, which then takes its default step.
         outside: External forces on the hands; default: those of the scenario.
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
@@ -197,7 +197,7 @@ def run(
         nonlocal diverged, net, done
         net, rows = buffer.net, buffer.rows[:count]
         diverged = engine.troubled()
-        if not np.isfinite(rows.sum()):  # Only then the rows are checked one by one.
+        if not np.isfinite(rows.sum()):  # Checking the sum first is faster than checking every row.
             finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
             diverged |= not finite.all()
             count = count if finite.all() else int(np.argmin(finite))
@@ -272,9 +272,10 @@ def run_blocks(
     each_block: _AfterBlock,
     block: int = 32,
 ) -> None:
-    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim); `each_block` sees each block.
+    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), block by block.
 
-    Row 0 of the buffer is the block's first tick. A block is small enough for the processor's cache.
+    After each block `each_block` is called; it returns True to stop. Row 0 of the buffer is the block's first tick. The
+    default block is small enough for the processor's cache.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
@@ -354,11 +355,11 @@ def make_engine(
     substeps: int | None = None,
     T: float | None = None,
 ) -> Engine:
-    """Return the engine of a name for one simulation; MuJoCo advances it by T seconds (default: the scenario's).
+    """Return the engine `engine` for one simulation; a tick of MuJoCo lasts T [s] (default: the scenario's period).
 
     The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
-    as it is, or made by calling it with the simulation. Raises ValueError for an unknown name, an object that is no
-    engine, the exact engine with Coulomb friction, and a user's own engine with uneven ticks.
+    as it is; a user's class or function is called with the simulation. Raises ValueError for an unknown name, an object
+    that is no engine, the exact engine with Coulomb friction, and a user's own engine with uneven ticks.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)

@@ -45,7 +45,7 @@ class Ran:
     T_s: float
     timing: UnevenTicks | None
     seed: int
-    engines: tuple[accuracy.EngineChoice, ...] | None  # compared for --error
+    engines: tuple[accuracy.EngineChoice, ...] | None  # the settings that --error compared
     cross_check: accuracy.CrossCheck | None
     interrupted: bool
     scenario_digest: str

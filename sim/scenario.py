@@ -64,7 +64,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i: 0.3 kg that swings 15 mm at 0.6 Hz, a quarter turn after the one before."""
+    """Return the default hand of device i: 0.3 kg that swings 15 mm at 0.6 Hz, a quarter period ahead of hand i - 1."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
@@ -84,14 +84,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     human: tuple[Human, ...] = _UNSAID  # the hands that hold the devices in a run; default: `_usual_hand`
     environment: Network
     ranges: Ranges | None = None  # environments beside the nominal one that guarantees must cover
-    lam: _Delays | None = None  # reference delays [samples] (7); without it the case decides
+    lam: _Delays | None = None  # reference delays [samples] (7); None: those of the case
     person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # distribution of the humans that `validate` draws
     varying_delay: VaryingDelay | None = None  # of the forces, around theta; None where delays are constant
-    T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
-    T_min: float | None = None  # [s] the shortest period, where T_max is given; only known-device needs it
+    T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
+    T_min: float | None = None  # [s] the shortest period if periods vary; only known-device needs it
     period: Periods | None = None  # the periods that are simulated; the computer's filters are designed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the force's latch
 
@@ -157,7 +157,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
     def _per_channel(self) -> None:
-        """Repeat values that are given per device for each axis. Raises ValueError where axes of a device differ."""
+        """Convert values per device to values per channel. Raises ValueError if the axes of a device differ in them."""
         counts = [len(device.free) for device in self.device]
         if max(counts, default=1) == 1:
             return
@@ -190,7 +190,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """(m,) "left.x" and so on where devices have several axes, else nothing: channels are called by numbers."""
+        """Names (m,) such as "left.x" if devices have several axes; otherwise (), since channels then have numbers."""
         return () if self.axis_devices is self.device else self.environment.contacts
 
     @property
@@ -214,7 +214,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lead(self) -> list[int]:
-        """(m,) the first channel of each channel's device: all axes of a device share what is drawn for it."""
+        """(m,) the first channel of each channel's device, whose drawn delays and latencies all its axes share."""
         counts = [len(device.free) for device in self.device]
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
@@ -268,7 +268,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delta(self) -> tuple[float, ...]:
-        """The guaranteed damping on each channel [N s/m], the diagonal of a matrix: see `levels`."""
+        """The guaranteed damping on each channel [N s/m]; of a matrix, the diagonal (`loop` has the matrix: levels)."""
         return tuple(device.passivity_level for device in self.axis_devices)
 
     @property
@@ -308,7 +308,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def usual_latency(self) -> list[float] | None:
-        """The middle of each channel's range [s]; None where forces latch at ticks."""
+        """The middle of each channel's range of latency [s]; None if forces latch at ticks."""
         return None if self.latency is None else [sum(span) / 2 for span in self.latency]
 
     @property
@@ -317,7 +317,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.period is not None or any(least < most for least, most in self.latency or ())
 
     def timing(self, seed: int, ticks: int) -> Timing | None:
-        """Return when ticks begin and forces latch, as the seed draws it; None if both are at k T."""
+        """Draw the times at which ticks begin and forces latch; None if both are at k T."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
         timing = drawn(self.T, self.period, self.latency, ticks, rng)
         if timing is None or timing.late is None or self.axis_devices is self.device:
@@ -359,7 +359,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:
-        """Return the loop that designs and proofs see: of a device its damping and guaranteed bounds, no human.
+        """Return the loop that designs and proofs see: the devices' damping and guaranteed bounds, but no humans.
 
         `case` is "none", "I" or "II"; raises InputError for another case.
         """
@@ -371,9 +371,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
-        """Return the fields of a loop on known devices for its first channels; none if a device is not known.
+        """Return `known_devices` and `T_min` of a loop with the first `channels` channels (default: all channels).
 
-        The shortest period is one of these fields, so that loops on unknown devices keep their digest.
+        The result is {} unless every device has guaranteed bounds, so that loops on unknown devices keep their digest.
         """
         known = self.known_devices
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
@@ -381,8 +381,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
         """Return the loop of the first device alone before a rigid wall. Raises ValueError.
 
-        The wall of a device with several axes may face any direction, so that the least damping of all directions
-        counts.
+        The wall of a device with several axes may face any direction, so the loop has the least damping of all
+        directions.
         """
         theta, late, delta = self.theta[:1], self.latency and self.latency[:1], self.delta[:1]
         if self.device[0].axes > 1:
@@ -394,10 +394,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """Return the scenario with some fields changed; `delta` is another guaranteed damping [N s/m].
 
-        Values are checked and normalised as those of a file: lists become tuples. Humans may also be of a user's own
-        class (models.human.Hand). So may a population with `draw(rng, n)`, which returns n humans, and an environment
-        with `contacts` and `E(T)` or `parts()`, which becomes a network.
-        Raises InputError with the field, its value and the allowed values.
+        Values are checked and normalised like those of a file: lists become tuples. Three fields may also be objects of
+        a user's own class: humans (models.human.Hand), a population with `draw(rng, n)`, which returns n humans, and an
+        environment with `contacts` and `E(T)` or `parts()`, which becomes a network. Raises InputError with the field,
+        its value and the allowed values.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
@@ -575,7 +575,10 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 
 
 def _own_humans(text: str) -> _HumanFile:
-    """Return the people of FILE.py:NAME: hands and persons, a population with draw(rng, n), or a function of them."""
+    """Return the people of FILE.py:NAME.
+
+    NAME is a list of hands and persons, a population with draw(rng, n), or a function or class that gives one of these.
+    """
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
         people = called(f"--human {text}", people)
@@ -645,20 +648,23 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
-        if place_of(error):  # in a class of the user's own
+        if place_of(error):  # The user's own class raised the error.
             raise
         raise InputError(f"{source}: {error}") from None
 
 
 def _require_keys(raw: dict[str, Any]) -> None:
-    """Raise ValueError if a key that every scenario needs is missing; unknown keys are reported first, elsewhere."""
+    """Raise ValueError if a key that every scenario needs is missing.
+
+    Files with unknown keys pass this check, because `msgspec.convert` reports those keys.
+    """
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace names of the catalogue, and `device` of a [[device]], by the fields of the device."""
+    """Replace each name of a device in the catalogue, in `device` or in a [[device]], by the fields of that device."""
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -683,7 +689,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
-        return raw  # one axis, or a number of axes that the checks of the fields refuse
+        return raw  # There is one axis, or the fields' checks refuse the number of axes.
     if not isinstance(table, dict) or table.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
@@ -715,7 +721,7 @@ def _listed(value: Any) -> list[str]:
 
 
 def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
-    """Return a spring whose stiffness or damping is a list or a matrix as springs along its principal directions.
+    """Convert a spring whose stiffness or damping is a list or a matrix to springs along its principal directions.
 
     Raises ValueError for a matrix that is not symmetric and positive semidefinite.
     """
@@ -815,7 +821,7 @@ def _without_folder(environment: Network) -> Network:
 
 
 def _network(own: Any, T: Any) -> Network:
-    """Return a user's own environment, which has `contacts` and `E(T)` or `parts()`, at a period. Raises InputError."""
+    """Convert a user's own environment, with `contacts` and `E(T)` or `parts()`, to a network. Raises InputError."""
     label = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
     has_E = getattr(type(own), "E", Environment.E) is not Environment.E
@@ -918,7 +924,7 @@ def _located(message: str, raw: dict[str, Any]) -> str:
             value = None
             break
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
-    if problem[1:2].islower():  # a word of msgspec, not one of our symbols
+    if problem[1:2].islower():  # The message starts with a word, not with a symbol.
         problem = problem[0].lower() + problem[1:]
     return f"{counted(path)}{shown}: {problem}" if path else problem
 

@@ -208,7 +208,7 @@ class Ringing:
         return f"{slowest}; least ratio {self.least_damping_ratio:.4f} at {self.least_frequency_hz:.2f} Hz"
 
 
-_FADED = 1e-6  # modulus up to which eigenvalues are a delay line's poles at zero, which rounding spreads
+_FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero, which rounding spreads
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
@@ -221,7 +221,7 @@ def ringing(simulation: Simulation) -> Ringing | None:
     modes = modes[np.abs(modes) > _CLEAR]  # A free drift neither rings nor decays.
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
-    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # They are a conjugate pair.
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # Both belong to one conjugate pair.
         least = slowest
     shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
     return Ringing(*map(float, shown))
@@ -244,8 +244,8 @@ def _measured_growth(
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
     The projection y = left* xi contains the dominant mode alone. With the known outside force subtracted,
-    y[k+1] - left* B w[k] = lambda y[k]. A least-squares fit gives lambda. It ends `ahead` ticks before the first
-    clipped one, because a limiter acts that long before its force arrives.
+    y[k+1] - left* B w[k] = lambda y[k]. A least-squares fit gives lambda. The fit ends `ahead` ticks before the first
+    clipped tick, because a limiter acts that long before its force arrives.
     """
     clipped = trace.clipped(force_limit, balls)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
@@ -254,7 +254,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # Rounding is relative to the terms that cancel in y, and to the errors of the eigenvector.
+    # The rounding error of y is relative to the terms that cancel in y, and to the error of the eigenvector.
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -420,12 +420,12 @@ class Balance:
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
-        """Return the balance of devices held by `variants`; forces latch `late` (m,) [s] after ticks, or at ticks."""
+        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None."""
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
             return Balance(delta / loop.T, Delta)
         spans = np.array(loop.latency)[:, :, None]
-        before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0: no step before
+        before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0 if latency is 0
         after = delta / ((loop.T_max or loop.T) - spans[:, 0])
         return _LateBalance(after, Delta, before, at_the_latch(variants.plants(), late))
 
@@ -435,7 +435,7 @@ class Balance:
         return buffer.f[:count] * moved, self._spent(self.damping, moved)
 
     def _spent(self, damping: Array, moved: Array) -> Array:
-        """Return the least dissipation over steps (count, m, nsim) for `damping` (m, 1); a matrix is scaled."""
+        """Return the least dissipation over steps (count, m, nsim); Delta is scaled to the diagonal `damping`."""
         if self.Delta is None:
             return damping * moved**2
         return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)

@@ -3,10 +3,10 @@
 The loop is linear, with one matrix for each set of ages of the forces in use. Its state is
 xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), and forces under way.
 
-The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick each device
-receives the force, among those that a delay in [lo, hi] allows, that gives it the most power -f v. Ages grow by at most
-one per tick, because packets are held. The worst period is the window of this sequence that may be repeated and whose
-product of mode matrices has the largest spectral radius per tick. A radius above 1 proves instability.
+The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
+[lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
+because packets are held. The worst period is a window of this sequence that may be repeated. Its product of mode
+matrices has the largest spectral radius per tick. A radius above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst pe
 _LONGEST_PERIOD = 250  # [ticks]
 _STARTS = 6  # number of ticks of the greedy sequence at which windows begin
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
-_SHORTEST = 4  # least number of ticks, because a growth compares quarters
+_SHORTEST = 4  # least number of ticks, because a growth rate compares quarters of the trace
 _STREAM = 5  # separates these draws from those of the humans with the same seed and index
 
 
@@ -177,7 +177,7 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 
 # ---- many humans in one batch, each under its own varying delays, drawn or adversarial
 
-_SHORTEST_CROWD = 2.0  # [s] of every trace, in which a growth of 1 1/s exceeds the spreading of the impulse
+_SHORTEST_CROWD = 2.0  # [s] least duration of a trace: a growth of 1 1/s then exceeds the spreading of the impulse
 _LONGER = 5  # factor of the duration of a second trace, for hands whose rate is too slow for the first
 
 
@@ -200,8 +200,8 @@ def switched_crowd(
     """Run the impulse test for every set of humans, each under the delays of its index.
 
     Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other` makes the second engine for the sets of these numbers. Sets whose rate is too slow for the
-    time run longer; if the sign changes, the longer traces of both engines count.
+    for all sets. `other` makes the second engine from the numbers of its sets. Sets whose rate is too slow for the
+    duration run longer; if the sign changes, the longer traces of both engines count.
     """
     scenario, scene = simulation.scenario, held_by.scene
 

@@ -7,9 +7,9 @@ oscillation   Does an oscillation last in the second half of a trace? The half i
               lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
               times that in the first. Octaves are judged apart, so that a slow mode that decays does not hide a fast
               one that grows.
-growth        How fast does an oscillation grow? If it grows like exp(g t), each window is exp(g hop) times larger than
-              the one before, and g is the slope of a line through the logarithms. The slope is a figure about motion,
-              not a verdict about a loop: the motion of a person who shakes the handle harder and harder grows, too.
+growth        How fast does an oscillation grow? If it grows like exp(g t), the amplitude grows by exp(g hop) from one
+              window to the next, and g is the slope of a line through the logarithms. The slope describes a motion and
+              is no verdict on a loop: the motion of a person who shakes the handle harder and harder grows, too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _real(name: str, values: NDArray[Any]) -> Array:
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Return whether an array is read-only, so that a long run needs no second copy."""
+    """Return whether an array is a read-only float array, which needs no copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
@@ -118,7 +118,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest line above 10 Hz in the last quarter of the forces; None for a short trace."""
+        """Return the strongest frequency above 10 Hz in the last quarter of the forces; None for a short trace."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -226,7 +226,7 @@ class Trace(ReadOnly):
 # ---- octaves, and lasting oscillations
 
 _PERIODS = 4  # periods of the slowest octave in a window; with fewer the window function mixes octaves
-_TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of 15 mm at 0.6 Hz
+_TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of a motion of 15 mm at 0.6 Hz
 SUSTAINED = 0.95
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
@@ -236,7 +236,7 @@ class Oscillation:
     """The strongest oscillation of positions, with one entry per simulation."""
 
     sustained: NDArray[np.bool_]  # (nsim,) whether it lasts
-    amplitude: Array  # (nsim,) [m] of the strongest octave, among those that last if any does; inf: diverged
+    amplitude: Array  # (nsim,) [m] of the strongest lasting octave, or of the strongest if none lasts; inf: diverged
     frequency_hz: Array  # (nsim,) [Hz] the strongest line in that octave; nan: diverged
 
 
@@ -294,7 +294,7 @@ def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
 # ---- how fast an oscillation grows
 
 _WINDOW = 1.0  # [s] longest window
-_LEAST_SAMPLES = 10  # in a window
+_LEAST_SAMPLES = 10  # least number of samples in a window
 _WINDOWS = 7  # least number of windows, each of which overlaps the next by half
 _NEEDED = 4  # consecutive windows in which an oscillation must be seen
 _SHORTEST = 200  # ticks that a growth rate needs
@@ -314,9 +314,9 @@ class Growth:
     growth_rate_per_s: float | None = None
     error_per_s: float | None = None  # standard error of the line
     frequency_hz: float | None = None
-    amplitude_m: float | None = None  # of its octave in the last window in which it is seen
+    amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
     slowest_hz: float | None = None  # slower oscillations are not seen
-    trend: str | None = None  # grows | decays | neither: by more than _CLEAR standard errors
+    trend: str | None = None  # "grows" or "decays", by more than _CLEAR standard errors, or "neither"
     reason: str | None = None
 
     def words(self, T: float) -> str:
@@ -389,7 +389,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the indices of the longest run of True, the last one of several."""
+    """Return the indices of the longest run of True; of several equally long runs, the last one."""
     runs = np.split(np.arange(len(on)), np.flatnonzero(np.diff(on)) + 1)
     return max((run for run in reversed(runs) if on[run[0]]), key=len, default=np.zeros(0, np.intp))
 

@@ -110,7 +110,7 @@ class DrawnHumans:
     person: tuple[Person, ...]
     environment: str | None = off_table("if given", None)
     network: Network | None = off_table("if given", None)
-    device: Sequence[Mechanics] | None = off_table("if given", None)  # drawn within the guaranteed bounds
+    device: Sequence[Mechanics] | None = off_table("if given", None)  # mechanics drawn within the guaranteed bounds
 
     @classmethod
     def of(cls, question: Validation, index: int) -> DrawnHumans:
@@ -122,7 +122,7 @@ class DrawnHumans:
 
 @dataclass(frozen=True)
 class WorstDrawn:
-    """The humans of the largest spectral radius."""
+    """The drawn humans with whom the loop has the largest spectral radius."""
 
     spectral_radius: float
     growth_rate_per_s: float
@@ -222,7 +222,7 @@ _Met = TypeVar("_Met")  # delays or ticks
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """The number of humans that grow while delays or ticks vary; none may grow if certificates cover them."""
+    """The number of humans with whom the loop grows while delays or ticks vary; with certificates it must be 0."""
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # by certificates
@@ -263,7 +263,7 @@ class Attacked:
     human: list[_Held]
     person: tuple[Person, ...]
     holds: bool
-    device: Sequence[Mechanics] | None = off_table("if given", None)  # found within the guaranteed bounds
+    device: Sequence[Mechanics] | None = off_table("if given", None)  # worst mechanics within the guaranteed bounds
 
     @classmethod
     def of(cls, worst: Worst, ratio: float, certified: bool) -> Attacked:

@@ -63,7 +63,7 @@ class _Sweep(ABC):
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of a condition at one point, by a separate sweep, to check maps."""
+        """Return the requirement of a condition at one point, by a separate frequency sweep that checks the map."""
 
     @cached_property
     def judges(self) -> dict[str, Condition]:
@@ -137,7 +137,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), or inf, for walls that make and break contact."""
+        """Return required over available damping (n,); inf if no damping is enough. Walls make and break contact."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -198,7 +198,7 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def stiffness_scale(self) -> float:
-        """The middle of the map [N/m]: the geometric mean of these springs."""
+        """The middle of the map [N/m]: the geometric mean of the stiffnesses at contacts."""
         stiff = [s.stiffness for s in contact_springs(self.loop.network) if s.stiffness > 0]
         return float(np.exp(np.mean(np.log(stiff)))) if stiff else 1000.0
 
@@ -222,7 +222,7 @@ class EnvironmentSweep(_Sweep):
         return [Process(Law(sent[i], self.loop.theta), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), or inf."""
+        """Return required over available damping (n,); inf if no damping is enough."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
         shares = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
@@ -239,7 +239,7 @@ class EnvironmentSweep(_Sweep):
 
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
-        """Requirements that do not depend on the springs, by condition, and refusals of those that do not apply."""
+        """Requirements that do not depend on the springs, and refusals of inapplicable conditions, by condition."""
         requirements: dict[str, Requirement] = {}
         for name, each in self.judges.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
@@ -438,9 +438,9 @@ def draw_map(
 
 
 def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
-    """Return the worst growth and the number of unstable humans among the leading ones, or else among all.
+    """Return the worst growth and the number of unstable humans; all are tried if no leading one is unstable.
 
-    `states` are the force maps of one cell; a human is unstable if it is unstable with any of them.
+    `states` are the force maps of one cell; a human is unstable if the loop with any of these maps is unstable.
     """
     growth = np.max([held.growth(F, leading)[0] for F in states], axis=0)
     if not (growth > MARGINAL).any() and not leading.all():
@@ -490,7 +490,7 @@ _HALVINGS = 20  # bisections, which give an edge of the population to a relative
 
 @dataclass(frozen=True)
 class Mark:
-    """One point, and the largest safe stiffness at the same B: None if none is safe, inf if all tried ones are."""
+    """One point, and the largest safe stiffness at the same B: None if none is safe, inf if the stiffest tried is."""
 
     K: float
     B: float
@@ -504,13 +504,13 @@ class Mark:
 class MapError:
     """Errors of the map against single sweeps, over the compared columns."""
 
-    figure_relative: float  # largest relative error of the figure beside the edge
+    figure_relative: float  # largest relative error of required over available damping, in cells beside the edge
     edge_relative_in_K: float  # largest relative error in K of the edge, interpolated between two rows
     columns_compared: int
 
 
 def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
-    """Judge (K, B) by each condition and the population, and find the stiffest K of each at this B."""
+    """Judge (K, B) by each condition and the population, and find the largest K that each of them allows at this B."""
 
     def calm(k: float) -> bool:
         return bool((_growth(sweep, held, k, B) <= MARGINAL).all())

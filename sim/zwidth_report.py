@@ -60,7 +60,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class _Point:
-    """One simulated coupling."""
+    """One simulated cell."""
 
     K: float
     B: float
@@ -184,12 +184,12 @@ class MapReport:
     holds: bool
     interrupted: bool
     wall_s: dict[str, float]
-    axes: str  # "coupling" or "environment", to which K and B belong
+    axes: str  # whether K and B belong to the "coupling" or the "environment"
     ratios: dict[str, _Ratio] = off_table("inlined")
     fixed: FixedCoupling | None = off_table("inlined")  # of a map over environments
     error: dict[str, MapError | None] | None = off_table("if given")
     marks: list[_Marked] | None = off_table("if given")
-    claim: str | None = off_table("if given")  # of a user's own condition, if it certifies a cell
+    claim: str | None = off_table("if given")  # the claim of a user's own condition, if it certifies a cell
     not_covered: str = CAVEATS
 
     @classmethod

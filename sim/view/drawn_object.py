@@ -1,7 +1,7 @@
 """The virtual object in pictures: its masses, springs and walls, and the places of its nodes at each tick.
 
-The displacements of the nodes are computed beside the loop and change nothing in it. They are further outputs of the
-equations that give the forces of a tick before Theta.
+The displacements of the nodes are computed beside the loop and change nothing in it. They are additional outputs of the
+equations that compute the forces of a tick before Theta.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _place(column: int, y: float) -> Array:
 
 
 class _Motion:
-    """Displacements of all nodes of a network behind a coupling, while the devices move, without force limits."""
+    """Displacements of a network's nodes behind a coupling, for given motions of the devices and no force limits."""
 
     def __init__(self, network: Network, coupling: Coupling, psi: Sequence[int], T: float) -> None:
         self._m, nodes = len(network.contacts), len(network.nodes())

@@ -148,7 +148,7 @@ def _event(entry: str, what: str, channels: int) -> _Event:
 
 
 def _number(text: str) -> float:
-    """Parse a number; text that is none gives infinity, which is never allowed."""
+    """Parse a number; for other text return infinity, which every caller refuses."""
     try:
         return float(text)
     except ValueError:
@@ -233,8 +233,8 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 
 HISTORY = 4.0  # [s] of forces in a picture
 _BLOCK = 64  # largest number of ticks in one block
-LONGEST_LAG = 0.1  # [s] that a window may catch up in one frame; more is dropped and counted
-_STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as of the hands of the default scenario
+LONGEST_LAG = 0.1  # [s] lag that a window may catch up in one frame; a longer lag is dropped and counted
+_STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as in the hands of the default scenario
 
 
 @dataclass
@@ -288,7 +288,7 @@ class Grip:
 
 
 def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
-    """Return the plant with the hand's spring and damper, whose far end rests, on a handle."""
+    """Return the plant with the spring and damper of the mouse's hand on a handle; their far end rests."""
     free, n = scene.plant, scene.model.nq
     A = free.A.copy()
     for channel in channels:
@@ -330,9 +330,9 @@ class LiveLoop:
 
         Args:
             prepared: The first loop.
-            executor: Prepares the loops of keys while the present loop runs.
-            script: Events at given times, whose loops are prepared here.
-            patience: Lag behind the clock [s] that is caught up; more is dropped.
+            executor: Prepares the loops that keys request while the present loop runs.
+            script: Events at given times. This constructor prepares their loops.
+            patience: Largest lag behind the clock [s] that is caught up; a longer lag is dropped.
 
         Raises:
             InputError, DesignFailed, SingularLoop: An event of the script is impossible.

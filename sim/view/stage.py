@@ -237,7 +237,7 @@ class ShownScene:
             _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
-        """Draw the forces of the last seconds, side by side at the bottom of a picture."""
+        """Plot each device's forces of the last seconds, side by side at the bottom of a picture."""
         m = len(self._channels)
         width, height = picture.width // m, round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
@@ -337,12 +337,12 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
     seen = set[int]()
     for joint, (place, device) in enumerate(zip(where, _owners(scene), strict=True)):
         number = int(scene.model.jnt_bodyid[joint])
-        if number in seen:  # The body has another joint.
+        if number in seen:  # An earlier joint has the same body.
             continue
         seen.add(number)
         body = spec.body(scene.model.body(number).name)
         body.pos = [place * STEP, device * -APART, 0.03]
-        if body.frame:  # The file of an attached device has a place of its own.
+        if body.frame:  # The frame of an attached device would shift the body.
             body.frame.pos = [0.0, 0.0, 0.0]
         if place == 0:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(device), 1.0), **_MASSLESS)
@@ -390,7 +390,7 @@ def _figure(device: int, low: Array, high: Array, top: float, unit: PositionUnit
 
 
 def _shade(device: int, axis: int) -> _Colour:
-    """Return the colour of an axis of a device: darker from one to the next."""
+    """Return the colour of an axis of a device; each axis is darker than the one before."""
     red, green, blue = _colour(device)
     return red * 0.6**axis, green * 0.6**axis, blue * 0.6**axis
 
@@ -433,7 +433,7 @@ def _connect(
 _RATE = 60.0  # frames per second
 _PATIENCE = 30  # [s] for the display to answer
 
-# Without a display the viewer's thread dies and its caller waits for ever, so a separate process asks first.
+# Without a display the viewer's thread dies and its caller waits for ever, so a separate process tries a window first.
 _PROBE = (
     "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
     "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
