@@ -54,7 +54,7 @@ _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 class NetFigures:
     """Counts of the ticks in which a net changed the force."""
 
-    guarantee: str | None  # in one line
+    guarantee: str | None  # the guarantee in one line
     ticks: int
     limited_ticks: int
 

@@ -274,7 +274,7 @@ class BallProblem(_Problem):
 
 _RESIDUAL = 1e-12  # allowed residual, relative to the limit
 _NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # largest numbers of iterations
-_FULL = 10  # number of full Newton steps
+_FULL = 10  # number of full Newton steps before shorter ones are tried
 _SHARES = (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # lengths of later Newton steps, of which the best one is taken
 _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its terms
 
@@ -292,7 +292,7 @@ class _BallBlock:
         if least < -GROUNDED:
             rows = (at + 1).tolist()
             raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
-        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # regularised; f is unique without it, too
+        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # regularised, although f is unique without it
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
         self._by_tau, self.tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)

@@ -133,7 +133,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hi: tuple[int, ...]  # (m,) [samples]
     pattern: _Pattern = "random"
     loss: float = 0.0  # probability that a packet is lost, independent of the others
-    playout: bool = False  # a buffer in the device, which applies every packet at age hi
+    playout: bool = False  # whether a buffer in the device applies every packet at age hi
     calm: float = 20.0  # bursty: mean number of successive packets with the delay lo
     burst: float = 5.0  # bursty: mean number of successive packets with longer delays
     recorded: tuple[tuple[int, ...], ...] = ()  # delays of packets 0, 1, .. [samples] by channel, repeated; -1 is lost
@@ -264,7 +264,7 @@ class Timing:
     """Length and latch times of every tick; a longer run repeats them."""
 
     period: Array  # (ticks,) [s]
-    late: Array | None  # (ticks, m) [s] after the tick's beginning, below its period; None if forces latch at ticks
+    late: Array | None  # (ticks, m) latch times [s] from the tick's beginning, below its period; None: all are 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "period", frozen(self.period, 1, "period"))

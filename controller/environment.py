@@ -33,7 +33,7 @@ MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _LEAST_AMOUNT = 1e-12  # far below the amounts that a person can feel; its square is far above the smallest float
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
-_MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
+_MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can handle a few hundred states.
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
@@ -329,7 +329,7 @@ class Network(
     masses: dict[str, float] = {}  # [kg], by node; other nodes have no mass
     walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
     block: Block | None = None  # an E(z) that is added to the network
-    elements: tuple[Any, ...] = ()  # of a user's own classes; their parts become springs and walls
+    elements: tuple[Any, ...] = ()  # objects of a user's own classes; their parts become springs and walls
     world: World | None = None  # a MuJoCo scene in place of springs, masses, walls and block
     points: dict[str, tuple[str, ...]] = {}  # the nodes of each point's coordinates; ground for a fixed coordinate
     linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model

@@ -87,7 +87,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
     axes: tuple[int, ...] | None = None  # number of channels of each device; None: one each
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
-    unit: PositionUnit = "m"  # of positions; "rad": N m, N m s/rad and kg m2 stand for N, N s/m and kg
+    unit: PositionUnit = "m"  # unit of positions; with "rad" N m, N m s/rad and kg m2 replace N, N s/m and kg
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)

@@ -11,7 +11,7 @@ from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # number of intervals of [0, pi] at the start
 _EVALUATIONS = 1 << 15  # largest number of intervals for up to 8 states, about half a second; fewer for more states
-_REACH = 0.5  # largest half-width of an interval with a bound, in units of the reciprocal norm of the resolvent
+_REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|R|
 _UNIT = 2.0**-53
 _NOISE = 1e-4  # covariance of a noise in every state, relative to that of the noise at the inputs
 _INFLATED = 1.001  # factor on norms against rounding

@@ -126,8 +126,8 @@ def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Mem
 class _State:
     """One state of an uncertain part, present or absent, with the ranges of this state."""
 
-    ranges: tuple[_Range, ...]  # without ranges of width 0
-    value: Callable[[Sequence[float]], Spring | float]  # the part, from one number in each of the ranges
+    ranges: tuple[_Range, ...]  # the ranges whose width is not 0
+    value: Callable[[Sequence[float]], Spring | float]  # one number in each range -> the part
 
 
 @dataclass(frozen=True)

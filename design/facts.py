@@ -26,7 +26,7 @@ class Unknowns:
     name: str  # name of the multiplier in files
     units: tuple[float, ...]  # (n,); 0 for a number that is always 0
     expected: str  # the allowed values in words, for messages
-    least: float  # if positive, the numbers must be positive
+    least: float  # in units; if `least` is positive, the numbers must be positive
     most: float
     start: tuple[float, ...] | None = None  # (n,) first values of a search; the units if None
 

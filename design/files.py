@@ -185,7 +185,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{named}: not valid TOML: nested too deeply") from None
-    except ValueError as error:  # tomllib also raises it for an integer of thousands of digits.
+    except ValueError as error:  # tomllib also raises ValueError for an integer of thousands of digits.
         raise InputError(f"{named}: not valid TOML: {error}") from None
 
 
@@ -373,7 +373,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # `from` is a keyword, so its field is from_.
+            part[one.name.removesuffix("_")] = plain(value)  # The field for the key `from` is named from_.
     return part
 
 

@@ -107,7 +107,8 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
 _EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced ones
 _PER_LOBE = 24  # evenly spaced frequencies for each lobe that a delay causes in the response
-_NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
+#: distances of frequencies from that of a pole, in widths of the pole
+_NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:

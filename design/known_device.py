@@ -101,7 +101,7 @@ def _shortfall(y: Array) -> Array:
     return np.where(y < _SERIES, series, 1 - np.tanh(y) / np.maximum(y, _SERIES))
 
 
-_SERIES = 0.03  # Below it the truncated series has the error 2e-14, above it cancellation has 4e-13.
+_SERIES = 0.03  # Below this y the truncated series has an error of 2e-14; above it cancellation costs 4e-13.
 
 
 def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
@@ -637,7 +637,7 @@ def positive(H: Complex) -> NDArray[np.bool_]:
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "periods up to T_max need a shortest one, T_min, for a known device"
 _LATE = "latency: Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
-_MOST_SHARE = 1e3  # largest share of the damping to which a beta on file is swept
+_MOST_SHARE = 1e3  # largest share of the damping that a sweep tries for a given beta
 
 
 class KnownDevice(Condition):
@@ -798,7 +798,7 @@ class KnownDevice(Condition):
         each = [self.form(G, loop, {}, KnownMotor(none, beta)).free.G for beta in (np.zeros(m), *np.eye(m))]
         shape = n, w.size, *each[0].shape[-2:]
         idle, *by = (hermitian(np.broadcast_to(part, shape)) for part in each)
-        last = np.zeros(n, dtype=int)  # The beta that last served a coupling is tried first.
+        last = np.zeros(n, dtype=int)  # The beta that last satisfied a coupling's block is tried first.
         known, delta = _known(loop, loop.T), np.array(loop.delta)
 
         def holds(share: Array) -> NDArray[np.bool_]:

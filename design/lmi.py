@@ -254,7 +254,7 @@ def least_multiplier(loop: Loop) -> Array:
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
-    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # has a unit diagonal
+    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
     least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
     each, root = least, np.linalg.inv(np.linalg.cholesky(level))
     if loop.levels:

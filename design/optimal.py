@@ -34,8 +34,8 @@ from haptic_loop.design.worst_member import Searched, search_ranges
 # _PROVING is the share of the robustness budget that is reserved for proofs.
 # A proof costs _PROOF * states^2.7 units of counted work: 0.3 at 100 states.
 _PROVING, _PROOF = 1 / 3, 1.2e-6
-_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # largest number of devices: (taps, poles) of the basis in `spread`
-_FIRST = 3  # The program starts with this many environments, those that the nominal design misses most.
+_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # largest number of channels: (taps, poles) of the basis in `spread`
+_FIRST = 3  # The program starts with the nominal environment and the _FIRST others that need the most damping.
 _SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
@@ -55,7 +55,7 @@ class _BasisResult:
 
     taps: int
     poles: int
-    states: int  # of the loop
+    states: int  # order of the loop
     mismatch_db: float  # objective
     g: float  # rendered share of the static stiffness
     reason: str | None  # reason why the coupling is not certified and proved, or None

@@ -38,9 +38,9 @@ class Spread:
 
     mismatch_db: float  # in the nominal environment
     price_db: float  # mismatch minus the mismatch of the nominal design
-    g: float  # rendered share of the stiffness
+    g: float  # rendered share of the static stiffness
     worst: float  # largest required over available damping at the vertices
-    states: int  # of the loop
+    states: int  # order of the loop
     environments: int  # number of vertices, including the nominal environment
     proved: int  # number of environments with an exact proof; the budget allows only sweeps for the others
     reason: str | None = None  # why the next environment is not proved

@@ -190,8 +190,8 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
-_SETTLED = 1e-6  # the sequence stops where a step improves the norm by less, relative to the norm
-_NEGLIGIBLE = 1e-6  # smaller dampers, relative to the usable damping, become 0: solvers return 1e-9 instead of zero
+_SETTLED = 1e-6  # The sequence stops when a step improves the norm by less than this share.
+_NEGLIGIBLE = 1e-6  # Dampers below this share of the usable damping become 0, because solvers return 1e-9 for 0.
 
 
 def design(
@@ -384,7 +384,7 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
 
-_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried shares of largest beta
+_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # of the largest beta
 _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 
@@ -503,7 +503,7 @@ def _stiffest_linear(loop: Loop) -> Design:
         each += _limits(axes, float(optimum.x), z, RESERVE)
     for limits in each:
         series = np.fft.rfft(limits).real / _TAPS
-        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # bound of each term and all later ones
+        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # bounds on the sum of each term and all later ones
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
         coefficients = series[1:count]
         weights = -2 * np.diff(np.append(coefficients, 0.0), prepend=0.0)
