@@ -144,7 +144,7 @@ def _missing(assessment: Assessment) -> str:
     if not assessment.decisive.certified:
         return f"by {_sentence(f'{assessment.condition}: {assessment.decisive.shortfall}')}"
     reason = assessment.ranges and assessment.ranges.reason
-    return f"for the ranges: {_sentence(reason or 'walls are proved in one environment only')}"
+    return f"for the ranges: {_sentence(reason or 'a vertex is not certified')}"
 
 
 def _sentence(words: str) -> str:

@@ -537,12 +537,14 @@ def assess(
         The assessment. Its guarantee is for the environment that runs; `holds` says whether it covers the ranges.
 
     Raises:
+        TypeError: `loop` is no Loop, or `coupling` no coupling.
         ValueError: The numbers of channels of coupling and loop differ, or the condition is unknown.
     """
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
     if isinstance(coupling, Design):
         certificate, condition = certificate or coupling.certificate, condition or coupling.asked
         searched, coupling = searched or coupling.searched, coupling.coupling
+    of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
     here = loop.at(network).switching(None)

@@ -145,8 +145,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 raise ValueError(f"person #{i}.holds is {list(person.holds)}, {expected}")
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
-        if self.ranges and self.environment.walls:
-            raise ValueError("ranges and environment.walls: a scenario has one of them; only a Loop in Python has both")
         self._check_timing()
         self.loop("I")  # raises ValueError where the ranges do not fit the environment
         there = self.environment

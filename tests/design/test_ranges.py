@@ -22,7 +22,7 @@ from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, membe
 from haptic_loop.design import optimal
 from haptic_loop.design.assessment import check_ranges
 from haptic_loop.design.bound import BoundBeside
-from haptic_loop.design.certificate import prove, verify
+from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, sealed
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
@@ -389,3 +389,16 @@ def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message)
 def test_missing_ranges_cannot_be_sampled(tmp_path):
     with pytest.raises(InputError, match="--environments ranges: the scenario has no ranges"):
         validate_main(["--environments", "ranges", "--out", str(tmp_path)])
+
+
+def test_scenarios_may_have_ranges_and_walls():
+    """One set of multipliers serves every vertex, so none may need more when it is judged alone."""
+    walls = '\n[[environment.walls]]\nbetween = ["mass", "ground"]\nstiffness = 3000.0\ndamping = 2.0\ngap = 5e-3\n'
+    both, coupling = parse(TEXT + walls + RANGES_TEXT).loop("I"), SpringDamper([800.0, 600.0], [0.5, 0.5])
+    together = check_ranges(both, coupling, samples=0)
+    alone = [both.at(member.network) for member in together.members]
+    assert [loop.environment.walls for loop in alone] == [both.network.walls] * 4
+    each = [required_damping(loop, coupling, "this-environment").ratio for loop in alone]
+    shared = [requirement.ratio for requirement in together.at_members]
+    assert np.all(np.array(each) <= np.array(shared) * (1 + 1e-6))
+    assert max(shared) < 1.1 * max(each)

@@ -222,6 +222,10 @@ LOOP = SHORT.loop("I")
         (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 to 10"),
         (lambda: certify(SHORT, SOFT), "loop is a Scenario, expected a Loop"),
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
+        (
+            lambda: assess(LOOP, None),
+            "coupling is None, expected a coupling (controller.coupling; NoCoupling() for none)",
+        ),
         (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),
         (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
