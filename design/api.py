@@ -1,4 +1,4 @@
-"""`design_coupling`, `certify` and `transparency_of` for scripts, as in python -m design. SI units."""
+"""Functions for scripts that design, certify, evaluate and store a coupling, as python -m design does. SI units."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ def design_coupling(
     Args:
         loop: The loop, `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions), which must hold beside the usual
-            one of the kind. None is the default of the commands: this-environment, also while forces are limited, and
-            any-environment for spring-dampers before walls, ranges or varying delays.
+        condition: The name of a condition, or your own Condition (design.conditions). The coupling satisfies your own
+            condition and the kind's usual one. None selects the usual condition (design.designs.usual_condition), as
+            the commands do.
         options: Options of the kind (DesignOptions). The range of switching delays must be given here; it is not taken
             from loop.varying_delay.
 
@@ -84,7 +84,7 @@ def certified_for(loop: Loop, certified: bool) -> str:
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: quick designs; "seconds" 0 limits the optimal coupling to its smallest basis
+#: Designs that take little time. `seconds` = 0 limits the optimal coupling to its smallest basis.
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
@@ -124,12 +124,13 @@ def instead(
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
-    The condition of the design, or your own `condition`, is judged, too. With loop.varying_delay there is a further
-    entry "switching" for any switching of the delays within that range.
+    Your own `condition`, or else that of the design, is judged, too. With loop.varying_delay there is a further entry
+    "switching" for any switching of the delays within that range.
 
     With ranges around the loop's environment, "this-environment" covers the environment and every vertex of the ranges.
-    The figure is the largest of them, and it is proved only if all are proved. Between the vertices a search replaces
-    the proof (design.worst_member); a violation there becomes the figure and is not certified.
+    Between the vertices there is no proof, only a search (design.worst_member). If every vertex is proved and the
+    search finds no violation, the requirement is the largest of the vertices. Otherwise it is the largest of vertices
+    and search, and it is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -162,8 +163,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
     """Return figures of the mismatch (8), M = F - Lambda E, in the loop's environment with all walls touching.
 
-    `mismatch_db` is the largest ratio of M to the environment over `band_hz`, `rms_mismatch_db` its rms; 0 dB is as
-    wrong as no force. `dc_ratio` is the rendered share of the static stiffness.
+    `mismatch_db` is the largest ratio of M to the environment over `band_hz`, and `rms_mismatch_db` is its rms. A
+    coupling without any force has 0 dB. `dc_ratio` is the rendered share of the static stiffness.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -194,7 +195,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its certificate; with ranges or varying delays it is returned unchanged."""
+    """Return the design with its certificate, or unchanged for ranges, for varying delays and without a proof."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -209,10 +210,11 @@ def store(
     path: Path,
     assessment: Assessment | None = None,
 ) -> Filed:
-    """Save the coupling with its proof; `assessment` may bring proofs for ranges and for limited forces.
+    """Save the coupling with its proof; `assessment` may contain proofs for ranges and for limited forces.
 
-    Without a proof for the ranges the file is for the nominal environment; without one for switching delays it is for
-    constant delays. Raises InputError if the file cannot be written.
+    If the ranges are not proved, the stored loop has the nominal environment only, unless the condition holds in any
+    environment. If switching delays are not proved, it has constant delays. Raises InputError if the file cannot be
+    written.
     """
     ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
@@ -247,7 +249,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
 
 def _certificate(loop: Loop, design: Design) -> Certificate:
-    """Return the proof of a design, for limited forces if the design has their multiplier. Raises NotProved."""
+    """Return the certificate of a design, which covers limited forces if the design has `c`. Raises NotProved."""
     if design.c:
         limiter = LimitedForces(lags=len(design.c[0]))
         return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])

@@ -59,7 +59,7 @@ SAMPLES = 64  # default number of environments that are drawn evenly from inside
 
 @dataclass(frozen=True, eq=False)
 class RangesResult:
-    """A condition over ranges: every vertex, a search between them, and random samples.
+    """The results of a condition at every vertex of ranges, at the worst point of a search, and at random samples.
 
     Attributes:
         members: The nominal environment and the vertices.
@@ -161,16 +161,16 @@ def check_ranges(
     certificate: Certificate | None = None,
     condition: Condition = THIS_ENVIRONMENT,
 ) -> RangesResult | None:
-    """Check a coupling over the ranges of its loop by this-environment or known-device; None without ranges.
+    """Check a coupling over the ranges of its loop by this-environment or known-device; return None without ranges.
 
-    The search is deterministic; `samples` more environments are drawn from inside, by the seed. `searched` and
-    `certificate` are the search and the proof of an earlier call or design. One set of multipliers serves all
-    environments, including those between the vertices.
+    The search is deterministic. In addition, `samples` environments are drawn at random from inside the ranges, with
+    `seed`. `searched` and `certificate` are the search and the proof of an earlier call or design, which are not
+    repeated. One set of multipliers serves all environments, including those between the vertices.
     """
     if loop.ranges is None:
         return None
     certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
-    simple = condition.extensible and not multiplier  # The fast sweeps of members are for such conditions.
+    simple = condition.extensible and not multiplier  # Only these conditions have fast sweeps of members.
 
     def need(there: Loop) -> Requirement:
         return required_damping(there, coupling, condition, multiplier)
@@ -240,7 +240,7 @@ class ForceLimits:
         c: The multiplier of the condition `limiter`, one row per channel, no unit.
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
-        less: Whether the limiter is proved in one environment, while the guarantee holds in more.
+        less: Whether the guarantee holds in more environments than the limiter's proof, which is for one.
         energy_budget: The energy W0 [J] that forces may give in total; None without a budget.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
     """
@@ -295,10 +295,12 @@ def covered_limits(
     proof: Certificate | None = None,
     known: Certificate | None = None,
 ) -> ForceLimits:
-    """Return the limiter that a condition covers: one without lag, or else that of this-environment or known-device.
+    """Return the limiter that a certified condition covers, or clipping with the reason.
 
-    The limiter of `proof` is used if the proof holds in this loop; otherwise a limiter of the same beta is searched.
-    The proof of `known` is not repeated (design.certificate.recheck).
+    A condition that covers a limiter without a further proof comes first. Otherwise this-environment or known-device
+    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise
+    multipliers are searched for a limiter of the same beta. The proof of `known` is not repeated
+    (design.certificate.recheck).
     """
     for each in requirements.values():
         if each.certified and each.lag is not None:
@@ -367,10 +369,10 @@ class Guarantee:
         hands: The hands that the guarantee covers, in words.
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", or the restriction.
-        delays: The delays of the forces [samples], lo and hi (m,); any of them at every tick.
+        delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
-        energy_J: Bound of the energy [J] that a hand receives beyond the dissipation of the devices; None: the loop
-            comes to rest.
+        energy_J: Bound of the energy [J] that a hand receives beyond the dissipation of the devices; None for a
+            guarantee that the loop comes to rest.
     """
 
     condition: str
@@ -414,7 +416,7 @@ class Assessment:
     """The assessment of a coupling in a loop, the record behind every report and every run.
 
     Attributes:
-        loop: Devices, delays and environment of the conditions.
+        loop: The loop for which the conditions were evaluated.
         coupling: The coupling as it runs.
         requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition.
         environment: The environment that runs: a network, or a plugged-in function.
@@ -466,11 +468,11 @@ class Assessment:
 
     @property
     def held_torques(self) -> str | None:
-        """A remark on held torques of devices with several axes, which no condition counts, or None."""
+        """The remark that no condition counts torques held by a moving device, or None for devices of one axis."""
         return held_torques(self.loop)
 
     def without_guarantee(self, reason: str) -> Assessment:
-        """Return the assessment without its guarantee, for a reason outside the loop's data."""
+        """Return the assessment without its guarantee, for this reason, and with its limiter marked as void."""
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
@@ -515,13 +517,13 @@ def assess(
 
     Args:
         loop: The loop; ranges, switching delays, latency and longest period must all be covered.
-        coupling: The coupling as it runs; a Design also has a condition, a proof and a search.
+        coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function that is plugged in
             behind the coupling and a shell that makes it passive.
-        energy_budget: W0 [J] of the shell before a function (default 0) or a MuJoCo world (default 2 mJ), or of an
-            energy budget before the delays.
-        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling, and if this
-            process has verified or made it.
+        energy_budget: W0 [J] of the shell (default 0 for a function, 2 mJ for a MuJoCo world), or, without a shell, of
+            an energy budget at the devices (controller.budget; default: no budget).
+        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling and holds; it is
+            verified unless this process has made or verified it.
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or
             known-device if the loop has bounds of its devices.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.

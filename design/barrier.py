@@ -3,9 +3,9 @@
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
 The barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is strictly
-feasible and at most degree/t above the minimum, where degree is the total size of the S_k. A Newton step is a
-least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from their eigenvalues
-without further evaluations.
+feasible, and its value is at most degree/t above the minimum, where degree is the total size of the S_k. A Newton step
+is a least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from the eigenvalues of
+these matrices without further evaluations.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from haptic_loop.design.frequency import hermitian
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
-_KEPT = 0.3  # least share of an eigenvalue that a step must leave
+_KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
 _LONGEST = 1e3  # largest step, in Newton steps
-_RIDGE = 1e-9  # weight, relative to its column, of a direction that neither objective nor inequalities depend on
+_RIDGE = 1e-9  # relative ridge, for directions on which neither objective nor inequalities depend
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +83,9 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The unknowns are the X_n, entry by entry, then the x_a. For two entries of X the weight from S^-1 is the same for
-    all pairs of functions. The Hessian is therefore a matrix product over the frequencies: (pairs of functions) times
-    (pairs of entries).
+    The unknowns are the entries of X (for each entry all n), followed by the x_a. A second derivative in two entries of
+    X is the product of two functions t_n, times a weight from S^-1 that is the same for all pairs of functions. The
+    Hessian is therefore a matrix product over the frequencies: (pairs of functions) times (pairs of entries).
     """
 
     constant: Array  # (k, r^2): `packed`
@@ -197,10 +197,10 @@ class Program:
         return all(_definite(block.at(x)) for block in self.blocks)
 
     def conditioned(self, x: Array) -> tuple[Program, Array]:
-        """Return the program in y = U x, and the upper triangle U that balances objective and barrier at x.
+        """Return the program in y = U x, and the upper triangular U that balances objective and barrier at x.
 
-        U is the triangle of a QR decomposition of the stacked rows of both. No inner product is formed in x, the
-        ill-conditioned coordinates of a basis of filters.
+        U is the factor R of a QR decomposition of the stacked rows of objective and barrier. Inner products of these
+        rows would lose digits, because the coordinates x of a basis of filters are ill-conditioned.
         """
         import scipy
 
@@ -265,9 +265,9 @@ def _solved(hessian: Array, right: Array) -> Array:
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """Return the step length that minimises the barrier function, while every eigenvalue keeps a share _KEPT.
+    """Return the step length that minimises the barrier function and leaves a share _KEPT of every eigenvalue of S.
 
-    The share keeps the search away from the boundary, where Newton's method would crawl along a curve.
+    The share keeps the search away from the boundary, where Newton's method would be slow.
     """
     along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
     residual, slope = program.A @ x - program.b, program.A @ step
@@ -292,7 +292,7 @@ def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Arra
 
 
 def _turned(W: Complex) -> Array:
-    """Return the map H -> W H W* on `packed` matrices, (k, r^2, r^2); entry a, b is the sum of W_ac conj(W_bd) H_cd."""
+    """Return the map H -> W H W* on `packed` matrices, (k, r^2, r^2), from (W H W*)_ab = sum W_ac conj(W_bd) H_cd."""
     r = W.shape[-1]
     c, d = np.triu_indices(r, 1)
     a, b = np.append(np.arange(r), c), np.append(np.arange(r), d)

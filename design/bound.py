@@ -1,22 +1,23 @@
-"""A lower bound, by weak duality, of the mismatch of every linear coupling of whatever order.
+"""A lower bound, by weak duality, of the mismatch of every linear coupling that this-environment certifies.
 
-The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is analytic outside the unit circle with
-He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the circle with s_0 = Delta. The delays
-make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because no force has arrived yet).
+The coupling may have any order. The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is
+analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the
+circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
+no force has arrived yet).
 Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mean square relative mismatch
 J = <M, w M>, M = F - Lambda E. For every H with support in the band |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
-F's coefficients are differences of the s_k. Hence 2 <H, F> + tr C_0 Delta = <D, S> >= 0 if, for some C_k that weigh
-only combinations that are zero,
+F's coefficients are differences of the s_k. Choose C_k that weigh only combinations that are zero, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k,
-and then J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h this is
+Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h
+this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
-the mean over log frequency in the band. H is piecewise linear, so that its sums over the circle are closed forms, and
-D is bounded from below between any two frequencies (`dual_matrix`). A shortage of D is added to C_0, which lowers the
-bound; the result holds for every linear coupling.
-If the bound drops to zero, or if unequal psi make the zero combinations known up to rounding only, the result is an
-estimate, for which D is positive at the frequencies of a sweep only. The integrals over the band are by Gauss's rule.
-The bound is reduced by a bound of its error (`_Dual.objective_again`) and by _QUADRATURE.
+where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
+from below between any two frequencies (`dual_matrix`). If this lower bound is negative, C_0 is increased until D >= 0,
+which lowers the bound on J. The bound is then proved.
+The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero,
+or unequal psi make the zero combinations known up to rounding only. The integrals over the band are computed by Gauss's
+rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
-_GRID = 250  # points, even and even in the logarithm, on which H is given
+_GRID = 250  # even points, and as many points even in the logarithm, between which H is linear
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} channels: half a minute for one that is 1 dB off"
@@ -54,8 +55,8 @@ _AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # ratios of frequencies around the
 _AROUND = np.array(
     [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
 )  # distances of frequencies from a mode, in widths of the mode
-_DEGREE = 3  # of the splines in h
-_FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objective, and the factor of its steps
+_DEGREE = 3  # degree of the splines of h
+_FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objective, and the factor by which t grows
 _GAP = 0.004  # gap that the barrier leaves, relative to the bound
 _LEAST = 1e-9  # mean square below which a bound is useless
 _WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative to the bound
@@ -63,7 +64,7 @@ _QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimat
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53
-_LARGEST_CHARGE = 0.005  # shortage of D between its frequencies that ends the search, relative to the bound
+_LARGEST_CHARGE = 0.005  # share of the bound that the shortage of D may cost when the search ends
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,9 @@ class _Bound:
 
 
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
-    """Bound the least rms mismatch of any coupling certified this-environment from below; for up to MOST channels.
+    """Return a lower bound of the rms mismatch of the couplings that this-environment certifies.
 
-    Periods up to T_max count as less damping, as in the condition.
+    The loop has up to MOST channels. Periods up to T_max count as less damping in even periods, as in the condition.
     """
     started = time.perf_counter()
     even = tuple(even_damping(loop).tolist())
@@ -104,8 +105,8 @@ class _Dual:
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner) scalar functions of H on the grid; those of h are orthonormal over the band
-    target: Array  # (2 inner, m^2) -Lambda E/|E| in the same units, real and then imaginary parts
+    heights: Array  # (k, inner) scalar functions that make up H, on the grid; over the band those of h are orthonormal
+    target: Array  # (2 inner, m^2) coefficients of -Lambda E/|E| in the functions of h, real and then imaginary parts
     knots: Array
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
     exact: bool  # whether these sums are exactly zero, not only up to rounding
@@ -140,7 +141,7 @@ class _Dual:
 
     @property
     def start(self) -> Array:
-        """The point h = 0 and C_0 = I/delta, where D = I; as a row vector it gives tr C_0."""
+        """The point h = 0 and C_0 = I/delta, where D = I. It also serves as the vector c with c'x = tr C_0."""
         m = self.loop.channels
         unit = [float(i == j) for i, j in _triangle(m)]
         return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
@@ -238,8 +239,8 @@ class _Dual:
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
         linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
         positive. Its error is at most twice the length times the distance of g from such a polynomial. The distance
-        from the Taylor polynomial around the middle is at most max |g| q^2N/(1 - q), over the disk of radius
-        half-width/q.
+        from the Taylor polynomial around the middle is at most q^2N/(1 - q) times the maximum of |g| on the disk of
+        radius half-width/q.
         """
         middle, half, response, (size, error) = self._nodes
         low, high = self.band
@@ -260,7 +261,7 @@ class _Dual:
         return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
-        """Return (the bound of a point less the shortage of D, the frequencies of D, its least eigenvalues there).
+        """Return (a point's bound less the shortage of D, frequencies at which D was evaluated, its least eigenvalues).
 
         The bound is zero if the forbidden sums are zero up to rounding only.
         """
@@ -273,7 +274,7 @@ class _Dual:
     def best(self) -> tuple[float, float]:
         """Return two bounds on the mean square: an estimate with D at samples, and one with D on the whole circle.
 
-        The points lie on the barrier's path. Frequencies at which D fails are added between the rounds.
+        The points are taken from the barrier's path. After each round, frequencies at which D fails are added.
         """
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
@@ -360,9 +361,9 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     """Return the sums that are zero because of delays, and whether they are exactly zero.
 
     A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E. Row i of s_k is zero for
-    1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels' psi differ, they
-    lie in a subspace, and v is from its complement, which a null space gives up to rounding. Long delays are cut to
-    their first steps, because every part of the sums gives a bound.
+    1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels' psi differ,
+    these products lie in a subspace; v is orthogonal to it and is computed as a null space, up to rounding. Only the
+    first steps of long delays are used, because any subset of the sums gives a bound.
     """
     import scipy
 
@@ -378,7 +379,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
         return _first(rows), True
     G = delay(loop.psi, loop.T) @ E
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
-    reach = np.zeros((span * m, span * m))  # coefficient l of R's row by step k of F's row
+    reach = np.zeros((span * m, span * m))  # map from the coefficients of R's row to the steps of F's row
     for step in range(span):
         for k in range(step, span):
             reach[step * m : (step + 1) * m, k * m : (k + 1) * m] = impulse[k - step]
@@ -399,10 +400,10 @@ def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:
-    """Return (1/z - 1) H_+ + H_0 at z = e^jw for H = a and H = j a, H(conj z) = conj H(z), (k, 2 functions).
+    """Return (1/z - 1) H_+ + H_0 at z = e^jw for H = a and for H = j a, with H(conj z) = conj H(z), (k, 2 functions).
 
-    Each a is piecewise linear with these heights on the grid and zero outside; the first and last heights are zero.
-    With sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2). H_+ therefore consists of
+    Each function a is piecewise linear with these heights on the grid and zero outside. The first and last heights are
+    zero. With sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2). H_+ therefore consists of
     dilogarithms Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
     """
     slopes = np.diff(heights, axis=0) / np.diff(grid)[:, None]
@@ -432,7 +433,7 @@ class BoundBeside:
     gap_db: float | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
     even_without: tuple[str, ...] = ()  # further requirements of the design, which the bound neglects
-    relative_mismatch_db: float | None = off_table("if given", None)  # of the supremum, if that was minimised
+    relative_mismatch_db: float | None = off_table("if given", None)  # if the design minimised the supremum
     proved: bool = False  # False: an estimate, whose dual matrix was checked at samples only
 
     @classmethod
@@ -476,7 +477,7 @@ class BoundBeside:
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
         left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
         rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"
-        certified = "that this-environment certifies"  # known devices, for one, allow for better couplings
+        certified = "that this-environment certifies"  # known-device may certify better ones
         if self.proved:
             return f"no linear coupling {certified} can be better than {rest}"
         rest = rest.replace(", nor than", " and", 1)

@@ -3,7 +3,7 @@
 No clock ends a search, so that results do not depend on the load of the machine. A search ends because it has
 converged, because a proof or a bound decides, or because one of these budgets is spent. Work is counted from the sizes
 of matrices and numbers (`haptic_loop.controller.arithmetic.spend`); one unit takes about a second on one core.
-Limits of bisections down to rounding, and of iterations in a tick, stand where they are used.
+Limits of bisections down to rounding, and of iterations in a tick, are defined where they are used.
 Measured on 23 loops, of which 22 are in benchmarks/loops, on one core of an AMD EPYC at 2.4 GHz.
 """
 
@@ -14,7 +14,7 @@ from typing import TypeVar
 
 # Work that is counted [units] -----------------------------------------------------------------------------------------
 
-#: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, over 800, the largest, 30.
+#: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and one over 800, the largest, takes 30.
 EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.006 for two devices and 0.008 for three.
 SWEEPS = 60.0
@@ -22,34 +22,36 @@ SWEEPS = 60.0
 GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of contacts.
 RANGES = 60.0
-#: The price of 10 %, by the largest number of devices. It takes up to 2.2 (two), 6.6 (three, four) and 16.4 (more).
+#: Figures of a coupling for environments within 10 % (design.optimal.spread), by the largest number of devices. They
+#: take up to 2.2 for two devices, 6.6 for three and four, and 16.4 for more.
 PRICE = {2: 6.0, 4: 12.0, 10**3: 40.0}
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
-#: Largest number of states of the loop with a basis: solving and proving one of 268 takes 8 for four devices (n6).
+#: Largest number of states of the loop with a basis. Solving and proving one of 268 states takes 8 for four devices
+#: (n6).
 BASIS_STATES = 270
-#: Cost of the proofs of a basis, (environments) states^2.7: that of 30 proofs over 112 states.
+#: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
-#: Unknowns of a basis for this-environment alone: ten seconds.
+#: Largest number of unknowns of a basis for this-environment alone. They take ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Unknowns by channels with further requirements: ten seconds, too.
+#: Largest product of unknowns and channels with further requirements. It takes ten seconds, too.
 BASIS_BESIDE = 3500
-#: Bases without a proof, one after the other, after which the growth ends.
+#: Number of successive bases without a proof after which the growth ends.
 UNPROVED_BASES = 2
-#: Bases, the best first, until one is proved at every vertex of ranges.
+#: Number of bases that are tried, the best first, until one is proved at every vertex of ranges.
 RANGED_BASES = 3
 
 # Sizes of proofs, and rounds of searches that normally converge earlier, with the measured numbers -------------------
 
-#: States of a proved block: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800.
+#: Largest number of states of a proved block: 0.3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800.
 PROOF_STATES = 800
 #: Rounds of cuts of a multiplier (one-wall takes 8), and rounds without progress after which rounding dominates.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
-#: Rows of a block whose multiplier is searched: those of twelve devices with limited forces.
+#: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have as many.
 MULTIPLIER_ROWS = 24
-#: Rounds of a search for gains with added frequencies (case I takes 3), and its steps. The numbers of steps are for
-#: every start and for the best starts with many devices, and for every start with few devices.
+#: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many devices
+#: every start has the first number, and the best starts have the second. With few devices every start has the third.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 #: Rounds with further frequencies of Theorem 4. Only delays of a hundred samples and more take any.
 THEOREM_4_ROUNDS = 12
@@ -60,17 +62,17 @@ LESS_DAMPING_ROUNDS = 6
 #: Rounds with further frequencies of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6
 #: Rounds with further frequencies of the bound on linear couplings, sums of coefficients in it, and intervals of its
-#: integral. Cases I and II take 2 rounds and 568 intervals; a sum is a step of a delay in one row.
+#: integral. Cases I and II take 2 rounds and 568 intervals. A step of a delay in a row gives sums.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
-#: Problems of a coupling of fixed order: in total, for one norm by complementarity, and cuts for one choice of poles.
-#: In case I inner approximation takes 32 in total. Fixed poles (105) and complementarity (103, 20 for one norm) spend
-#: the budget. A choice of poles takes 2 cuts.
+#: Convex problems for a coupling of fixed order: in total, and for one norm by complementarity. The third number limits
+#: the cuts for one choice of poles. In case I inner approximation takes 32 in total. Fixed poles (105) and
+#: complementarity (103, 20 for one norm) spend the budget. A choice of poles takes 2 cuts.
 FIXED_ORDER_PROBLEMS, COMPLEMENTARITY_PROBLEMS, FIXED_POLE_CUTS = 100, 20, 20
 #: Cuts of the least share of a known device at one beta, and rounds of tangents for beta and multipliers. The pair of
 #: omega.3 with known transmissions takes 4 and 11, one with walls and limited forces 20.
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Points between the vertices of ranges: on all edges, least and most on one edge, on faces and inside, and starts of
-#: ascents. Together they are the about 500 sweeps of RANGES.
+#: Numbers of points between the vertices of ranges: on all edges; least and most on one edge; on faces and inside; and
+#: starts of ascents. Together they take the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge, with the largest number of steps in brackets. Measured with the optimal and the
@@ -79,8 +81,9 @@ RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 #: Newton steps to the centre of a barrier (9 centrings spent them and kept the last point), and of the primal-dual
 #: method (two runs spent them because of rounding).
 CENTRING_STEPS, CONE_STEPS = 60, 60
-#: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further one
-#: takes as much off what is left. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after them (1).
+#: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further pass
+#: divides the condition number by as much. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after
+#: them (1).
 DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
 #: Rounds of halving the intervals of an integral (3), and intervals that are halved in one round.
 INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000

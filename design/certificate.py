@@ -46,7 +46,7 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, Limi
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
 
-_CLAIM_TOLERANCE = 1e-6  # allowed error of the required damping on file; sweeps repeat to 1e-9
+_CLAIM_TOLERANCE = 1e-6  # allowed error of the required damping on file; repeated sweeps agree to 1e-9
 
 
 @contextmanager
@@ -66,11 +66,11 @@ def _in_time() -> Iterator[None]:
 # The blocks are those of the condition (design.conditions, design.environments), over the rationals. The proof shows
 # that static matrices are symmetric, and positive semidefinite where required. It shows that each block at the
 # available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
-# any-environment with psi = 0 Phi = 0 satisfies Lemma 4, because the parameters of a Network are non-negative. The
-# multipliers are stored.
+# any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the parameters of a Network are
+# non-negative. Other multipliers are stored.
 #
-# With ranges this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..), not for the
-# environments in between or for one that changes.
+# With ranges, this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..). It is not
+# proved for the environments in between, nor for an environment that changes.
 #
 # A certificate names its base condition and the facts that are part of its block: latency, walls, limiter, switching.
 
@@ -102,7 +102,7 @@ def prove(
         swept: The result of `required_damping` for these arguments, if the caller has it.
 
     Raises:
-        NotProved: With the reason.
+        NotProved: No proof was found; the message gives the reason.
     """
     import scipy
 
@@ -163,7 +163,7 @@ def _proof(
 
 
 def _placed(place: str, reason: str) -> str:
-    """Return the reason with its place before it, unless it begins with the place."""
+    """Return the reason with the place as its beginning."""
     return f"{place}{reason.removeprefix(place)}"
 
 
@@ -194,7 +194,7 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
 
 
 # Larger problems are refused at once: a proof would take minutes.
-_MOST_BITS = 400  # of the denominator of a coefficient, which is a decimal of 120 places
+_MOST_BITS = 400  # largest size of a coefficient's denominator; a decimal of 120 places has 399 bits
 _MOST_COST = 2  # total cost of the members of ranges, in units of one proof with PROOF_STATES states
 
 
@@ -233,8 +233,8 @@ _MOST_LOST = 1e-4  # largest difference of float and exact response, relative to
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
-    Responses and rounding errors may differ by _MOST_LOST on the circle. They differ by more if terms cancel that are
-    far larger than the forces.
+    On the circle the difference of the responses, plus the rounding errors, may be at most _MOST_LOST of the largest
+    response or of Delta_D/T. It is larger if terms that are far larger than the forces cancel.
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
@@ -408,7 +408,7 @@ def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[floa
 _NAMED: dict[str, Condition] = {
     each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
 }
-_PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # conditions that are facts in a certificate
+_PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # a certificate states them as facts of a base
 
 
 def _is_ours(condition: Condition) -> bool:
@@ -434,9 +434,9 @@ def named(condition: str | Condition) -> Condition:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """Return the damping that the condition requires, the same share of each device's damping, from a refined sweep.
+    """Return the damping that the condition requires, as one share of all devices' damping, from a refined sweep.
 
-    With ranges this-environment returns the largest requirement of all members. The requirement of a loop without a
+    With ranges, this-environment returns the largest requirement of all members. The requirement of a loop without a
     solution is infinite.
     """
     requirement = named(condition).judge(loop, coupling, multiplier)
@@ -479,8 +479,9 @@ def requirements_of(
 ) -> dict[str, Requirement]:
     """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
-    this-environment is for the nominal environment and the constant theta; design.assessment adds ranges and switching.
-    The proof of `known`, a certificate that holds, is not repeated; without `more` nothing else is proved.
+    The environment is the nominal one and the delays theta are constant; design.assessment adds ranges and switching.
+    `known` is a certificate that holds; its proof is not repeated. If `more` is false, other conditions are proved only
+    if `known` does not belong to this loop and coupling.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)

@@ -1,4 +1,4 @@
-"""Conditions under which no passive human can make a loop oscillate. Each condition states its block once.
+"""Conditions under which no passive human can make a loop oscillate.
 
 A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.frame) holds it
 as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
@@ -11,14 +11,15 @@ stacks their inputs and adds their forms, as design.frame describes. design.envi
 conditions, and design.certificate has one exact proof and one file format.
 
 To add a hands' side, derive a class from `HandsSide` and state
-  `inputs`   one `Input` per scalar input. `moved` are the weights w_0 + w_1 z + .. of its share of the displacement
-             that f[k] multiplies. Examples: dx (1,); xa of a latency, which f[k-1] multiplies, (0, 1); the speed v of a
-             known device in f'(dx + beta dv), (-beta, beta) with `follows=0`. `slips` says whether the limiter's slip
+  `inputs`   one `Input` per scalar input. `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
+             that f[k] multiplies. dx has (1,). xa of a latency, which f[k-1] multiplies, has (0, 1). The speed v of a
+             known device in f'(dx + beta dv) has (-beta, beta) and `follows=0`. `slips` says whether the limiter's slip
              is subtracted from the input;
   `damping`  the matrix over its inputs that is proportional to Delta_D;
   `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
   `unknowns` its multipliers, by name.
-`hands_side(loop)` chooses it for the loops that declare it. Rows, walls, limiter and switching follow.
+Let `hands_side(loop)` return the class for its loops. `compose` then makes the rows and adds walls, limiter and
+switching without further code.
 
 any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`v_hat`,
 `any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
@@ -79,18 +80,19 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
 
 
 def v_hat(H: Block) -> tuple[Array, Block]:
-    """Return H(1), symmetric, and H(1)/2 - (H - H(1))/(z - 1), with the Hermitian part of T V-hat/|1 - 1/z|^2.
+    """Return H(1) and H(1)/2 - (H - H(1))/(z - 1), whose Hermitian part is that of T V-hat/|1 - 1/z|^2.
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) combines the compliance V and the delays. V-hat vanishes at z = 1,
-    where it cannot be strictly positive, so it is divided by |1 - 1/z|^2. The factor (1 - 1/z) becomes 1/(1 - z), whose
-    pole has the Hermitian part 1/2. The result is linear in H, so V and Theta-hat may be passed separately.
+    where it cannot be strictly positive, so it is divided by |1 - 1/z|^2. The factor (1 - 1/z) becomes 1/(1 - z), which
+    has the Hermitian part 1/2. H(1) must be symmetric. The result is linear in H, so V and Theta-hat may be passed
+    separately.
     """
     H1, regular = H.over_z_minus_one()
     return H1, -regular
 
 
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
-    """Return the block of Theorem 4 for the damping s Delta_D, times s; psi >= 1 needs the multiplier phi (m,) [N s/m].
+    """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. After the
     division by |1 - 1/z|^2 (see `v_hat`) this is T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat. A Schur
@@ -107,7 +109,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     short = np.flatnonzero(shortage)
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
-        """Return H(1) and the block of H with this corner, linear in both."""
+        """Return H(1) and the block with this lower right corner; both are linear in H and the corner."""
         H1, regular = v_hat(H)
         if not short.size:
             return H1, regular
@@ -151,7 +153,8 @@ def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
     return hermitian_floor(demand.free + demand.gain, -slack / 2, -slack)[0] >= -slack
 
 
-#: A pair is singular if its determinant is below _SINGULAR times the diagonal's product; smaller entries are rounding.
+#: A 2 x 2 gain is singular if its determinant is below _SINGULAR times the product of its diagonal. Diagonal entries
+#: below _NOTHING times the largest one are rounding.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are processed together
 
@@ -169,7 +172,7 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 def least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
-    Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
+    If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if gain.shape[-1] == 2 and (own > 0).all():
@@ -410,7 +413,7 @@ def unsound(system: Lti, delta: Sequence[float]) -> str | None:
 
 
 def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> str | None:
-    """Return the reason why the demand's static matrices violate it by more than rounding, or None."""
+    """Return the reason why a static matrix of the demand is asymmetric or negative beyond rounding, or None."""
     end = system.at(-1.0)
     for matrix, value in demand.static.items():
         skew, least = _static_errors(value, system.D, end)
@@ -453,7 +456,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """Return `ratio_in` by the poles and states of the force map."""
+    """Return `ratio_in` from the states of the force map; inf without a stable map."""
     try:
         F = loop.F(coupling)
         if thin == 1:
@@ -472,7 +475,7 @@ _STATIC = 1e-9  # allowed relative asymmetry and negativity of F(1)
 def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
     """Return the asymmetry of F(1) and its least eigenvalue, (...,) each, relative to the largest of all matrices.
 
-    The other matrices count because F(1) of a free mass is a difference of large numbers, which should be 0.
+    The other matrices set the scale because F(1) of a free mass should be 0 but is a difference of large numbers.
     """
     scale = np.max([np.abs(part).max(axis=(-2, -1)) for part in (F1, *elsewhere)], axis=0, initial=1e-12)
     turned = np.swapaxes(F1, -1, -2)
@@ -483,7 +486,7 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
 def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
     """Return the damping that any-environment requires for V before any passive environment.
 
-    With phi (m,) [N s/m] (see `any_environment_demand`) V stands before the loop's own environment and its delay psi.
+    With phi (m,) [N s/m] (see `any_environment_demand`) the environment is the loop's own, with its delay psi.
     """
     available = dampings(loop.delta, V.inputs)
 
@@ -523,8 +526,8 @@ def asymmetric(V1: Array) -> str | None:
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     """Return `least_scale` (k,), without a demand in directions in which V vanishes.
 
-    If V and the delays' window vanish together, V-hat vanishes, and He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. The
-    moving average has this property at every zero of its window. If only V vanishes, the ratio is large.
+    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. The
+    moving average has this property at every zero of Theta-hat. If only V vanishes, the ratio is large.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -536,7 +539,7 @@ def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
 
 
 def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
-    """Return any-environment for a diagonal coupling from its channels, with each device's own figure."""
+    """Return the requirement of any-environment for a diagonal coupling, channel by channel."""
     each = [any_environment(v, loop.channel(i)) for i, v in enumerate(V)]
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
@@ -568,7 +571,7 @@ _CHUNK = 256  # ticks summed at once
 def l1_gain(F: Lti) -> Array:
     """Return an upper bound of the sum over all ticks of |impulse response|, (p, m); inf for an unstable F.
 
-    Ticks are summed until the bound of the rest is small: with A'PA <= r^2 P, r < 1,
+    Ticks are summed until the bound of the remaining sum is small. With A'PA <= r^2 P and r < 1 this bound follows from
     |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
     """
     import scipy
@@ -599,7 +602,7 @@ def l1_gain(F: Lti) -> Array:
 
 
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
-    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m] for any condition.
+    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], for every condition.
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound does not hold behind
     a limiter or walls. Friction of a device with several `axes` opposes its velocity in space, and |W|_2 of these axes
@@ -636,7 +639,7 @@ def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array
 def any_environment_ratios(
     V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
 ) -> Array:
-    """Return required over available damping (count,) of any-environment, from the block of their responses."""
+    """Return required over available damping (count,) of any-environment for `count` compliances V."""
 
     def needed(w: Array) -> Array:
         return _least_scales(demand(V(on_circle(w))))
@@ -649,6 +652,6 @@ def _least_scales(demand: Demand[Sampled]) -> Array:
 
 
 def regular_part(E: Lti) -> Lti:
-    """Return a block with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle except z = 1; stable if E is."""
+    """Return a block with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle, except z = 1; stable if E is."""
     _, regular = E.over_z_minus_one()
     return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

@@ -73,13 +73,13 @@ class Stored(Strict, frozen=True):
         return self.coupling.build(self.loop.T)
 
 
-_SAME = 1e-9  # rounding between the responses of a coupling and its form, relative to the largest response
+_SAME = 1e-9  # allowed rounding between responses of a coupling and its form, relative to the largest response
 
 
 def filed(loop: Loop, coupling: Coupling) -> Coupling:
-    """Return the coupling as a file restores it: itself, or the one that the form of a user's own class builds.
+    """Return the coupling as a file restores it, which for a user's own class is built from its form.
 
-    Raises InputError if the restored coupling is another system, in the loop or in its compliance.
+    Raises InputError if the restored coupling has another response in the loop, or another compliance.
     """
     built = coupling.form().build(loop.T)
     if type(built) is type(coupling):
@@ -151,7 +151,7 @@ class _Twice(Exception):
 
 
 def _once(pairs: list[tuple[str, Any]]) -> None:
-    """Raise _Twice for a repeated name, of which JSON readers take the last value and people may read the first."""
+    """Raise _Twice for a repeated name: JSON readers take its last value, but people may read its first."""
     names: set[str] = set()
     for name, _ in pairs:
         if name in names:
@@ -169,7 +169,7 @@ def _place(content: bytes, message: str) -> str:
 
 
 def save(stored: Stored, path: str | Path) -> None:
-    """Write through a temporary file beside `path`, so that the file is always complete. Raises InputError."""
+    """Write the stored coupling through a temporary file, so that `path` is always complete. Raises InputError."""
     if _read_back(stored) is stored:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
         own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")

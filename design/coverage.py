@@ -37,7 +37,7 @@ class _Playout:
 
 @dataclass(frozen=True)
 class Switching:
-    """Requirement for any switching within a loop's range of delays; without a proof only the requirement."""
+    """Requirement for any switching within a loop's range of delays; if it is infinite, further figures are None."""
 
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
@@ -75,7 +75,7 @@ class OverRanges:
     """Requirement and mismatch of a coupling over ranges; a mismatch of zero is null in JSON."""
 
     coupling: str
-    violated: int  # vertices
+    violated: int  # number of members that violate the condition
     required_over_available: NominalWorst
     rms_mismatch_db: NominalWorst
     relative_mismatch_db: NominalWorst
@@ -104,7 +104,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of a design over the ranges, after those of `nominal`, a design without ranges."""
+    """Return the figures over the ranges of the design that `nominal` makes without ranges, then those of `design`."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

@@ -37,7 +37,7 @@ class _Kind(NamedTuple):
 
     conditions: tuple[Condition, ...]  # allowed conditions, the default first
     module: str  # of design/, imported on first use
-    function: str  # from a loop to a Design
+    function: str  # name of the function from a loop to a Design
     takes: tuple[str, ...] = ()  # further arguments: condition, progress
     options: tuple[str, ...] = ()  # names of design.api.DesignOptions that the function takes
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
@@ -81,9 +81,11 @@ def kind_of(name: str) -> _Kind:
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
-    A spring-damper is designed for this environment, which has the least transparency error. For walls, worlds, ranges
-    and varying delays it is designed for any environment. The conditions for known devices take their place where
-    they cover the loop, since they never require more: known-device-any before walls. Others have one condition.
+    A spring-damper is designed for this environment, which gives the least transparency error, or with walls, worlds,
+    ranges and varying delays for any environment; with a latency always for this environment. If bounds of
+    the devices are known, known-device replaces this environment, except with a latency. With walls known-device-any
+    is the default if it covers the loop. Neither ever requires more damping. Apart from these two conditions, every
+    other kind has one.
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
@@ -174,7 +176,7 @@ def design_by_kind(
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
-    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # whose gains are searched with constant delays
+    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # The search for gains takes constant delays.
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)
@@ -230,7 +232,7 @@ def _in_principal_axes(
     values = (1 - _ROUNDED) * np.diag(Q.T @ Delta @ Q)
 
     def made(part: Loop) -> Design:
-        """Return the design for the share of the damping that `part` has; all of its walls touch."""
+        """Return the design for `part`, which is the loop with a share of its damping and with touching walls."""
         delta = tuple((part.delta[0] / loop.delta[0] * values).tolist())
         straight = {"environment": _Turned(loop.environment, Q), "delta": delta, "levels": None, "ranges": None}
         design = design_by_kind(msgspec.structs.replace(part, **straight), kind, condition, progress, **options)
@@ -280,7 +282,8 @@ _UNUSED = 0.005  # largest unused share of the damping at which `_with_less_damp
 def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Condition) -> Design:
     """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
 
-    The designs neglect the latency and assume that all walls touch; for any environment they have the longest delay.
+    The designs neglect the latency and assume that all walls touch. Designs for any environment or for known devices
+    are made for the longest delays.
     """
     share, best, shortfall = 1.0, None, ""
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
@@ -293,7 +296,7 @@ def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Co
         needs = condition.judge(loop.at(loop.environment), design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            best = replace(design, requirement=needs, notes=())  # Notes are of the part.
+            best = replace(design, requirement=needs, notes=())  # The notes describe `part`.
             if needs.ratio > 1 - _UNUSED:
                 return best
         if np.isinf(needs.ratio):

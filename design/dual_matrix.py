@@ -7,16 +7,17 @@ piecewise linear with bends c_i at x_i, so that with H_0 = mean and a = 1/z - 1
 
 In an interval of length l without a bend inside, the error of linear interpolation is at most
 - l^2/8 max |f^(2)| for any f;
-- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi, because
-  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2 and |cot(x/2)|/2 <= 1/|x|, and because the error of x log x, whose
-  second derivative is 1/x, is largest on [0, l], where it is l/e;
+- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi. Here
+  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2, and |cot(x/2)|/2 <= 1/|x|. The function x log x has the second
+  derivative 1/x, and its error is largest on [0, l], where it is l/e;
 - l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with derivatives in the middle, for the sum over far bends, whose
   terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
 - |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the
-  interpolant of g, whose second derivative is a^(2) times the interpolant and 2 a^(1) times its slope, with
-  |a^(1)| = |a^(2)| = 1.
-No matrix on the line between two Hermitian matrices has a smaller eigenvalue than both of them. The least eigenvalue in
-the interval is therefore at least the smaller one at its ends, less the Frobenius norm of these errors and of rounding.
+  interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times its slope,
+  with |a^(1)| = |a^(2)| = 1.
+On the line between two Hermitian matrices, no matrix has an eigenvalue below the least ones of both. The least
+eigenvalue in the interval is therefore at least the smaller one at its ends, less the Frobenius norm of these errors
+and of rounding.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _SHARE = 8  # intervals are halved until their error is below 1/_SHARE of the to
 
 @dataclass(frozen=True, eq=False)
 class DualMatrix:
-    """D of one dual point, for m channels, n bends, and sums of C_k up to the step K."""
+    """The matrix D of one dual point, for m channels, n bends of H, and C_k up to the step K."""
 
     points: Array  # (n,) x_i [rad/sample], in (0, pi)
     bends: Complex  # (n, m, m) c_i times 4/T, scaled

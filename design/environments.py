@@ -1,7 +1,7 @@
 """Conditions with multipliers: this-environment with walls, ranges, switching delays and limited forces.
 
-Walls, switching delays and limited forces weigh an error with a multiplier, in which the block is affine; `Multiplied`
-searches the best multiplier. The members of ranges are proved one by one.
+The blocks for walls, switching delays and limited forces are affine in a multiplier, which weighs an error term;
+`Multiplied` searches the best multiplier. The members of ranges are proved one by one.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peak
 from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
-# The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers at some frequencies
-# is a matrix inequality (design.cone). Its solution bounds s from below. Frequencies at which a sweep with the solution
-# needs more are added, until the sweep attains the bound.
+# The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers, at finitely many
+# frequencies, solves a semidefinite program (design.cone). It bounds s from below. Frequencies at which a sweep with
+# the program's multiplier needs a larger s are added, until the sweep attains the bound.
 
 
 class Multiplied(Condition):
@@ -74,7 +74,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block` as an affine function of s and the search's unknowns, which are s times those of `hands`."""
+        """Return `block`, affine in s and the search's unknowns, which contain the multipliers of `hands` times s."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -94,7 +94,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier, or at the best one with the `bound` of the search."""
+        """Return the requirement at this multiplier; without one, at the best multiplier, with the search's `bound`."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -156,7 +156,7 @@ def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequenc
 _MOST_PEAKS = 3  # largest number of frequencies that are added in a round
 _NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
 _SETTLED = 5e-7  # relative gap between the sweep and the bound at which the search ends
-_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; smaller ones are 0, in units
+_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; values below 1e-6 units count as 0
 
 
 class _Search:
@@ -244,7 +244,7 @@ class _Search:
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
         """Return (largest ratio at these values, frequencies to add); no frequencies if the ratio is at the bound.
 
-        The ratio is for the block less its spare, so that the multiplier may be rounded.
+        The ratio is that of the block less the demand's `spare`, a margin that allows rounding the multiplier.
         """
         demand = self._block(values)
         demand = replace(demand, free=demand.free - self._spare) if self._spare.any() else demand
@@ -303,8 +303,8 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the start of each multiplier.
 
-        alpha is half the width of the delays times the device's largest force per own displacement. With many devices,
-        whose multipliers are not searched, alpha is the best of several shares of this value.
+        alpha is half the width of the range of delays, times the device's largest force per own displacement. With many
+        devices the multipliers are not searched, and alpha is the best of several shares of this value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -339,7 +339,7 @@ class ThisEnvironment(Multiplied):
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block; without a multiplier that for touching walls and constant delays."""
+        """Return the block; without a multiplier all walls touch and delays are constant."""
         if multiplier is not None:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
@@ -359,7 +359,10 @@ class ThisEnvironment(Multiplied):
         return requirements[worst(requirements)]
 
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """Return the requirement with `multiplier`, or the usual one or the worst member's best one."""
+        """Return the largest requirement of all members with `multiplier`.
+
+        For None it is the smaller one of two: with the usual multiplier, and with the best one of the worst member.
+        """
         loops = [loop.at(member.network) for member in loop.members()]
 
         def most(values: Any) -> tuple[Requirement, Loop]:
@@ -429,7 +432,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 
 
 class SwitchingDelays(ThisEnvironment):
-    """this-environment of a loop whose delays switch, as the separate requirement "switching"."""
+    """this-environment of a loop whose delays switch, reported as a separate requirement "switching"."""
 
     name, covers = "switching", ("psi", "T_max", "latency", "varying_delay", "walls")
 
@@ -451,8 +454,8 @@ def _half_widths(loop: Loop) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Forces that leave through the limiter of controller.law. any-environment without delay in the environment needs no
-# proof of its own: with rho = 0 the limiter and the environment together are a passive environment.
+# Forces that are sent through the limiter of controller.law. any-environment covers them without a further proof if the
+# environment has no delay: with rho = 0 the limiter and the environment together are a passive environment.
 
 BETA = 0.01  # default lag of a limiter under this-environment, relative to Delta/T
 
@@ -462,7 +465,7 @@ class LimitedForces(ThisEnvironment):
     """this-environment also while forces are limited, by a limiter of lag rho_i = beta lambda_min(Delta_i)/T."""
 
     beta: float = BETA
-    lags: int = 1  # weights c_ij per device
+    lags: int = 1  # number of weights c_ij per device
     held: tuple[float, ...] | None = None  # rho [N/m] per device of a certificate; None: computed from beta
     name, covers = "limiter", BEYOND
 
@@ -493,7 +496,7 @@ class LimitedForces(ThisEnvironment):
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
 
     def not_designed(self, loop: Loop) -> str | None:
-        """Return the reason why no design for limited forces exists in this loop, or None; other loops are judged."""
+        """Return the reason why this loop has no design for limited forces, or None; couplings can still be judged."""
         if loop.varying_delay:
             return "limiter: designs for limited forces are made for constant delays, not for delays that switch"
         if loop.environment.walls or loop.latency:

@@ -114,7 +114,7 @@ class _Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
-_MANY_ROWS = 8  # above it `strictly_positive` is tried before the elimination
+_MANY_ROWS = 8  # number of rows above which `strictly_positive` is tried before the elimination
 
 
 def definiteness(S: Matrix) -> _Definiteness:
@@ -153,8 +153,8 @@ def definiteness(S: Matrix) -> _Definiteness:
 # be exact, too, but its numbers grow with every pivot.
 
 
-BITS = 192  # of the rounded matrix whose definiteness is tested
-_FACTOR_BITS = 46  # of the entries of R, relative to the largest
+BITS = 192  # binary places of the rounded matrix whose definiteness is tested
+_FACTOR_BITS = 46  # bits of the largest entry of R; the others are rounded to the same unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
@@ -174,7 +174,7 @@ def strictly_positive(S: Matrix) -> bool:
 
 
 def _halves(S: Matrix) -> list[int]:
-    """Return the powers of two that divide rows and columns of a positive S for a diagonal near one."""
+    """Return exponents of two; S with rows and columns divided by these powers has a diagonal near one."""
     return [(int(v).bit_length() - S.den.bit_length()) // 2 for v in np.diag(S.num)]
 
 
@@ -277,9 +277,9 @@ def _whitening(W: Array) -> _Integers | None:
 # which is as good as any other. The errors of all other rounding are bounded and subtracted.
 
 
-_MOST_BITS = 4000  # of the common denominator of a stored P; our own have some hundred bits
-_STORED_BITS = 48  # of each entry of P, relative to its diagonal
-_EXTENDED_BITS = 96  # of the factors of exact products, relative to the largest entry; extended precision has fewer
+_MOST_BITS = 4000  # largest size of the common denominator of a stored P; that of `find_storage` has some hundred bits
+_STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
+_EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
 _LEFT = 0.02  # largest residual of the Riccati equation, relative to its drive
 _UNIT = 2.0**-53  # of double precision
@@ -295,8 +295,8 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     multiples of 2^-bits; the rounded P is exactly known and as good a proof as any other. The other matrices are
     rounded to multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded
     down to multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm. The error
-    by E is |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, of which floating point gives at least
-    two digits.
+    by E is |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point computes to at
+    least two digits.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
@@ -444,7 +444,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (the change of coordinates, P in these coordinates); `white` makes states independent.
+    """Return (the change of coordinates, P in these coordinates); with `white` they make the states independent.
 
     Raises LinAlgError.
     """
@@ -504,7 +504,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 def _independent(covariance: Array) -> tuple[Array, Array]:
     """Return the change to coordinates with the covariance I, and its inverse."""
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Cancelling inputs leave rounding only.
+    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Some variances are rounding only.
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     root = np.sqrt(np.maximum(size, size[-1] * _LEAST_MOVED))
     return (V / root).T / deviation, deviation[:, None] * V * root
@@ -527,7 +527,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     for _ in range(budgets.RICCATI_STEPS):
         PA = P @ A
         cross, gap = C - B.T @ PA, R - B.T @ P @ B
-        feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # The residual is of second order in it.
+        feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # The residual is second order in its error.
         half = cross.T @ feedback
         left = A.T @ PA - P + half + half.T - feedback.T @ gap @ feedback + drive * one
         if np.abs(left).max() < _LEFT * drive:
@@ -537,7 +537,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
 
 
 def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
-    """Return the limit of X = H + A'X (I + S X)^-1 A from X = 0, or without S of X = H + A X A', by doubling.
+    """Return the limit of X <- H + A'X (I + S X)^-1 A, or without S of X <- H + A X A', from X = 0, by doubling.
 
     Raises LinAlgError if the iteration diverges.
     """
