@@ -1,7 +1,7 @@
 """The record of a session: its trace, and the replay of the trace through the controller, bit by bit.
 
-A trace is the npz of sim.run, with what the link saw beside it, so that it can be replayed; the recipe for that (the
-limits, coupling and scenario of every arming) travels in its metadata. A digest tells whether it was changed.
+A trace is the npz of sim.run with arrays of the link added, so that it can be replayed. Its metadata hold the recipe
+for the replay (the limits, coupling and scenario of every arming). A digest detects changes of the file.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from haptic_loop.hw.protocol import NO_MARGIN, SafetyStop
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace
 
-#: what the link adds, one entry per tick and name
+#: names of the link's arrays in a trace, each with one entry per tick
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")
-_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers that a row has once, not per axis
+_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers of which a row has one, not one per axis
 
 
 class Recorder:
@@ -61,9 +61,9 @@ class Recorder:
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
-        """Return [first, stop) of each arming in which the loop was linear: full gain, until cap or slew rate cuts.
+        """Return the ticks [first, stop) of each arming with a linear loop: full gain, before a cap or slew rate acts.
 
-        Missed ticks are not left out. `force_step` (m,) [N].
+        Missed ticks are included. `force_step` is (m,) [N].
         """
         link = self.link()
         wanted = -np.round(link["asked"] / np.array(force_step))
@@ -77,7 +77,7 @@ class Recorder:
         return stretches
 
     def trace(self, units: Units, T: float, meta: dict[str, Any], names: tuple[str, ...] = ()) -> Trace:
-        """Return a trace as of sim.run. Handles and outside forces are not measured (nan, or no column)."""
+        """Return a trace in the form of sim.run. Handles and outside forces are not measured (nan, or no column)."""
         link = self.link()
         n, m = len(self), self.channels
         last = np.maximum.accumulate(
@@ -149,9 +149,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _Comparison:
     """Where the replay differs from the record."""
 
-    asked: NDArray[np.bool_]  # (N,) the controller's forces, as 64-bit floats
-    sent: NDArray[np.bool_]  # (N,) what was put on the wire, as integers
-    largest: float  # [N] between the controller's forces
+    asked: NDArray[np.bool_]  # (N,) whether any bit of the controller's forces differs
+    sent: NDArray[np.bool_]  # (N,) whether the steps sent differ
+    largest: float  # [N] largest difference of the controller's forces
 
     @property
     def identical(self) -> bool:
@@ -161,7 +161,7 @@ class _Comparison:
 def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
     """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest.
 
-    Raises InputError where the trace has no recipe for that.
+    Raises InputError where the trace cannot be replayed, as without a recipe.
     """
     wanted, sent, arming = np.zeros_like(link["asked"]), np.zeros_like(link["sent"]), link["arming"]
     try:

@@ -1,6 +1,7 @@
 """Run a whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
 
-Nothing waits, and all random numbers have a seed: a session of seconds runs in less than one, always the same.
+Nothing waits in real time, and all random numbers have a seed. A session of some seconds takes less than one second,
+and repeats exactly.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from haptic_loop.hw.session import Said, Session, session_for
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.trace import Trace
 
-_MEASURE = 200  # answers that are timed: virtual time does not scatter
-_QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
-_BEGIN_US = 500  # after the device's first tick
-_GRACE_US = 20_000  # after the end
-_LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
+_MEASURE = 200  # answers that are timed; few suffice, because virtual time does not scatter
+_QUANTILE, _GUARD_US = 0.99, 100.0  # part of the ages that the delay covers, and its guard [us]; as in hw.bridge
+_BEGIN_US = 500  # time from the device's first tick to the start of the session
+_GRACE_US = 20_000  # time after the end of a session in which its device comes to rest
+_LATENCY_US = 60  # of one direction, so that the median age is about the 130 us measured
 
 Plan = Callable[[Ages], Sequence[Armable]]
 
@@ -59,11 +60,11 @@ class _Cable:
     up: Line
     down: Line
     period: float  # [us]
-    data: bytes = b""  # what has come in
+    data: bytes = b""  # bytes that have come
     gone: bool = False
 
     def wait(self, seconds: float) -> bool:
-        """Advance time until bytes have come, or by so many seconds."""
+        """Advance time until bytes have come, by at most `seconds`."""
         return self.rehearsal.wait(seconds, (self,))
 
     def read(self) -> bytes:
@@ -89,7 +90,7 @@ class _Cable:
         """Advance the device by a tick."""
         rehearsal, emulator = self.rehearsal, self.emulator
         now, clock = rehearsal.now, round(rehearsal.now)
-        if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
+        if clock < emulator.stalled_until:  # the ticks of a stall are skipped, not made up for
             return rehearsal.at(emulator.stalled_until, self.tick)
         data = emulator.tick(clock)
         emulator.advance()
@@ -114,9 +115,9 @@ class Further:
     """One more emulated board of a rehearsal, with a clock of its own (hw/boards.py)."""
 
     emulator: Emulator
-    clock: float = 1.0  # how long a tick lasts, in T
-    faults: tuple[FaultInjection, ...] = ()  # of its line
-    begin_us: float = 0.0  # its first tick
+    clock: float = 1.0  # length of a tick in T
+    faults: tuple[FaultInjection, ...] = ()  # faults of its line
+    begin_us: float = 0.0  # time of its first tick
 
 
 @dataclass
@@ -133,11 +134,11 @@ class Rehearsal:
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
-    arm: bool = True  # once; a softer coupling waits for a person
-    operator: Operator | None = None  # in place of `arm`: the rule of a live session
+    arm: bool = True  # whether to arm the first coupling; a softer one waits for a person
+    operator: Operator | None = None  # decides in place of `arm`, as in a live session
     latency_us: float = _LATENCY_US
-    clock: float = 1.0  # how long a tick of the device lasts, in T
-    keep: bool = True  # every tick of the device in `moments`
+    clock: float = 1.0  # length of a tick of the device in T
+    keep: bool = True  # whether to record every tick of the device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
     further: Sequence[Further] = ()
     moments: list[_Moment] = field(default_factory=list)
@@ -163,7 +164,7 @@ class Rehearsal:
         return self.session
 
     def run_until_armed(self, seconds: float) -> Session:
-        """Run until `seconds` after arming, or a little longer than a session that is never armed."""
+        """Run until `seconds` after arming, or until shortly after the end of a session that is never armed."""
         while self.armed_us is None and not self._over:
             self._turn()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
@@ -202,7 +203,7 @@ class Rehearsal:
             self._ended = self.now
 
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
-        """Advance time until bytes have come, or by so many seconds, and as long as the host is frozen."""
+        """Advance time until bytes have come, by at most `seconds`, and then while the host is frozen."""
         until, cables = self.now + 1e6 * seconds, cables or self._cables
         while not (ready := any(cable.data or cable.gone for cable in cables)) and self._queue[0][0] <= until:
             self._next()
@@ -213,14 +214,14 @@ class Rehearsal:
         return any(cable.data or cable.gone for cable in cables)
 
     def _frozen_for(self) -> float:
-        """Return the time [us] for which the host does nothing."""
+        """Return the time [us] for which the host stays frozen."""
         since = self.emulator.since_armed(round(self.now))
         if since is None:
             return 0.0
         left = [start + lasts - since for start, lasts in self.host_stalls if start <= since < start + lasts]
         return 1e6 * max(left) + 1 if left else 0.0
 
-    # what happens in time
+    # the queue of events
 
     def at(self, when: float, what: Callable[[], object]) -> None:
         heapq.heappush(self._queue, (when, next(self._number), what))
@@ -235,7 +236,7 @@ class Rehearsal:
         self.now, _, what = heapq.heappop(self._queue)
         what()
 
-    # what came of it
+    # results
 
     @property
     def armed_us(self) -> int | None:
@@ -274,11 +275,11 @@ class Rehearsed:
         delay: The median time from a sample to its force [s]; None where it was not measured.
         theta: (m,) delays for which the coupling is certified [samples]; None where there is none.
         latency: Least and most time by which forces latch after their tick [s]; None where they latch at ticks.
-        coupling: The coupling with which the device was armed, or would have been.
+        coupling: The first coupling certified for the measured delay; None where there is none.
         assessment: The assessment of that coupling in the loop with the measured delay.
-        result: A Trace with t, x and f of every tick; handles are not measured.
-        zero_after: The time from the wish to stop until no motor does anything [s], the last test of the motors
-            included; None where it never ran.
+        result: A Trace with t, x and f of every tick, without handles, which are not measured; None without ticks.
+        zero_after: The time from the request to stop until all motors stay at zero [s], including the last test of
+            the motors; None where forces never acted, or do not stop.
     """
 
     stage: str
@@ -306,11 +307,11 @@ def rehearse(
 ) -> Rehearsed:
     """Rehearse a session with the scenario's devices behind the real protocol, without device, port or waiting.
 
-    Handshake, delay measured, coupling designed for it (or `coupling`, judged for it), certified, armed, run for
-    `seconds`, ramped out. The scenario's theta is the least delay; a slower link makes it longer. With
-    `latch_on_arrival` the device applies a force as soon as it comes, and the loop has the measured latency in place of
-    a whole tick (`latency`), beside the scenario's theta, which may then be 0. A session that is
-    refused, because nothing is certified for its delay, is a result too: see `stage` and `cause`.
+    The session connects, measures the delay, designs a coupling for it (or judges `coupling`), certifies it, arms, runs
+    for `seconds`, and ramps out. The scenario's theta is the least delay; a slower link makes it longer. With
+    `latch_on_arrival`, the device applies a force as soon as it comes. The loop then has the measured latency
+    (`latency`) in place of a whole tick, beside the scenario's theta, which may be 0. If no coupling is certified for
+    the delay, the session is refused, which is a result and no error: see `stage` and `cause`.
 
     Raises InputError for a scenario that cannot stand behind a serial link, TypeError for an argument of another type.
     """

@@ -1,10 +1,10 @@
-"""One session with a device: it turns messages and the time into forces and stops, without port, clock or thread.
+"""One session with a device. It computes forces and stops from messages and times, without port, clock or thread.
 
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
 
-Every other end is a named stage with its cause in the log: refused, stopped, lost, e-stop. A session that has ended
-answers nothing but repeats its STOP to a device that still drives; it never arms again.
+Every other end is a stage of its own with a cause in the log: refused, stopped, lost, e-stop. A session that has ended
+never arms again. It only repeats its STOP to a device that still drives.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor
 from haptic_loop.models.device import symmetric
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
-_PATIENCE_US = 2_000_000  # a question without an answer is given up after this time
-_ARMING_US = 600_000  # per axis: the device must follow ARM and pass the test of its encoders within this time
-_QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
-_STOPPING_US = 50_000  # STOP is repeated for so long to a device that says nothing
-_OBEYING_US = 30_000  # a device must rest so soon after STOP: 1.5 times the longest hold and ramp
-_ELSEWHERE = 5e-3  # [m] a handle that moved by this much is at another place
-_STRONGEST = 12.0  # [N] whatever a scenario allows
+_PATIENCE_US = 2_000_000  # longest wait for the answer to HELLO or CONFIG
+_ARMING_US = 600_000  # time per axis in which the device must arm and its encoders must pass their test
+_QUIET_US = 1_000_000  # longest silence of a device while no force acts
+_STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
+_OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
+_ELSEWHERE = 5e-3  # [m] least motion after which a handle counts as moved to another place
+_STRONGEST = 12.0  # [N] largest force at the hand, whatever a scenario allows
 
 
-Said = tuple[wire.Force | wire.Stop, ...]  # to the device
+Said = tuple[wire.Force | wire.Stop, ...]  # messages to the device
 
 
 class _Event(NamedTuple):
@@ -55,13 +55,13 @@ class Session:
         self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[_Event] = []
-        self.info: wire.Info | None = None  # what the device is; None before it said so
-        self.config: wire.Config | None = None  # how the device was asked to run, last
+        self.info: wire.Info | None = None  # the device's INFO; None before it came
+        self.config: wire.Config | None = None  # the last configuration for the device
         self.programs: tuple[Armable, ...] = ()
         self.program: Armable | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[Arming] = []
-        self.worlds: list[WorldController] = []  # arming by arming
+        self.worlds: list[WorldController] = []  # one per arming in a world
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
         self._expected = Expected(scenario, self.settings.held)
@@ -70,7 +70,7 @@ class Session:
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
         self._shutdown: _Shutdown | None = None
-        self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
+        self._after: Stage | None = Stage.FINISHED  # stage after a ramp-out; None: disarmed with a softer coupling
 
     @property
     def gain(self) -> float:
@@ -107,15 +107,15 @@ class Session:
         assert self._units
         return self._units
 
-    # what a person or the driver does
+    # calls of a person and of the driver
 
     def start(self, now: int) -> None:
-        """Wait for the device to say who it is."""
+        """Wait for the device's INFO."""
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
 
     def load(self, programs: Sequence[Armable], now: int) -> Said:
-        """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
+        """Take the couplings for the measured delay, the one of least delay first, and configure its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:
             return ()
@@ -125,12 +125,12 @@ class Session:
         return self._take(0, "certified")
 
     def refuse(self, cause: str, now: int) -> Said:
-        """End the session before it has moved anything."""
+        """End the session as refused, while no force acts."""
         self.now = now
         return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> Said:
-        """Arm at a person's request; does nothing unless the session is disarmed and nothing forbids it."""
+        """Arm at a person's request. Do nothing unless the session is disarmed and `hindrance` is None."""
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
             self._log(hindrance)
@@ -148,9 +148,9 @@ class Session:
         return ()
 
     def _accounts(self, config: wire.Config) -> tuple[SentBudget | None, BudgetPlan | None]:
-        """Return the energy budget of an arming, and the plan of one for the tests of motors in a world."""
+        """Return the energy budget of an arming, and the plan of a budget for motor tests in a world."""
         scenario, budget = self.scenario, self.settings.energy_budget
-        tests = is_world(scenario) and config.theta > 0  # forces that latch on arrival act for no whole tick
+        tests = is_world(scenario) and config.theta > 0  # a SentBudget counts whole ticks only
         if budget is None and not tests:
             return None, None
         longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
@@ -160,8 +160,8 @@ class Session:
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
         """End the session as planned: by a ramp where forces act, at once where none do.
 
-        After the ramp the motors are tested once more. Where the user `let_go` of the deadman no force may act any
-        more, so the session ends as stopped.
+        After the ramp the motors are tested once more. Where the user `let_go` of the deadman, no test force may act,
+        so the session ends as stopped.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -177,7 +177,7 @@ class Session:
         return self._end(after, cause, wire.Reason.DONE)
 
     def fail(self, cause: str, now: int) -> Said:
-        """End the session at zero force, at once, for a fault that was found outside of it."""
+        """End the session as stopped, without a ramp by the host, because of a fault."""
         self.now = now
         return () if self.stage in ENDED else self._end(Stage.STOPPED, cause)
 
@@ -193,14 +193,14 @@ class Session:
         self.now = now
         return () if self.stage in ENDED else self._end(Stage.LOST, cause)
 
-    # what the link does
+    # calls when the device answers
 
     def met(self, info: wire.Info, now: int) -> Said:
-        """Take INFO, in which the device says what it is."""
+        """Take the device's INFO."""
         return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
-        """Take ACK, in which the device confirms `config` or says why it refuses."""
+        """Take the result in ACK, with which the device accepts `config` or refuses it."""
         return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
@@ -213,11 +213,11 @@ class Session:
             return understand(heard)
         except wire.SafetyStop as fault:
             return self.fail(str(fault), now)
-        except Exception as error:  # whatever it is: first the force to zero, then the explanation
+        except Exception as error:  # after any error, stop the device first
             return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
 
     def poll(self, now: int) -> Said:
-        """Act on what is due at this time."""
+        """Act on time-outs and on a STOP that must be repeated."""
         self.now = now
         if self.stage in ENDED:
             return self._shutdown.again(now) if self._shutdown else ()
@@ -296,7 +296,7 @@ class Session:
         assert self._shutdown
         if cause := self._shutdown.disobeyed(state, self.now):
             if self.stage == Stage.FINISHED:
-                self._enter(Stage.STOPPED, cause)  # whatever it was to end in, it has not finished
+                self._enter(Stage.STOPPED, cause)  # a device that still drives contradicts "finished"
             else:
                 self._log(cause)
         return self._shutdown.answer(state)
@@ -338,7 +338,7 @@ class Session:
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
         return ()
 
-    # to zero force, and what comes then
+    # ramps and the end
 
     def _soften(self, late: str) -> None:
         """Ramp out, and continue with the next coupling if there is one."""
@@ -373,7 +373,7 @@ class Session:
 
 
 def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: float) -> None:
-    """Raise SafetyStop where the device is in a wrong phase, or has a force that cannot have been asked for."""
+    """Raise SafetyStop where the device is in a wrong phase, or applies a force that no host can have sent."""
     for force, cap in zip(state.applied, config.cap, strict=True):
         if not -cap <= force <= cap:
             raise wire.SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")
@@ -390,9 +390,9 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 
 def axis_by_axis(scenario: Scenario) -> Scenario:
-    """Return the scenario with what INFO can state of a full delta: one number per axis, which lie below the matrix.
+    """Return the scenario with a diagonal matrix below each full delta, because INFO states one number per axis.
 
-    d diag(Delta) <= Delta with the least eigenvalue d of D^-1/2 Delta D^-1/2, D = diag(Delta).
+    It is d diag(Delta) <= Delta with the least eigenvalue d of D^-1/2 Delta D^-1/2, D = diag(Delta).
     """
     devices = []
     for device in scenario.device:
@@ -407,7 +407,7 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """Return a session that asks for at most `cap` [N] at the hand.
+    """Return a session whose forces at the hand are at most `cap` [N].
 
     Raises:
         InputError: A limit or T is impossible.
@@ -430,7 +430,7 @@ class _Shutdown:
     """Repeat STOP until the device rests, or an emergency stop until the device has latched it."""
 
     def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
-        """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
+        """Take `acted`: whether the session was armed, so that STOP is repeated to a silent device every T [s]."""
         self._stop, self._latch = (wire.Stop(reason),), reason == wire.Reason.ESTOP
         self._repeat, self._every = acted or self._latch, 1e6 * T
         self._began = self._sent = now
@@ -442,7 +442,7 @@ class _Shutdown:
         return () if self._rests else self._stop
 
     def again(self, now: int) -> Said:
-        """Repeat STOP where no STATE has confirmed it for a tick: the last STOP, or the STATEs, may be lost."""
+        """Repeat STOP where no STATE has confirmed it for a tick, because messages may be lost."""
         due = now - self._sent >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
             return ()
@@ -450,7 +450,7 @@ class _Shutdown:
         return self._stop
 
     def disobeyed(self, state: wire.State, now: int) -> str | None:
-        """Say once that the device goes on driving."""
+        """Return a message, once, if the device still drives long after STOP, else None."""
         if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
         self._obeys = False

@@ -27,20 +27,20 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
 from haptic_loop.sim.world import SceneRecord, WorldRecord
 
-_AT_CAP = 1 - 1e-6  # part of the cap: a limiter stops at it
+_AT_CAP = 1 - 1e-6  # part of the cap above which a force counts as cut
 _PERCENTILES = (50, 90, 99, 100)
-_PIECE = 100_000  # ticks whose ages are held by number at a time, for memory
+_PIECE = 100_000  # ticks whose ages are computed at a time, to save memory
 
 
 class IncidentLog:
     """A log file that is complete up to the last second, however the process ends.
 
-    One JSON object a line: every change of the stage at once, and every second where things stand. What was written
-    survives SIGKILL, though not a power failure.
+    Each line is a JSON object. Every change of the stage is written at once, the state of the session every second. The
+    lines survive SIGKILL, but may not survive a power failure.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError where the file cannot be written."""
+        """Open the file to append. Raises InputError where it cannot be written."""
         self.path = path
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
@@ -49,7 +49,7 @@ class IncidentLog:
         self._written = 0  # [us]
 
     def attach(self, session: Session) -> None:
-        """Record from now on."""
+        """Write a header, and from now on every change of the session's stage."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
 
@@ -63,7 +63,7 @@ class IncidentLog:
         self._write(standing | {"counters": asdict(session.counters)})
 
     def _write(self, line: dict[str, Any]) -> None:
-        with suppress(OSError):  # a full disk is no reason to drop the forces
+        with suppress(OSError):  # a full disk must not stop the session
             os.write(self._file, (json.dumps(keys_in_unit(line)) + "\n").encode())
 
     def close(self) -> None:
@@ -72,7 +72,7 @@ class IncidentLog:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change of the stage, and why."""
+    """A change of the stage and its cause."""
 
     t_s: float  # since the session began
     stage: str
@@ -135,9 +135,9 @@ class _Ran:
 
 @dataclass(frozen=True)
 class WorldSession(WorldRecord):
-    """What happened at the contacts of a world in one arming, and what the scene cost."""
+    """The figures of a world in one arming: its energy, its contacts and the time of its steps."""
 
-    step_us: dict[str, float] | None  # of the processor that a step of the scene took
+    step_us: dict[str, float] | None  # percentiles of the CPU time of a step of the scene
 
     @classmethod
     def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[WorldSession]:
@@ -169,7 +169,7 @@ class SessionReport:
 
     case: str
     scenario: str
-    kind: str | None  # of the coupling; null where the session had none, as the next four
+    kind: str | None  # kind of the coupling; null, like the next four, in a session without a coupling
     assessment: Assessment | None
     link_delay: int | None = off_table()
     remarks: list[str] | None = off_table()
@@ -177,8 +177,8 @@ class SessionReport:
     link: _Link = off_table()
     run: _Ran = off_table()
     growth: list[Growth] = off_table()
-    energy_budget: list[BudgetFigures] | None = off_table()  # arming by arming
-    world: list[WorldSession] | None = off_table()  # the same
+    energy_budget: list[BudgetFigures] | None = off_table()  # one per arming
+    world: list[WorldSession] | None = off_table()  # one per arming
     scene: SceneRecord | None = off_table()
 
 
@@ -216,7 +216,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 
 def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str | None:
-    """Return why a session that ended as planned has not finished, or None if forces acted as requested."""
+    """Return why a session that ended as planned does not count as finished, or None if forces acted as requested."""
     ticks, link = len(recorder), recorder.link()
     if 2 * session.counters.slowed > ticks > 0:
         return f"{100 * session.counters.slowed / ticks:.0f} % of its forces were cut by the slew rate"
@@ -233,7 +233,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
 
 
 def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
-    """Return the ages [us] of the answers of all armings, with those that an `echo` skipped; `dues` [ticks] of each."""
+    """Return the ages [us] of all answers, also of those that an `echo` skipped; `dues` [ticks] has one per arming."""
     ages: list[int] = []
     for i, due in enumerate(dues):
         rows = link["arming"] == i

@@ -1,12 +1,12 @@
 """Bounds of a motor's mass and of its transmission from records with the handle free and with the handle clamped.
 
-The known-device conditions rest on them: the mass at the motor at least, the stiffness k of the transmission at most,
-its damping b at least and at most. With a clamped handle motor and transmission are a mass on a spring and a damper.
-With a free handle the motor's own damping slows everything, and b damps only the mode between motor and handle. One
-model is fitted to the spectra of all records together, the clamped ones at two levels of force.
+The known-device conditions need these bounds: the least mass at the motor, the largest stiffness k of the transmission,
+and the least and the largest of its damping b. With a clamped handle, motor and transmission are a mass on a spring and
+a damper. With a free handle, the motor's own damping slows all motion, and b damps only the mode between motor and
+handle. One model is fitted to the spectra of all records together, with clamped records at two levels of force.
 
 Each bound is the estimate, moved by two standard errors (95 %) and by 0.5 % for the scale of the encoder. The errors
-come from fits that leave out one part of one record's frequencies at a time: what the model does not explain counts.
+come from fits that each leave out a part of one record's frequencies, so they include the errors of the model.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, an encoder of 5 um sees nothing of 1 N
-_TOLD = 0.01  # part of the motion to which the model is held; and the encoder's noise
-_UNEXPLAINED = 2.5  # times both: play and presliding friction leave 3 to 6, ideal rigs 1, dry friction up to 2.1
-_GROUPS = 5  # of a record's frequencies, which are left out in turn
+_TOLD = 0.01  # model error that is allowed, as a part of the motion, beside the encoder's noise
+_UNEXPLAINED = 2.5  # largest rms error over both: play and presliding friction leave 3 to 6, dry friction up to 2.1
+_GROUPS = 5  # groups of a record's frequencies that are left out in turn
 _SIGMAS, _SCALE = 2.0, 0.005
-_WITHIN = (2.0, 0.85)  # times the lowest and the highest frequency heard, between which the clamped mode must lie
-_STEPS = 60  # of a fit
-_LATE = 0.05  # [T] that a force may be late: no proof covers a current loop that is slower
-_FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # the least of log m1, log m2, log k, log b, delta and lag
+_WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
+_STEPS = 60  # most evaluations of a fit
+_LATE = 0.05  # [T] largest delay of a force: no proof covers a slower current loop
+_FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # least log m1, log m2, log k, log b, delta and lag
 
 
 @dataclass(frozen=True)
 class TransmissionBounds:
-    """What holds with 95 % confidence of one axis, and the estimates."""
+    """Bounds of one axis with 95 % confidence, and the estimates."""
 
     motor_mass_min: float  # [kg]
     transmission_stiffness_max: float  # [N/m]
@@ -45,7 +45,7 @@ class TransmissionBounds:
     handle_mass: float  # [kg] estimate
     transmission_stiffness: float  # [N/m] estimate
     transmission_damping: float  # [N s/m] estimate
-    late: float  # [s] lag and delay of the forces, at most
+    late: float  # [s] upper bound of lag plus delay of the forces
 
 
 class _Joint:
@@ -56,7 +56,7 @@ class _Joint:
         self._scale = [np.hypot(step * np.sqrt(r.ticks / 12), _TOLD * np.abs(r.motion)) for r in records]
 
     def errors(self, p: Array) -> list[NDArray[np.complex128]]:
-        """Return motion less model of every record, in units of what it is held to."""
+        """Return motion less model of every record, in units of the allowed error."""
         p = np.append(p, 0.0)
         return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
 
@@ -87,7 +87,7 @@ def transmission_bounds(
     radius `lever` [m] are fitted as metres and N at the hand.
 
     Raises:
-        ValueError: No spring and damper in parallel between two masses explain the records, or they do not tell them.
+        ValueError: No spring and damper in parallel between two masses explain the records, or they determine no bound.
     """
     records, friction = [], at_radius(friction, 1 / lever)
     for (x, force), held in ((free, False), *((record, True) for record in clamped)):

@@ -1,7 +1,7 @@
 """Run a session in real time over a serial port (pyserial), in one thread that waits for the port only.
 
-A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So loaded objects are frozen, and the collector is
-off while forces act.
+A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So gc.freeze() excludes the loaded objects, and the
+collector is off during the session.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
 _UNUSED = 9600  # baud set on a port without UART: it has no effect, whereas 1200 resets many boards
-_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # duration of the measurement of stalls, and the least stall that is reported
+_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # duration of the measurement of stalls; the least stall that gives a warning
 _GRACE_US = 50_000  # time after the end in which a lost STOP is repeated
 
 
@@ -45,7 +45,7 @@ class SerialPort:
             self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise InputError(f"--port {path}: {error}") from None
-        with suppress(Exception):  # where the driver knows it: the latency timer of FTDI chips goes from 16 ms to 1 ms
+        with suppress(Exception):  # not all drivers have it; the latency timer of FTDI chips goes from 16 ms to 1 ms
             self._serial.set_low_latency_mode(True)
 
         self._fd = self._serial.fileno()
@@ -54,7 +54,7 @@ class SerialPort:
         return self._fd
 
     def wait(self, seconds: float) -> bool:
-        """Wait for bytes at most so many seconds, and return whether there are any."""
+        """Wait for bytes for at most `seconds`, and return whether there are any."""
         return bool(select.select([self._fd], [], [], seconds)[0])
 
     def read(self) -> bytes:
@@ -97,9 +97,9 @@ class SerialPort:
 
 
 def preflight(paths: Sequence[str]) -> str:
-    """Return one line that says how well this machine keeps time, and what to do where it does not.
+    """Return one line on how well this machine keeps time, with advice where it does not.
 
-    It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
+    The function requests real-time scheduling and locked memory, and measures for two seconds how late sleeps end.
     """
     checks = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _stalls()
     return "pre-flight: " + "; ".join(checks)
@@ -185,7 +185,7 @@ class Live(Driver):
         return session
 
     def turn(self) -> None:
-        """Handle keys, arming, the planned end and signals: everything but the answer to a STATE."""
+        """Call the device once, then handle keys, arming, the planned end and signals."""
         super().turn()
         try:
             self._steer(self.clock())
@@ -208,7 +208,7 @@ class Live(Driver):
             self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
-        """Design a coupling, interruptibly. Keys typed meanwhile are read before it can be armed."""
+        """Design a coupling; SIGINT interrupts the design. Keys typed meanwhile are read before it can be armed."""
         self._watch(self.session)  # the design takes a while
         try:
             with _interruptible():
@@ -226,7 +226,7 @@ class Live(Driver):
         return self._keyboard is not None and bool(select.select([self._keyboard], [], [], 0)[0])
 
     def _pressed(self) -> None:
-        """Carry out the keys typed. A lost terminal counts as SIGHUP: the person is gone."""
+        """Act on the keys typed. A lost terminal counts as SIGHUP, because the person is gone."""
         assert self._keyboard is not None
         keys = b""
         with suppress(OSError):
@@ -240,7 +240,7 @@ class Live(Driver):
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """Note SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), which are handled between two ticks."""
+    """Collect SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), to be handled between two calls."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
@@ -252,7 +252,7 @@ def _signals(received: list[int]) -> Iterator[None]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Let SIGINT raise KeyboardInterrupt during a design, which may take long while nothing moves."""
+    """Let SIGINT raise KeyboardInterrupt during a design, which may take long. No force acts meanwhile."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

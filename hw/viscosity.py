@@ -1,19 +1,19 @@
-"""Whether the damping of an axis is the same at every speed and at every frequency of a record.
+"""Test whether the damping of an axis is the same at every speed and at every frequency of a record.
 
-The bound of hw/friction.py is a statement about one number b. Friction that thins with speed (grease), or that has a
-memory (a dashpot behind a spring, a belt, a rubber mount), has no such number: it damps less at the speeds and at the
-frequencies where a session needs it. A record that shows either is refused.
+The bound of hw/friction.py assumes that one number b describes the damping. Friction that thins with speed (grease), or
+that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no such number. It damps less at the speeds
+and frequencies where a session needs the damping. A record that shows either kind of friction is refused.
 
-Speed: in a stroke, from one turning point to the next, the kinetic energy begins and ends at zero, so the work of the
-motor is dissipated: W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt, with S_n = int |v|^n dt; l is the lag
-of an amplifier. For viscous and dry friction q = 0, whatever the amplitude; where friction thins, q < 0, and at the
-speed v the damping is b + q v.
+Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the motor's work
+is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt, with S_n = int |v|^n dt and the lag l of an amplifier.
+For viscous and dry friction q = 0 at every amplitude. Where friction thins, q < 0, and the damping at the speed v is
+b + q v.
 
-Frequency: the motion that the force's spectrum causes, with a transmission, an amplifier's lag and dry friction taken
-into account, is fitted with a Maxwell element (c, tau) beside b, for each of several tau. Its damping c/(1 + (w tau)^2)
-is in the record's slow strokes, and gone at high frequency, where b alone is left. A certificate charges the damping at
-every frequency, so only b counts. The bound is the least lower end of b over all tau: what a record cannot exclude, as
-because the encoder is coarse, it does not credit.
+Frequency: a model with a transmission, an amplifier's lag and a Maxwell element (c, tau) beside b is fitted to the
+motion under the force less dry friction, for each of several tau. The element's damping c/(1 + (w tau)^2) acts in the
+record's slow strokes and vanishes at high frequency, where only b is left. A certificate uses the damping at every
+frequency, so only b counts. The bound is the least lower end of b over all tau. So a memory that the record cannot
+exclude, for example because the encoder is coarse, lowers the bound.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
-_FAST = 0.25  # part of the highest speed from which on a stroke counts: dry friction has reached its level there
-_FEW = 8  # strokes
-_SIGMAS = 2.0  # standard errors
-#: [s] of a memory; a shorter one counts as damping: an encoder of 5 um on a rigid 0.25 kg would exclude 1 ms nowhere
+_FAST = 0.25  # a stroke counts from this part of the highest speed on, where dry friction is saturated
+_FEW = 8  # least number of strokes
+_SIGMAS = 2.0  # standard errors of the thinning that are allowed for
+#: [s] time constants of a memory; a shorter one counts as damping: an encoder of 5 um at 0.25 kg cannot exclude 1 ms
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um sees nothing of 1 N
-_LOUD = 0.05  # part of the strongest force in the band that a frequency must have
-_POINTS = 200  # frequencies at which a fit begins
-_ALIASES = (-1, 0, 1)  # sampling adds what is whole multiples of 1/T away; the next are below 1e-3
-_MODES_HZ = np.geomspace(20.0, 300.0, 40)  # where a transmission's mode is looked for first
-_PARTS = (0.15, 0.3, 0.5, 0.65)  # of the mass, that the motor may have
-_STEPS = 30  # of a fit
-_VAGUE = 3.0  # standard deviation of a logarithm before the record is seen
+_LOUD = 0.05  # least force at a frequency, as a part of the strongest in the band
+_POINTS = 200  # frequencies of a first, rough fit
+_ALIASES = (-1, 0, 1)  # sampling adds frequencies at multiples of 1/T; further ones add less than 1e-3
+_MODES_HZ = np.geomspace(20.0, 300.0, 40)  # initial frequencies of a transmission's mode
+_PARTS = (0.15, 0.3, 0.5, 0.65)  # initial shares of the motor in the mass
+_STEPS = 30  # most evaluations of a fit
+_VAGUE = 3.0  # prior standard deviation of a logarithm
 _B, _C = 4, 7  # places of b and c among the parameters
-_MUCH = 0.15  # part of the damping that a memory may have where the fit is linear in it
+_MUCH = 0.15  # largest share of a memory in the damping for which the linear fit suffices
 _QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
-_SURE = 100.0  # log likelihood ratio from which on a memory is not chance, nor friction that is modelled badly
+_SURE = 100.0  # log likelihood ratio that neither chance nor a poor model of friction explains, but only a memory
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Viscosity:
     thinning_error: float  # [N s/m] its standard error
     lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left beyond a memory
     memory: float  # [s] time constant of the memory that this bound allows for
-    remembers: bool  # whether the record shows a memory, rather than not excluding it
+    remembers: bool  # whether the record shows a memory, not only fails to exclude one
 
 
 def viscosity(x: Array, force: Array, T: float, step: float, friction: Friction) -> Viscosity:
@@ -93,7 +93,7 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
     """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m]."""
     import scipy
 
-    n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms: its error in a stroke of 3 Hz is far below an encoder's count
+    n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms errs by far less than a count in strokes of 3 Hz
     smooth = scipy.signal.savgol_filter(x, n + 2, 3)
     v = scipy.signal.savgol_filter(x, n + 2, 3, deriv=1, delta=T)
     top = float(np.percentile(np.abs(v), 99.5))
@@ -115,7 +115,7 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
     weight = 1 / np.sqrt(columns[1])  # the error of a stroke's work grows with the stroke
 
     def cubic(keep: NDArray[np.bool_]) -> float:
-        """The coefficient q of S3."""
+        """Return the coefficient q of S3."""
         w = weight[keep]
         return float(np.linalg.lstsq(A[keep] / scale * w[:, None], work[keep] * w, rcond=None)[0][2] / scale[2])
 
@@ -158,7 +158,7 @@ class Spectra:
     def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
 
-        `end` [N] is the force of one tick that would stop what still moves when the record ends.
+        `end` [N] is the force in one tick that would stop the motion that is left when the record ends.
         """
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
         link = k + d * s
@@ -173,9 +173,9 @@ class Spectra:
 
 
 def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False) -> list[Array]:
-    """Return initial parameters: the two splits of the mass and modes that explain the spectra's sizes best.
+    """Return two initial parameter vectors: the mass splits and modes that explain the spectra's magnitudes best.
 
-    The modes that are tried are those of a free handle, or of a `clamped` one.
+    The modes are those of a free handle, or of a `clamped` one.
     """
     tried = []
     for hz, part in product(_MODES_HZ, _PARTS):
@@ -188,12 +188,13 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
 
 
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
-    """The least lower end of b [N s/m] over all tau, that tau [s], and whether the record shows a memory.
+    """Return the least lower end of b [N s/m] over all tau, that tau [s], and whether the record shows a memory.
 
     `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. A small
-    Maxwell element changes little beside the mass, so its part is linear in c, and each tau takes one linear fit. That
-    model may also have explained a large element by a lag and a transmission. So all parameters are fitted with most of
-    the damping in the element first, and what explains the record about as well counts.
+    Maxwell element changes the motion little beside the mass, so its effect is linear in c, and each tau takes one
+    linear fit. But the lag and the transmission of the model without memory may imitate a large element. So all
+    parameters are also fitted from a start with most of the damping in the element. Such a fit counts if it explains
+    the record about as well.
     """
     import scipy
 
@@ -202,11 +203,11 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf, np.inf])
 
     def error_of(spectra: Spectra, tau: float, p: Array) -> Array:
-        """Errors by p = [log m1, log m2, log k, log d, b, lag, delay, c, end]."""
+        """Return errors for p = [log m1, log m2, log k, log d, b, lag, delay, c, end]."""
         return spectra.error(p[:8], tau, p[8])
 
     def fitted(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
-        """Return the fit from a start; without tau, c stays near 0."""
+        """Return the fit that begins at `start`; without tau, c stays near 0."""
         top = np.where(np.arange(9) == _C, 1e-12, high) if tau is None else high
         begin = np.clip(start, low + 1e-13, top - 1e-13)
         how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
@@ -217,11 +218,11 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
     plain = fitted(every, rough.x)
     left, points = plain.fun, len(every.force)
     noise = np.sqrt(float(left @ left) / len(left))
-    # a rigid device tells nothing of a transmission, and a delay acts like a lag
+    # weak priors, because a rigid device does not determine a transmission, and a delay acts like a lag
     vague = noise * np.diag([1 / _VAGUE] * 4 + [0.0] + [1 / T] * 2 + [0.0] * 2)
 
     def linear(jacobian: Array, errors: Array) -> tuple[Array, Array, float]:
-        """Return (best change of p, its standard errors, remaining squares), (9,) each."""
+        """Return the best change of p (9,), its standard errors (9,) and the remaining sum of squares."""
         columns = np.vstack([jacobian, vague])
         size = np.linalg.norm(columns, axis=0) + 1e-300
         q, r = np.linalg.qr(columns / size)
