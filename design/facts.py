@@ -181,7 +181,7 @@ def _varies(loop: Loop) -> list[int]:
 
 
 def _ranges(loop: Loop) -> list[tuple[float, float]]:
-    """Return the latency [s] of every device, which its axes share."""
+    """Return the (least, largest) latency [s] of every device; the axes of a device share it."""
     return [loop.latency[own.start] for own in loop.devices] if loop.latency else []
 
 
@@ -255,7 +255,7 @@ class KnownMotor(HandsSide):
 
 
 def hands_side(loop: Loop) -> HandsSide:
-    """Return the hands' side of a loop whose devices are known by their damping only."""
+    """Return the hands' side that uses only the damping of the loop's devices."""
     return Latency() if loop.latency else _EvenPeriods()
 
 
@@ -421,7 +421,8 @@ def compose(
     """Return the block of the loop's hands' side with these facts, at these multipliers, which are not checked.
 
     Args:
-        G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and ways into the walls.
+        G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and displacements across
+            the walls.
         loop: The loop.
         facts: The facts of the environment's side.
         values: The multipliers by name.

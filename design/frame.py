@@ -54,7 +54,7 @@ class Demand(Generic[AnyBlock]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return Delta_D T/T_max (m,) [N s/m], the damping that represents delta when even periods T replace T_max.
+    """Return Delta_D T/T_max (m,) [N s/m], the damping for even periods T that stands for delta in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T: the force map is the same at every tick.
@@ -199,7 +199,7 @@ class Collected(Generic[AnyBlock]):
     # -- terms of rows
 
     def sums(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
-        """Add the weighted sent force to a row; as the sum of its steps it has a pole at z = 1."""
+        """Add the weighted sent force to a row. The force is the sum of its steps, which is a pole at z = 1."""
         self._sums.append((row, channel, weights, scale))
 
     def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
@@ -207,7 +207,7 @@ class Collected(Generic[AnyBlock]):
         self._steps.append((row, channel, weights, scale))
 
     def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
-        """Add the steps of the way into a wall to a row, or the way itself if `summed`."""
+        """Add the weighted steps of the displacement y across a wall to a row, or y itself if `summed`."""
         self._walls.append((row, wall, weight, summed))
 
     def term(self, row: int, column: int, weight: Any) -> None:
@@ -272,15 +272,15 @@ class Collected(Generic[AnyBlock]):
     def build(self, G: AnyBlock | None) -> tuple[Array, AnyBlock, Any]:
         """Return (residue at z = 1 (n, n), block without its pole, matrix that the damping multiplies).
 
-        G maps [x; p], displacements and wall forces, to [f_e; y], sent forces and ways into walls. With None the steps
-        of the forces are inputs instead (`force`).
+        G maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
+        the steps of the forces are inputs instead (`force`).
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
         rows, reads = self._reads()
         bank = self._bank(reads)
         follows = len(reads)
-        # The signals are weighted forces, ways into walls, and inputs of the previous tick.
+        # The signals are weighted forces, displacements across walls, and inputs of the previous tick.
         inner = m + w  # outputs of G
         rest = m + len(late)  # outputs of the filter that bypass G
         mix: Any = numbers(np.zeros((m + w + len(late), inner + rest), dtype=int), T) + 0

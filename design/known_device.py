@@ -198,7 +198,7 @@ def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], t
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double from the ball's midpoint `towards` an end whose decimal is `beyond` the ball."""
+    """Return the first double whose decimal is `beyond` the ball, going from the ball's midpoint in `towards`."""
     import flint
 
     value = float(ball.mid())
@@ -605,7 +605,7 @@ def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
 
 
 def with_cost(idle: Complex, z: Complex, cost: PeriodCost, moves: Sequence[NDArray[np.intp]]) -> Complex:
-    """Return Hermitian matrices (k, n, n) with L added; entries of the cost are (k, m), `moves` those of `Sweep`."""
+    """Return the matrices `idle` (k, n, n) with L added. Entries of `cost` are (k, m); `moves` is `Sweep.moves`."""
     own, cross, speed = device_rows(z, cost)
     block, m = idle.copy(), own.shape[1]
     for i, part in itertools.product(range(m), moves):

@@ -496,7 +496,7 @@ class _Search:
         return last
 
     def scaled(self) -> Optimal:
-        """Return the environment itself as a coupling R = kappa I, scaled down until it is proved."""
+        """Return the coupling R = kappa I, with kappa reduced until the coupling is proved."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)
