@@ -228,7 +228,7 @@ class Design(Chosen):
         requirement: The requirement of `condition`, from a refined sweep.
         sdps: The number of convex problems that were solved, or of runs of a local search.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per channel, if its search took long.
+        c: The multiplier of the limiter, one row per device, if its search took long.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.
