@@ -1,4 +1,4 @@
-"""Build devices and the humans who hold them as one MuJoCo scene, as matrices, and as many models of one crowd."""
+"""Devices with the humans who hold them: one MuJoCo scene, the plant's matrices, and a model for each set of humans."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
-# Motor, handle and transmission come from compliant.xml or rigid.xml, which a viewer can open. Those of device i are
-# called device_i/motor and so on. The scenario gives their parameters. The scene's XML contains shapes that are only
+# Motor, handle and transmission come from compliant.xml or rigid.xml, which a viewer can open. The motor of device i is
+# called device_i/motor, and so on. The scenario gives the parameters. The scene's XML contains shapes that are only
 # drawn; the simulated model does not.
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).

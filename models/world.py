@@ -31,7 +31,7 @@ Array = NDArray[np.floating[Any]]
 
 _CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
 ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
-MOST_REPETITIONS = 8  # of a step whose forces are limited
+MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
 _DIRECTION_SLACK = 1e-6  # repetitions end when they change limited forces by less than this part of the limit
 _TOO_LARGE = 50_000_000  # [bytes] of one file of a scene

@@ -174,7 +174,7 @@ class Points:
     """The simulated cells, (k,) each."""
 
     cell: Cells  # flat index in the grid
-    oscillates: NDArray[np.bool_]  # to the end of the trace
+    oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace
     amplitude: Array  # [m] of the oscillation; inf: diverged
     frequency_hz: Array  # [Hz] of the oscillation; nan: diverged
     growth: Array  # [1/s] of the exact loop's dominant mode among those that oscillate visibly or run away

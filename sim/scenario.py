@@ -41,7 +41,7 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
-_MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
+_MOST_DELAYS = 1000  # total of all channels [samples]; eigenvalues of 1000 states take ten seconds, of 2000 a minute
 _MOST_CHANNELS = 32  # a run of 16 channels without a coupling takes 13 s of a core; of 50 it takes minutes
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
@@ -89,7 +89,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # distribution of the humans that `validate` draws
-    varying_delay: VaryingDelay | None = None  # of the forces, around theta; None where delays are constant
+    varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
     T_min: float | None = None  # [s] the shortest period if periods vary; only known-device needs it
     period: Periods | None = None  # the periods that are simulated; the computer's filters are designed for T

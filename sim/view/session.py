@@ -340,14 +340,14 @@ class LiveLoop:
         self.prepared = prepared
         self.pace = _Pace(prepared.scenario.T, patience)
         self.keys: SimpleQueue[_Event] = SimpleQueue()
-        self.clipped = 0  # ticks, since the start
+        self.clipped = 0  # number of clipped ticks since the start
         self.log: list[tuple[float, str, PreparedLoop]] = [(0.0, "start", prepared)]  # (time [s], event, loop)
         self.script_ends = script[-1][0] if script else 0.0  # [s]
         self._executor, self._latest = executor, prepared
         self._wanted: list[tuple[_Event, Future[PreparedLoop | str]]] = []
         self._script = _rehearsed(prepared, script)
         self._tick = 0
-        self._pushed = np.zeros(prepared.scenario.channels)  # by the script
+        self._pushed = np.zeros(prepared.scenario.channels)  # [N] forces of the script on the handles
         self._history = np.zeros((max(1, round(HISTORY / prepared.scenario.T)), prepared.scenario.channels))
         self._grip: Grip | None = None
         self._note = ""

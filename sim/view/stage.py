@@ -569,7 +569,7 @@ class FlatPictures:
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         steps, behind = max(place for _, place, _ in self._shapes) + 1, self.object.reach if self.object else 0.0
-        left = max(_LONGEST + STEP, behind)  # [m] of the picture left of the handles
+        left = max(_LONGEST + STEP, behind)  # [m] width of the picture to the left of the handles
         per_metre = (_SIZE[0] - 120) / (left + steps * STEP + _LONGEST)
         origin, row = 60 + left * per_metre, (bottom - top) / _devices(self.scene)
         usual = min(14.0, 0.3 * row)
