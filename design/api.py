@@ -62,8 +62,9 @@ def design_coupling(
             from loop.varying_delay.
 
     Returns:
-        A Design: `coupling` (a spring-damper has K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the required damping,
-        from a sweep of the coupling alone), `figure` and `objective` (the name of the minimised figure, and its value).
+        A Design. Its `coupling` has K (m,) [N/m] and B (m,) [N s/m] if it is a spring-damper. `requirement` is the
+        required damping, from a sweep of the coupling alone. `figure` is the name of the optimised figure, and
+        `objective` is its value.
 
     Raises:
         TypeError: An argument has the wrong type, or the kind does not have an option.

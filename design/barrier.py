@@ -23,7 +23,7 @@ from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
-_CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
+_CENTRED = 0.5  # squared Newton decrement at which a point counts as central; it is 0.05/t above the best value
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
 _LONGEST = 1e3  # largest step, in Newton steps

@@ -8,7 +8,7 @@ Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mea
 J = <M, w M>, M = F - Lambda E. For every H with support in the band |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
 F's coefficients are differences of the s_k. Choose C_k that weigh only combinations that are zero, such that
-    D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k,
+    D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
 Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h
 this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
@@ -477,7 +477,7 @@ class BoundBeside:
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
         left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
         rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"
-        certified = "that this-environment certifies"  # known-device may certify better ones
+        certified = "that this-environment certifies"  # known-device may certify better couplings
         if self.proved:
             return f"no linear coupling {certified} can be better than {rest}"
         rest = rest.replace(", nor than", " and", 1)

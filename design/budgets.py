@@ -48,7 +48,7 @@ RANGED_BASES = 3
 PROOF_STATES = 800
 #: Rounds of cuts of a multiplier (one-wall takes 8), and rounds without progress after which rounding dominates.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
-#: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have as many.
+#: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have that many.
 MULTIPLIER_ROWS = 24
 #: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many devices
 #: every start has the first number, and the best starts have the second. With few devices every start has the third.
@@ -62,7 +62,7 @@ LESS_DAMPING_ROUNDS = 6
 #: Rounds with further frequencies of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6
 #: Rounds with further frequencies of the bound on linear couplings, sums of coefficients in it, and intervals of its
-#: integral. Cases I and II take 2 rounds and 568 intervals. A step of a delay in a row gives sums.
+#: integral. Cases I and II take 2 rounds and 568 intervals. Each step of a delay in a row gives a sum per column.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Convex problems for a coupling of fixed order: in total, and for one norm by complementarity. The third number limits
 #: the cuts for one choice of poles. In case I inner approximation takes 32 in total. Fixed poles (105) and

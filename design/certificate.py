@@ -194,7 +194,7 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
 
 
 # Larger problems are refused at once: a proof would take minutes.
-_MOST_BITS = 400  # largest size of a coefficient's denominator; a decimal of 120 places has 399 bits
+_MOST_BITS = 400  # largest number of bits of a coefficient's denominator; a decimal of 120 places has 399
 _MOST_COST = 2  # total cost of the members of ranges, in units of one proof with PROOF_STATES states
 
 
@@ -408,7 +408,7 @@ def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[floa
 _NAMED: dict[str, Condition] = {
     each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
 }
-_PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # a certificate states them as facts of a base
+_PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # stored as facts of a base condition
 
 
 def _is_ours(condition: Condition) -> bool:

@@ -456,7 +456,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """Return `ratio_in` from the states of the force map; inf without a stable map."""
+    """Return `ratio_in` from the states of the force map, or inf if the map is not stable."""
     try:
         F = loop.F(coupling)
         if thin == 1:
@@ -559,9 +559,9 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 
 # Encoder steps under Coulomb friction
 #
-# f = F (x + n) with |n_j| <= q_j/2 is F x + w with |w_i| <= W_i = sum_j |F_ij|_1 q_j/2, where |F_ij|_1 is the sum of
-# the absolute values of the impulse response. In a tick w does the work w'dx <= sum_i W_i (integral of |v_i|), and
-# Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
+# Encoder errors n with |n_j| <= q_j/2 change the force F x to F (x + n) = F x + w. Here |w_i| <= W_i = sum_j |F_ij|_1
+# q_j/2, where |F_ij|_1 is the sum of the absolute values of the impulse response. In a tick w does the work w'dx <=
+# sum_i W_i (integral of |v_i|), which Coulomb friction of at least W_i at the encoder's coordinate dissipates.
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends
@@ -605,8 +605,8 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], for every condition.
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound does not hold behind
-    a limiter or walls. Friction of a device with several `axes` opposes its velocity in space, and |W|_2 of these axes
-    is needed, because the work of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
+    a limiter or walls. Friction of a device with several `axes` opposes its velocity in space. It must be at least
+    |W|_2 of these axes, because the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

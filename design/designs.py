@@ -81,11 +81,11 @@ def kind_of(name: str) -> _Kind:
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
-    A spring-damper is designed for this environment, which gives the least transparency error, or with walls, worlds,
-    ranges and varying delays for any environment; with a latency always for this environment. If bounds of
-    the devices are known, known-device replaces this environment, except with a latency. With walls known-device-any
-    is the default if it covers the loop. Neither ever requires more damping. Apart from these two conditions, every
-    other kind has one.
+    The default of a spring-damper is this-environment, which gives the least transparency error. In loops with walls,
+    worlds, ranges or varying delays, but without a latency, it is any-environment. If bounds of the devices are known,
+    two conditions that never require more damping take precedence: known-device replaces this-environment in loops
+    without a latency, and known-device-any is chosen with walls if it covers the loop. Apart from these two, every
+    other kind has one condition.
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions

@@ -7,9 +7,9 @@ piecewise linear with bends c_i at x_i, so that with H_0 = mean and a = 1/z - 1
 
 In an interval of length l without a bend inside, the error of linear interpolation is at most
 - l^2/8 max |f^(2)| for any f;
-- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi. Here
-  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2, and |cot(x/2)|/2 <= 1/|x|. The function x log x has the second
-  derivative 1/x, and its error is largest on [0, l], where it is l/e;
+- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi. Proof:
+  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2 with |cot(x/2)|/2 <= 1/|x|. The bound 1/|x| is the second derivative of
+  x log x, whose interpolation error is largest on [0, l], where it is l/e;
 - l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with derivatives in the middle, for the sum over far bends, whose
   terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
 - |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the

@@ -277,7 +277,7 @@ def _whitening(W: Array) -> _Integers | None:
 # which is as good as any other. The errors of all other rounding are bounded and subtracted.
 
 
-_MOST_BITS = 4000  # largest size of the common denominator of a stored P; that of `find_storage` has some hundred bits
+_MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; our own have some hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
@@ -363,7 +363,7 @@ def prove_positive_real(G: Lti, P: Matrix) -> str | None:
 def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     """Return whether a direction makes the KYP matrix negative by more than every rounding error.
 
-    The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], whose entries are sums of products of three
+    The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B]. Its entries are sums of products of three
     correctly rounded numbers. The error of each entry is at most gamma (|S| + |J|'|P||J|),
     gamma = (2n + 8) u / (1 - (2n + 8) u).
     """
@@ -413,8 +413,8 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     half of its margin subtracted: D is reduced by a part of mu, the minimum over |z| = 1 of the least eigenvalue of
     He G. The equation is driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first
-    solved in coordinates in which white noise at the inputs moves all states equally and independently, because there
-    the condition number of P is 1e9 in place of 1e15. The original states are tried next. The result is transformed
+    solved in coordinates in which white noise at the inputs moves all states equally and independently. There the
+    condition number of P is 1e9 in place of 1e15. The original states are tried next. The result is transformed
     back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
@@ -504,7 +504,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 def _independent(covariance: Array) -> tuple[Array, Array]:
     """Return the change to coordinates with the covariance I, and its inverse."""
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Some variances are rounding only.
+    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Small variances may be rounding only.
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     root = np.sqrt(np.maximum(size, size[-1] * _LEAST_MOVED))
     return (V / root).T / deviation, deviation[:, None] * V * root
