@@ -14,7 +14,7 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # largest number of steps for a row: a minute or two
+_MOST_STEPS = 3_000_000  # most steps for a row, which then takes a minute or two
 _LEGEND = (
     "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
     "cycle: standard deviation [N] and frequency of the limit cycle without coupling, once it is sustained",

@@ -111,7 +111,7 @@ def _parser() -> options.Parser:
     what = "Say whether a coupling is safe for every passive human, and how far."
     parser = options.Parser("design.audit", what, *_EXAMPLES, first="K B rigid device scenario json")
     coupling = parser.add_argument_group("the coupling")
-    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, and so is the damping
+    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, like the damping below
     coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
@@ -133,7 +133,10 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """Return the options, completed by the catalogue's numbers; `source` allows its gains. Raises InputError."""
+    """Return the options, completed by the catalogue's numbers. Raises InputError.
+
+    `source` cites the source of the catalogue's gains, or is None where they are not used.
+    """
     if not args.device:
         return args
     with options.refused("--"):
@@ -266,7 +269,7 @@ def _tables(result: Audit) -> list[render.Table]:
 
 
 def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
-    """Answer which wall may be used with the damper of the coupling."""
+    """Return a sentence on the stiffest wall that is certified with the coupling's damper."""
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:

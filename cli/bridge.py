@@ -32,7 +32,7 @@ from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
-_LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
+_LONGEST = 3600.0  # [s] longest session, because the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
@@ -42,14 +42,14 @@ def main(argv: list[str]) -> int:
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # A host without a device clock sends at once.
+    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # A device without a clock applies at once.
     if at_once and args.condition:
         choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
         if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
             raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # The energy account of a world is at its contacts.
+        args.energy_budget = None  # A world accounts for energy at its contacts.
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
@@ -186,7 +186,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """Bound the power [W] that a tick longer than T_max gives a hand, per second of its length: sum f^2/(4 delta)."""
+    """Bound the power [W] that a hand may take during a tick longer than T_max: sum f^2/(4 delta)."""
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 

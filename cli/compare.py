@@ -1,8 +1,8 @@
-"""python -m design.compare: the same devices and hands with every coupling, or couplings over frequency.
+"""python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
-Without --coupling every coupling that is possible in the loop drives the scenario's own hands: one row each, and their
-forces side by side in couplings.png. The couplings of --coupling are drawn over frequency: singular values, required
-damping, perceived stiffness and damping.
+Without --coupling, the loop is run with the scenario's own hands and every possible coupling. The table has one row for
+each coupling, and couplings.png shows the forces side by side. With --coupling, the named couplings are drawn over
+frequency: singular values, required damping, perceived stiffness and damping.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return the verdict: which coupling with a guarantee has the least force error, or else the most stiffness."""
+    """Return the verdict: the coupling with a guarantee and the least force error, else the best static stiffness."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -208,7 +208,7 @@ def _named(name: str) -> tuple[str, str | Condition | None]:
 
 
 def _guarantees(report: Comparison) -> render.Table:
-    """Return the table of required damping [N s/m], or of multiples if the devices' damping differs."""
+    """Return the table of required damping [N s/m], or of its share of the devices' damping if that differs."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
@@ -253,7 +253,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return the damping that is needed at the worst stiffness or mass within ten percent."""
+    """Return the damping that the worst stiffness or mass within ten percent requires."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"

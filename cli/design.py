@@ -163,9 +163,9 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling.
+    """Design and prove. Raises InputError for contradictory options, DesignFailed if no coupling was found.
 
-    The second part is the decay of a knock, with --decay.
+    The second part of the result is the decay of a knock, or None without --decay.
     """
     from haptic_loop.design.api import proved
 
@@ -237,7 +237,7 @@ def _that_decays(
 
 
 def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
-    """Assess the design in its loop, with the design's own search between the vertices and proof."""
+    """Assess the design in its loop, with the design's own proof and its own search between the vertices."""
     with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
         return assess(
             loop,

@@ -1,9 +1,9 @@
 """python -m hw.identify: measure the damping that a device guarantees, by a chirp of a small force and a free release.
 
-Nobody may hold the device, in two sittings with the handles at different places. The sitting without a hand reveals a
-hand in the other one that only damps. The chirp passes through the session of the bridge with all its limits, capped at
-its own amplitude. With --transmission two sittings with clamped handles follow. They bound the mass of the motor and
-the transmission (hw/transmission.py), which the known-device conditions need.
+Two sittings are recorded with the handles at different places, and nobody may hold them. If a hand damps a handle in
+one sitting, the other sitting reveals it. The chirp is played in a session of the bridge with all its limits, whose
+force cap is the excitation's largest force. With --transmission two sittings with clamped handles follow. They bound
+the mass of the motor and the transmission (hw/transmission.py), which the known-device conditions need.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _TRANSMISSION_LIMITS = (
     "encoder that is not on the motor's shaft, or of a transmission that was tightened or warmed since."
 )
 _LEVELS = 1.0, 0.5  # shares of the force in the sittings with clamped handles; play shows as a difference
-_CLAMPED = 1000.0  # [kg] at the handle of an emulated device
+_CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +179,12 @@ def _sitting(
     number: int,
     clamped: float | None = None,
 ) -> _Sitting:
-    """Play the excitation to every axis, record and estimate.
+    """Play the excitation to every axis, record the motion and estimate.
 
-    With `clamped` handles the excitation is a chirp of this share of the force, and nothing is estimated yet.
+    With `clamped` the excitation is a chirp at this share of the force, and the function estimates nothing.
     """
-    undamped = scenario.replace(delta=(1e-6,) * scenario.channels)  # The damping is unknown.
-    r = scenario.lever  # the options are for the hand
+    undamped = scenario.replace(delta=(1e-6,) * scenario.channels)  # No damping is required, as it is unknown.
+    r = scenario.lever  # the options state figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # stops a device that is lighter than declared
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
@@ -205,7 +205,7 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
-    seconds = played(1).seconds - 0.2  # The lead includes the ramp.
+    seconds = played(1).seconds - 0.2  # The gain rises during the lead.
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
@@ -259,7 +259,7 @@ def _with_transmissions(
 
 
 def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Write one [[device]] table for a scenario file; a transmission that was not identified is the scenario's."""
+    """Write one [[device]] table for a scenario file, with the scenario's transmission if none was identified."""
     device, mass = scenario.axis_devices[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {_floored(e.delta, 6)}"]
     comment = in_unit("# [m/s] of the record: delta is not known beyond it")

@@ -26,7 +26,7 @@ from haptic_loop.design.own import is_refusal, place_of
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
 
-#: command -> (module of python -m, purpose); the command is in the file of its name in this folder
+#: command -> (module of python -m, purpose); the file of the same name in this folder has the code
 COMMANDS = {
     "audit": ("design.audit", "are these gains safe, and how far"),
     "design": ("design", "design a coupling, prove its certificate and store both"),

@@ -46,8 +46,8 @@ DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 _Number = TypeVar("_Number", int, float)
 _Given = TypeVar("_Given")
 _Group = argparse._ActionsContainer
-_CHOICE = re.compile(r"argument ([\w-]+): invalid choice: (.*) \(choose from (.*)\)")  # argparse's own words
-_OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # words of the types below
+_CHOICE = re.compile(r"argument ([\w-]+): invalid choice: (.*) \(choose from (.*)\)")  # argparse's message
+_OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # messages of the option types below
 
 
 class Parser(argparse.ArgumentParser):
@@ -391,7 +391,7 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
-        if place_of(error):  # in a class of the user's own
+        if place_of(error):  # raised in the user's own class
             raise
         text = str(error)
         argument = text.partition(" ")[0]
@@ -412,7 +412,10 @@ def per_channel(
 
 
 def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> DelayRange:
-    """Return the range of delays of --varying-delay, per device or channel, on every channel. Raises InputError."""
+    """Return the range of --varying-delay for every channel; `pairs` has one, one per device or one per channel.
+
+    Raises InputError.
+    """
     if loop.axes and len(pairs) == len(loop.axes):
         pairs = loop.per_channel(pairs)
     lo, hi = zip(*per_channel("--varying-delay", pairs, loop.channels, "ranges"), strict=True)
@@ -424,7 +427,7 @@ def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> De
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
-    """Parse `count` numbers in a longer text; a single number is repeated. Raises InputError."""
+    """Parse `count` numbers from a part of an option; a single number is repeated. Raises InputError."""
     try:
         if count == 1 and "," not in text:
             return (_one(kind)(text),)
@@ -514,7 +517,7 @@ def name_of(file: str) -> str:
     return f"{path.stem}-{sha256(str(path.parent.resolve()).encode()).hexdigest()[:6]}"
 
 
-_LONGEST = 80  # characters of a coupling or a condition in the name of a file, which may have 255
+_LONGEST = 80  # most characters of a coupling or a condition in a file name, which may have 255 characters
 
 
 def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:

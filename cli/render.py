@@ -42,7 +42,7 @@ def console(args: argparse.Namespace) -> Screen:
     return Screen(stderr=args.json == "-", highlight=False)
 
 
-_Progress = Callable[[str, int, int], None]  # (what, steps done, of how many)
+_Progress = Callable[[str, int, int], None]  # (task, steps done, steps in all)
 
 
 class Move(Protocol):
@@ -200,9 +200,9 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 
 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
-    """Return a table of records. A cell is a format of the record `r`, or a function of it, by its head.
+    """Return a table of records. `cells` maps the head of a column to a format of the record `r` or a function of it.
 
-    For two columns with the same head one key has a blank at its end.
+    If two columns have the same head, one key of `cells` has a blank at its end.
     """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
     return grid(title, [head.strip() for head in cells], rows, left)

@@ -120,7 +120,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
-    """Return the vertices of the ranges and as many other points, the worst one first. Raises InputError.
+    """Return the vertices of the ranges, the worst point found, and further random points. Raises InputError.
 
     Without `--environments ranges` the result is empty, and every loop has the nominal environment.
     """
@@ -160,7 +160,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search the worst humans in the environment that needs the most damping, until Ctrl-C or the end."""
+    """Search for the worst humans in the environment that needs the most damping. Ctrl-C ends the search."""
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
@@ -175,7 +175,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
             with render.progress("searching the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
-                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that needs the most damping
+                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # touching walls that need most damping
                 worst.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
         return _Searched(*worst, ratio=ratio, interrupted=True)

@@ -71,9 +71,9 @@ def verdict(
 
     Args:
         assessment: The assessment of exactly the loop that the command runs or judges.
-        nearby: The damping that is needed if the environment is ten percent off, if it was computed.
+        nearby: The required damping in environments within ten percent, or None.
         force_error: rms of a run, in percent of the ideal force.
-        encoder: Whether friction covers the encoder steps of the devices, where these have steps.
+        encoder: Whether friction covers the encoder steps of the devices; None without encoder steps.
     """
     guarantee = assessment.guarantee
     if guarantee is None:
@@ -94,7 +94,7 @@ def verdict(
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
 
 
-SOFT_END = 1.001 * SOFTEST  # [N/m] a spring below is at the soft end of the search
+SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
 _NOTHING_DB = -1.0  # rms mismatch above which a force is about as wrong as none, if there is no stiffness to render
 
 

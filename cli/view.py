@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     require_even_ticks(scenario, "sim.view")
     if args.video:
         check_film(Path(args.video))
-        if args.video.endswith(".gif") and 100 % args.fps:  # A GIF counts in hundredths of a second.
+        if args.video.endswith(".gif") and 100 % args.fps:  # A GIF states times in hundredths of a second.
             raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
     if is_world(scenario):
         args.coupling, args.duration = args.coupling or "moving-average", args.duration or scenario.duration
@@ -85,7 +85,7 @@ class _Event:
     coupling: str
     theta: tuple[int, ...]
     psi: tuple[int, ...]
-    exact_growth_rate_per_s: float  # null in JSON without one
+    exact_growth_rate_per_s: float  # null in JSON if there is none
     exact_frequency_hz: float
     assessment: Assessment
 

@@ -47,8 +47,8 @@ class _Report:
 
     scenario: str
     scenario_digest: str
-    kind: str  # of the coupling
-    coupling: dict[str, object]  # its figures
+    kind: str  # kind of the coupling
+    coupling: dict[str, object]  # figures of the coupling
     assessment: Assessment
     guaranteed: bool
     guarantee: str
@@ -125,7 +125,7 @@ def _energy(joules: float) -> str:
 # ----------------------------------------------------------------------------------------------------
 # sim.run
 
-_WRITTEN = ("scene.xml", "world.xml")  # the devices, and the scene with its springs
+_WRITTEN = ("scene.xml", "world.xml")  # files of the devices, and of the scene with its springs
 
 
 def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
