@@ -83,9 +83,9 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The unknowns are the entries of X (for each entry all n), followed by the x_a. A second derivative in two entries of
-    X is the product of two functions t_n, times a weight from S^-1 that is the same for all pairs of functions. The
-    Hessian is therefore a matrix product over the frequencies: (pairs of functions) times (pairs of entries).
+    The unknowns are the entries of X (for each entry all n), followed by the x_a. At each frequency a second derivative
+    in two entries of X is a sum of products t_n t_l and t_n t_l*, with weights from S^-1 that do not depend on n and l.
+    The Hessian is therefore a matrix product over the frequencies: (pairs of functions) times (pairs of entries).
     """
 
     constant: Array  # (k, r^2): `packed`
