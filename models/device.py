@@ -249,8 +249,9 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
 
         A negative entry of u selects the bound itself, because the worst devices lie near the bounds. A positive entry
-        moves the logarithm of its value evenly away from the bound. At 1 the values are ten times the least motor mass,
-        a hundredth of the handle mass (which has no bound), a tenth of the largest stiffness, and the largest damping.
+        moves the logarithm of its value evenly away from the bound. At 1 the motor has ten times its least mass and the
+        handle, which has no bound, a hundredth of its mass. The stiffness is then a tenth of the largest one, and the
+        damping is the largest one.
         """
         known = device.guaranteed
         assert known is not None  # the caller draws only where every device has bounds

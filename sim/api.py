@@ -232,8 +232,9 @@ def validate(
             the stability limit, the lossless ones and 64 at random), or "all".
 
     Returns:
-        Findings with n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
-        unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
+        Findings with n = humans. `exact` and `mujoco` (n,) are growth rates [1/s], positive where a human makes the
+        loop unstable. `radius` (n,) and `frequency` (n,) [Hz] are those of the exact loop's mode, and `disagreements`
+        (n,) those of the engines. crowds.Findings lists the other fields.
 
     Raises:
         InputError: A device has Coulomb friction; verdicts are of linear loops.

@@ -20,9 +20,9 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """Return a coupling's requirement in environments that differ by 10 %; if it filters forces, also a design's price.
+    """Return a coupling's requirement in environments that differ by 10 %.
 
-    The price is that of a design for all these environments.
+    For a coupling that filters forces, the result also has the price of a design for all these environments.
     """
     filters_forces = coupling.in_series(loop.T) is not None
     return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
