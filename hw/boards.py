@@ -34,8 +34,8 @@ _FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SIL
 def ticks_behind(theta: Sequence[int], axes: Sequence[int]) -> tuple[int, ...]:
     """Return the ticks (m,) by which forces of each channel act later than the link's delay.
 
-    The first board with the least delay leads. Its channels have 0, those of the other boards 1. `theta` (m,) are the
-    delays of the channels [samples], `axes` the numbers of channels of the boards.
+    The first board with the least delay leads. Its channels act 0 ticks later, those of the other boards 1 tick.
+    `theta` (m,) are the delays of the channels [samples], `axes` the numbers of channels of the boards.
     """
     owner = [i for i, n in enumerate(axes) for _ in range(n)]
     lead = min(range(len(axes)), key=lambda i: min(n for n, own in zip(theta, owner, strict=True) if own == i))
@@ -47,7 +47,7 @@ class _Board:
 
     def __init__(self, device: SerialDevice, axes: slice, behind: int) -> None:
         self.device, self.axes, self.behind = device, axes, behind
-        self.period = 0.0  # [us] of the configuration
+        self.period = 0.0  # [us] length of a tick, from INFO
         self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
         self.last: wire.State | None = None  # None before it was configured

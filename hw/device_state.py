@@ -10,7 +10,7 @@ docs/protocol.md states the rules. Forces are tuples of steps, one entry per axi
 from haptic_loop.hw import protocol as wire
 
 _SLOTS = 16  # places for forces that wait for their tick: a power of two above MAX_THETA
-RUNNING = (wire.Phase.ARMED, wire.Phase.HOLDING, wire.Phase.RAMP)  # the motors may carry a force
+RUNNING = (wire.Phase.ARMED, wire.Phase.HOLDING, wire.Phase.RAMP)  # phases in which motors may carry a force
 
 
 class Device:

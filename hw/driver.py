@@ -28,7 +28,7 @@ class Operator:
     auto_arm: bool
     seconds: float  # of forces at full gain, from each arming on
     deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
-    _asked: bool = False  # auto_arm has been used up
+    _asked: bool = False  # whether it or a key has armed the session
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] when the user gave a sign last
     _free_at: int = 0  # [us] time from which on it may arm by itself

@@ -1,7 +1,7 @@
 """Emulate a device: the scenario's plant under the firmware's own state machine, with faults on request.
 
-A fault of a cable, a process or a device is written KIND[=VALUE][@START[+DURATION]], with
-`up:` (device to host) or `down:` in front for one direction of the line, `axis2:` for another axis than the first:
+A fault of a cable, a process or a device is written KIND[=VALUE][@START[+DURATION]]. The prefix `up:` (device to host)
+or `down:` selects one direction of the line, and a prefix such as `axis2:` selects another axis than the first:
 
     drop=0.1          a tenth of all frames never arrives
     up:flip=0.02@1+2  from 1 s after arming, for 2 s, one bit of every fiftieth STATE is wrong
@@ -293,9 +293,11 @@ class Emulator:
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
         self._motor: Array = np.ones(scenario.channels)  # part of its force that each motor makes
         self._swapped, self._crossed = False, 0.0
-        self._begun, self._rest, self._at_tick = 0, 0.0, False  # start of the tick [us], its share to come, is it new
+        # start of the tick [us], its share that is still to come, and whether none of it has passed
+        self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
-        self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: the shown count for a true one
+        # by axis: function from the true count to the count that a broken encoder shows
+        self._encoder: dict[int, Callable[[int], int]] = {}
         for fault in faults:
             if fault.kind in _AXIS and fault.axis >= scenario.channels:
                 raise ValueError(

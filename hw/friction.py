@@ -13,9 +13,9 @@ all parameters but the a beside g, so a fit takes milliseconds, and it needs no 
 
 Dry friction g(x') is c tanh(v/v0), with a part that vanishes at speed (Stribeck), or a bristle that bends over some
 distance (Dahl). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits almost as well as
-the best counts in the bound, with a drag q >= 0. Of b and q, only b is guaranteed. The periodic term holds forces that
-repeat with position (a motor's poles) and encoder errors that do (its eccentricity). Their periods are searched in the
-residual.
+the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term holds
+forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods are
+searched in the residual.
 
 For one law, the bound is b minus two parts: its scatter when tenths of the record are left out in turn, and a share of
 the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit.
@@ -36,7 +36,7 @@ from haptic_loop.controller.lti import Array
 
 _WINDOW = 0.012  # [s] least standard deviation of h, which halves the amplitude at 16 Hz
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave; a coarse encoder gets a longer window
-_SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that decides friction; sets the shortest window
+_SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that friction depends on; sets the shortest window
 _SPACING = 0.4  # distance of two rows in standard deviations of the window: filtered signals have no finer detail
 _NEARBY = 3.5  # standard deviations between a row and the nearest tick at which the balance does not hold
 _REACH = 6  # standard deviations at which a window is cut off
@@ -54,7 +54,7 @@ SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows below which a record is too short
 _ALMOST = 4.0  # largest log likelihood ratio of the best law to one that counts in the bound
-_ROUNDS = 3  # iterations that settle the transmission's part of friction
+_ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
 _NEAR = np.geomspace(0.92, 1.09, 24)  # factors of the best of these periods, searched next
 _PERIODIC = 4  # most periodic disturbances in a fit
@@ -151,7 +151,7 @@ class _Balance:
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
-        self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples that stay independent
+        self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # independent filtered samples
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
         self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}

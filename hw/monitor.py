@@ -1,10 +1,10 @@
 """Check that link and device behave as the certificate assumes: measured delay, clock, lateness, applied forces.
 
 The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the clocks of
-device and host are compared with the tick number, late and missing answers are counted, and the force that the device
-reports is compared with the force that it was sent. docs/protocol.md determines that force: in ARMED the device moves
-from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps its last force;
-in DISARMED it applies none.
+device and host are compared with the tick number, and late and missing answers are counted. The force that the device
+reports is compared with the force that it was sent. docs/protocol.md determines the applied force: in ARMED the device
+moves from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps its last
+force; in DISARMED it applies none.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from haptic_loop.sim.scenario import Scenario
 _STATES_PER_ANSWER = 8  # most STATEs per measured age: a USB frame may bring several FORCEs, but one margin is told
 _INFERRED = 0.005  # largest share of inferred ages: half of what the usual quantile leaves out
 _MEASURED_TOLERANCE = 0.01  # relative error of the device's clock against T, over the measurement
-_UNTOLD = 0.9  # largest share of STATEs without a margin; a USB frame may carry several
+_UNTOLD = 0.9  # largest share of STATEs without a margin; a USB frame may carry several FORCEs
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # relative clock error over a block; a busy host blurs its own
 _BLOCK = 200  # ticks over which a clock is compared
 _CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
@@ -45,12 +45,12 @@ _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; 1 % of
 _FIT = 0.8  # least share of power with the expected shape: free handles in a moving hand have 0.93, held ones up to 0.5
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have one, but no certificate covers a whole tick
 _CROSS = 0.25  # largest share of the expected motion on another axis; less may pass through a table
-_ALIVE = 0.06  # least share of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, no motor 0.03
+_ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
 _STRONG = 2  # first block of the test at the end of a session
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
-_PRESSING, _PRESSED = 0.3, 0.5  # [N] force under which an encoder may stand still for this time [s]
-_FORGETTING = 8  # right ticks that cancel a wrong one: fewer let a session stop, also if wrong ticks are not in a row
+_PRESSING, _PRESSED = 0.3, 0.5  # force [N], and the longest time [s] for which an encoder may stand still under it
+_FORGETTING = 8  # right ticks that cancel a wrong one; with fewer in between, scattered wrong ticks stop a session, too
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class Measurement:
             self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
         self._last, self._tick = state, self._tick + passed
         self._states += 1
-        counted = self._states - 2 * self._theta  # before, the device misses answers to ticks before the first STATE
+        counted = self._states - 2 * self._theta  # the device has no answers to ticks before the first STATE
         if counted <= 0:
             return False
         tick = self._tick + distance(state.echo, state.tick)

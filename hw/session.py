@@ -59,7 +59,7 @@ class Session:
         self.config: wire.Config | None = None  # the last configuration for the device
         self.programs: tuple[Armable, ...] = ()
         self.program: Armable | None = None
-        self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
+        self.drive: Drive | None = None  # that of the last arming; None before the first and after the end
         self.armings: list[Arming] = []
         self.worlds: list[WorldController] = []  # one per arming in a world
         self.record: Callable[[TraceRow], None] = lambda row: None

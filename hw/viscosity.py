@@ -4,13 +4,13 @@ The bound of hw/friction.py assumes that one number b describes the damping. Fri
 that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no such number. It damps less at the speeds
 and frequencies where a session needs the damping. A record that shows either kind of friction is refused.
 
-Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the motor's work
-is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt, with S_n = int |v|^n dt and the lag l of an amplifier.
-For viscous and dry friction q = 0 at every amplitude. Where friction thins, q < 0, and the damping at the speed v is
-b + q v.
+Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the work of the
+motor is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, and l is the lag of an
+amplifier. For viscous and dry friction q = 0 at every amplitude. Where friction thins, q < 0, and the damping at the
+speed v is b + q v.
 
-Frequency: a model with a transmission, an amplifier's lag and a Maxwell element (c, tau) beside b is fitted to the
-motion under the force less dry friction, for each of several tau. The element's damping c/(1 + (w tau)^2) acts in the
+Frequency: a model is fitted to the motion under the force less dry friction. It has a transmission, an amplifier's lag
+and, for each of several tau, a Maxwell element (c, tau) beside b. The element's damping c/(1 + (w tau)^2) acts in the
 record's slow strokes and vanishes at high frequency, where only b is left. A certificate uses the damping at every
 frequency, so only b counts. The bound is the least lower end of b over all tau. So a memory that the record cannot
 exclude, for example because the encoder is coarse, lowers the bound.
