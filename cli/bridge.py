@@ -174,7 +174,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """Return a sentence on the length of ticks and on the energy that a tick beyond the certified length may give."""
+    """Return a sentence on the lengths of ticks and on the energy that a tick longer than certified may give a hand."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)

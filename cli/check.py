@@ -61,7 +61,7 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
-    claim: str | None = render.figure("claim", default=None, json="if given")  # on a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # claim on a condition of the user's own
     assessment: Assessment | None = off_table(default=None)  # in the loop of the file, if the file is proved
     anew: bool = off_table(default=False)  # whether --condition is not that of the file
 

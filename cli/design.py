@@ -165,7 +165,7 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
     """Design and prove. Raises InputError for contradictory options, DesignFailed if no coupling was found.
 
-    The second part of the result is the decay of a knock, or None without --decay.
+    The second part of the result is the decay after a knock, or None without --decay.
     """
     from haptic_loop.design.api import proved
 
@@ -386,7 +386,7 @@ class _Report:
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
     interrupted: bool = off_table()
-    claim: str | None = render.figure("claim", default=None, json="if given")  # on a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # for the user's own condition
     compared: str | None = render.figure("compared", default=None, json="if given")  # other certificates
 
     @property

@@ -62,7 +62,7 @@ class _Exported:
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
-    claim: str | None = render.figure("claim", json="if given")  # on a condition of the user's own
+    claim: str | None = render.figure("claim", json="if given")  # claim on a condition of the user's own
 
 
 def main(argv: list[str]) -> int:

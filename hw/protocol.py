@@ -42,13 +42,13 @@ class Cause(IntEnum):
     NONE = 0
     HOST = 1  # a STOP from the host
     WATCHDOG = 2  # more than `hold` ticks without a force
-    COMMAND = 3  # a FORCE with a command that has no place while armed
+    COMMAND = 3  # a FORCE with a command that is not allowed while armed
     DEVICE = 4  # the firmware found a fault of its own
     ESTOP_DEVICE = 5  # the emergency stop at the device
     ESTOP_HOST = 6  # a STOP with reason ESTOP
 
 
-#: members by value: ten times as fast as a look-up in the enumeration, which every tick does ten times
+#: members by value, because a look-up in the enumeration takes ten times as long, and a tick needs ten look-ups
 _PHASES, _CAUSES = {int(phase): phase for phase in Phase}, {int(cause): cause for cause in Cause}
 
 
@@ -93,7 +93,7 @@ class Hello(NamedTuple):
 
 
 class Info(NamedTuple):
-    """Device to host: what it is. Tuples have one entry per axis."""
+    """Device to host: the properties of the device. Tuples have one entry per axis."""
 
     version: int
     firmware: str  # at most 16 ASCII characters
@@ -111,7 +111,7 @@ class Info(NamedTuple):
 
 
 class Config(NamedTuple):
-    """Host to device: how to run. Tuples have one entry per axis."""
+    """Host to device: the parameters of a run. Tuples have one entry per axis."""
 
     theta: int  # a force answers tick k and is latched at tick k + theta; 0: as soon as it comes, within tick k
     hold: int  # ticks that the last force is held for when frames are missing
@@ -201,7 +201,7 @@ class Force(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """Host to device: to zero force, now."""
+    """Host to device: go to zero force now."""
 
     reason: int
 
