@@ -269,7 +269,7 @@ def test_a_requested_error_chooses_the_engine(tmp_path, capsys):
     assert (check["integrator"], check["substeps"], check["agrees"]) == ("RK4", 4, True)
     assert 0 < check["position_relative_rms"] < 1e-6
     assert "RK4 x 4" in capsys.readouterr().out
-    with pytest.raises(InputError, match="--error chooses integrator and substeps"):
+    with pytest.raises(InputError, match="--error chooses MuJoCo's integrator and substeps"):
         main([*options, "--error", "1e-9", "--engine", "exact"])
 
 
