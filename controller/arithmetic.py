@@ -168,6 +168,7 @@ def fractions(value: Any) -> Any:
 
 
 def eye(n: int, T: Number) -> Array:
+    """Return the identity matrix (n, n) in the arithmetic of T."""
     if not isinstance(T, Fraction):
         return np.eye(n)
     one = np.full((n, n), _ZERO, dtype=object)

@@ -122,7 +122,9 @@ class NoCoupling(Coupling):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SpringDamper(ReadOnly, Coupling):
-    """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26). Leading axes of K and B hold many couplings.
+    """One spring and damper per channel: V = [K + B (z-1)/(Tz)]^-1, (26) of the paper.
+
+    K and B are (m,), or (.., m) for many couplings at once.
 
     The damper may act on a filtered velocity. It is then the backward Euler discretisation of B s/(tau s + 1), which is
     a damper in series with a spring of stiffness B/tau and therefore passive. In this case

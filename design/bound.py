@@ -43,7 +43,7 @@ from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
-_GRID = 250  # even points, and as many points even in the logarithm, between which H is linear
+_GRID = 250  # points of the grid: so many with equal steps, and so many with equal ratios. H is linear between them.
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} channels: half a minute for one that is 1 dB off"

@@ -69,8 +69,8 @@ def _in_time() -> Iterator[None]:
 # any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the parameters of a Network are
 # non-negative. Other multipliers are stored.
 #
-# With ranges, this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..). It is not
-# proved for the environments in between, nor for an environment that changes.
+# With ranges, this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..). There is no
+# proof for an environment between the vertices, or for one that changes with time.
 #
 # A certificate names its base condition and the facts that are part of its block: latency, walls, limiter, switching.
 
@@ -141,7 +141,7 @@ def _proof(
     """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
-    complete = swept is not None and len(swept.multiplier or ()) == numbers  # Quick sweeps search no multipliers.
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep leaves them out.
     requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)

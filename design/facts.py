@@ -454,7 +454,7 @@ def compose(
 
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
-    """Add the form of the hands' side; if `scaled`, the terms with its multipliers do not grow with s."""
+    """Add the form of the hands' side. If `scaled`, its terms with multipliers are not multiplied by s."""
 
     def form(values: Values) -> Any:
         return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)

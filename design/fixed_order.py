@@ -418,7 +418,7 @@ class FixedPoles:
         return self.units.si(unit(x)), float(np.sqrt(max(x[-1], 0.0)))
 
 
-_START_ROOM = 1e-3  # relative reduction of the damping for the start, so that it is strictly feasible
+_START_ROOM = 1e-3  # The first point is found for damping that is less by this share, so that it is strictly feasible.
 
 
 def design(

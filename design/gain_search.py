@@ -116,7 +116,10 @@ class SampledLoop:
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """Return the multiplier (active,) at x and its derivative by the unknowns, (active,) or a symmetric matrix."""
+        """Return the multiplier (active,) at x, and its derivative by the unknowns.
+
+        The derivative is symmetric, (active, active). A diagonal one is given by its diagonal, (active,).
+        """
         return np.zeros(0), np.zeros(0)
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:

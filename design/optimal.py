@@ -178,7 +178,8 @@ def design(
     return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
 
 
-_ETAS = 0.15, 0.3, 0.5  # tried shares of the largest beta, equal on all channels; the mismatch hardly depends on them
+# Tried betas, as shares of the largest one. All channels have the same share, on which the mismatch hardly depends.
+_ETAS = 0.15, 0.3, 0.5
 _SCALINGS = 6  # most scalings of the forces; each reduces them by at least MARGIN
 
 

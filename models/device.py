@@ -168,7 +168,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
-    file: ClassVar[str] = "compliant"  # name of the MJCF file, without ".xml"
+    file: ClassVar[str] = "compliant"  # The MJCF file is models/{file}.xml.
 
     @property
     def bodies(self) -> dict[str, float]:

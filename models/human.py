@@ -414,7 +414,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         return force
 
 
-_MOST_LINKS = 500  # of one hand: the loop's eigenvalues take five seconds; with 1000 links they take half a minute
+_MOST_LINKS = 500  # Largest number for one hand: eigenvalues then take 5 s, with 1000 links 30 s.
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):

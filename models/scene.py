@@ -626,7 +626,7 @@ class Crowd:
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
     axes: tuple[int, ...] = ()  # (devices,) if links have amounts along directions, with 1 + 2 axes^2 numbers each
-    mechanics: _Drawn = ()  # (nsim, devices) if the devices are drawn within their guaranteed bounds
+    mechanics: _Drawn = ()  # (nsim, devices), or empty where every hand holds the scenario's devices
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)

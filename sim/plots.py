@@ -350,7 +350,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     for i, column in enumerate(1e3 * sizes.T):
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
-    # The prediction is fitted to the last third, because slower modes have decayed by then.
+    # The predicted line is fitted to the last third of the trace, where only the slowest mode is left.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
