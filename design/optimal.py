@@ -306,9 +306,9 @@ class _Search:
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
-            slip = program.Slip(beta_of(self.loop, before.certificate), ((),) * self.loop.channels)
+            slip = program.Slip(beta_of(self.loop, before.certificate), ((),) * len(self.loop.devices))
             c = before.certificate.multipliers["c"]
-            condition = LimitedForces(slip.beta, len(c) // self.loop.channels)
+            condition = LimitedForces(slip.beta, len(c) // len(self.loop.devices))
             return (replace(slip, c=condition.rows(self.loop, c)),)
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 

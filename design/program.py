@@ -141,7 +141,7 @@ class Slip:
     """Lag and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
 
     beta: float  # rho = beta delta/T
-    c: tuple[tuple[float, ...], ...]  # (m, lags)
+    c: tuple[tuple[float, ...], ...]  # (devices, lags)
 
     @property
     def condition(self) -> LimitedForces:
@@ -149,7 +149,7 @@ class Slip:
 
     @classmethod
     def even(cls, loop: Loop, beta: float, c: float) -> Slip:
-        return cls(beta, ((c,),) * loop.channels)
+        return cls(beta, ((c,),) * len(loop.devices))
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
@@ -158,11 +158,8 @@ def limiter(loop: Loop, slip: Slip) -> _Constraint:
 
     def block(G: Sampled, own: Array) -> Sampled:
         demand = condition.block(G, loop, c)
-        return (
-            demand.free
-            + demand.gain * (1 - MARGIN)
-            - np.diag(np.zeros(len(c)) if demand.spare is None else demand.spare)
-        )
+        demanded = demand.free + demand.gain * (1 - MARGIN)
+        return demanded if demand.spare is None else demanded - np.diag(demand.spare)
 
     return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop) / loop.T), 2))
 

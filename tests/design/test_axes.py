@@ -660,3 +660,11 @@ def test_switching_search_shares_a_multiplier() -> None:
 def test_reports_show_matrix_gains_on_their_diagonal() -> None:
     rows = dict(verdict.gain_rows(assess(PAIR, BUILT)))
     assert rows == {"coupling, static": "1500, 800, 1000, 700 N/m"}
+
+
+def test_optimal_filters_limit_force_vectors() -> None:
+    """The multiplier has one row per device; a second basis starts from the first one's certificate."""
+    design = design_by_kind(LOOP, "optimal", limiter=True, bases=((1, 1), (2, 1)))
+    needs = required_damping(LOOP, design.coupling, LimitedForces(0.0, 1))
+    assert design.requirement.certified
+    assert len(needs.multiplier or ()) == len(LOOP.devices)
