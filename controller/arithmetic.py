@@ -108,11 +108,11 @@ def _spend_on_differences(count: int, factor: Fraction) -> None:
     spend(_DIFFERENCE * count * (1 + factor.denominator.bit_length() / 80))
 
 
-Args = ParamSpec("Args")
-Result = TypeVar("Result")
+_Args = ParamSpec("_Args")
+_Result = TypeVar("_Result")
 
 
-def one_blas_thread(function: Callable[Args, Result]) -> Callable[Args, Result]:
+def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
     """Let a function compute with one BLAS thread.
 
     More threads change the last digits. They also wait for each other: on a busy machine they made the design of an
@@ -120,7 +120,7 @@ def one_blas_thread(function: Callable[Args, Result]) -> Callable[Args, Result]:
     """
 
     @wraps(function)
-    def limited(*args: Args.args, **kwargs: Args.kwargs) -> Result:
+    def limited(*args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
         with _blas().limit(limits=1, user_api="blas"):
             return function(*args, **kwargs)
 

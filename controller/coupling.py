@@ -183,9 +183,9 @@ class SpringDamper(ReadOnly, Coupling):
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> SpringDamper:
         return replace(self, K=stiffness * self.K, B=damping * self.B)
 
-    def turned(self, Q: Array) -> MatrixSpringDamper:
+    def turned(self, Q: Array) -> _MatrixSpringDamper:
         K, B = (Q * gains @ Q.T for gains in (self.K, self.B))
-        return MatrixSpringDamper((K + K.T) / 2, (B + B.T) / 2)
+        return _MatrixSpringDamper((K + K.T) / 2, (B + B.T) / 2)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
         """Return V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
@@ -209,7 +209,7 @@ class SpringDamper(ReadOnly, Coupling):
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixSpringDamper(ReadOnly, Coupling):
+class _MatrixSpringDamper(ReadOnly, Coupling):
     """V = [K + B (z-1)/(Tz)]^-1 with symmetric matrices, springs and dampers between the axes of devices (26).
 
     Raises:
@@ -247,8 +247,8 @@ class MatrixSpringDamper(ReadOnly, Coupling):
     def figures(self, T: float) -> dict[str, Any]:
         return {"stiffness": np.diag(self.K).tolist()} | super().figures(T)
 
-    def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> MatrixSpringDamper:
-        return MatrixSpringDamper(stiffness * self.K, damping * self.B)
+    def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> _MatrixSpringDamper:
+        return _MatrixSpringDamper(stiffness * self.K, damping * self.B)
 
     def form(self) -> _MatrixSpringDamperForm:
         return _MatrixSpringDamperForm(_rows(self.K), _rows(self.B))
@@ -360,7 +360,7 @@ def _decimals(M: Array, digits: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InternalModel(ReadOnly, Coupling):
+class _InternalModel(ReadOnly, Coupling):
     """Internal model control with a parameter Q(z): u = x - Q y, where y = Psi E x is the output of the model.
 
     G = Psi E - Psi E Q Psi E equals V = Q (I - Psi E Q)^-1 in feedback. It is affine in Q, and stable if Q and the
@@ -419,7 +419,7 @@ class ForceFilter(ReadOnly, Coupling):
     """A filter R(z) of the environment's forces: F = Theta R Psi E, with one copy of the environment.
 
     There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
-    coupling `InternalModel`. R(z) = sum_k R_k b_k(z) with the functions of `basis`, which are 1 at z = 1. The decimals
+    coupling `_InternalModel`. R(z) = sum_k R_k b_k(z) with the functions of `basis`, which are 1 at z = 1. The decimals
     of the coefficients give R(1) = g I exactly, so that F(1) = g E(1) is symmetric for all springs. R_k has one column
     for the force of each channel, and optionally one more for the sum of all forces.
 
@@ -638,8 +638,8 @@ class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix
     def shape(self) -> tuple[str, int, int]:
         return "K", len(self.K), len(self.K)
 
-    def build(self, T: float) -> MatrixSpringDamper:
-        return MatrixSpringDamper(*(_table(name, getattr(self, name), *(len(self.K),) * 2) for name in "KB"))
+    def build(self, T: float) -> _MatrixSpringDamper:
+        return _MatrixSpringDamper(*(_table(name, getattr(self, name), *(len(self.K),) * 2) for name in "KB"))
 
 
 class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
@@ -699,8 +699,8 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
     def shape(self) -> tuple[str, int, int]:
         return "Q", len(self.Q[0]), len(self.Q[0])
 
-    def build(self, T: float) -> InternalModel:
-        return InternalModel(self.poles, self.Q)
+    def build(self, T: float) -> _InternalModel:
+        return _InternalModel(self.poles, self.Q)
 
 
 class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):

@@ -108,7 +108,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
         return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
-def parts_of(element: Any) -> list[Spring | Wall]:
+def _parts_of(element: Any) -> list[Spring | Wall]:
     """Return the springs and walls of a user's own element. Raises ValueError for an object without such parts.
 
     A hardening spring, for example, is a spring with walls in parallel, which push beyond their gaps.
@@ -338,7 +338,7 @@ class Network(
         if self.world:
             self._check_world(self.world)
             return
-        for part in [part for element in self.elements for part in parts_of(element)]:
+        for part in [part for element in self.elements for part in _parts_of(element)]:
             name = "springs" if isinstance(part, Spring) else "walls"
             msgspec.structs.force_setattr(self, name, (*getattr(self, name), part))
         msgspec.structs.force_setattr(self, "elements", ())

@@ -288,7 +288,7 @@ class ForceLimits:
         return shown | {"certificate": self.requirement, "c": self.c, "energy_budget": self.energy_budget}
 
 
-def covered_limits(
+def _covered_limits(
     loop: Loop,
     coupling: Coupling,
     requirements: Mapping[str, Requirement],
@@ -606,7 +606,7 @@ def _force_limits(
     """Return the limiter for a loop, or clipping with the reason."""
     if limiter is False:
         return ForceLimits(None, "forces are clipped, as asked")
-    return covered_limits(loop, coupling, requirements, proof, known)
+    return _covered_limits(loop, coupling, requirements, proof, known)
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:

@@ -284,7 +284,7 @@ class _Remedy:
     requirement: Requirement
 
 
-def remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
+def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
     """Return single changes that certify or lower the requirement by 10 %; [] for a certified coupling."""
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
@@ -431,6 +431,6 @@ def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requir
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
     """Return changes that certify a failing condition or lower its required damping."""
-    helpful = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
+    helpful = _in_time(loop, coupling, lambda: _remedies(loop, coupling, condition), lambda why: [])
     pairs = ((remedy.change, remedy.requirement) for remedy in helpful)
     return [Help(change, condition.name, after.required, after.certified) for change, after in pairs]

@@ -21,7 +21,7 @@ To add a hands' side, derive a class from `HandsSide` and state
 Let `hands_side(loop)` return the class for its loops. `compose` then makes the rows and adds walls, limiter and
 switching without further code.
 
-any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`v_hat`,
+any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`_v_hat`,
 `any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
 """
 
@@ -79,7 +79,7 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
     return weight @ moving_sum(theta, T)
 
 
-def v_hat(H: Block) -> tuple[Array, Block]:
+def _v_hat(H: Block) -> tuple[Array, Block]:
     """Return H(1) and H(1)/2 - (H - H(1))/(z - 1), whose Hermitian part is that of T V-hat/|1 - 1/z|^2.
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) combines the compliance V and the delays. V-hat vanishes at z = 1,
@@ -95,8 +95,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. After the
-    division by |1 - 1/z|^2 (see `v_hat`) this is T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat. A Schur
-    complement gives He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
+    division by |1 - 1/z|^2 (see `_v_hat`) this is T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat. A Schur
+    complement gives He[[T _v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
     Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a
     multiplier.
     """
@@ -110,7 +110,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
         """Return H(1) and the block with this lower right corner; both are linear in H and the corner."""
-        H1, regular = v_hat(H)
+        H1, regular = _v_hat(H)
         if not short.size:
             return H1, regular
         corner = np.vstack([np.zeros((loop.channels, short.size), dtype=int), corner])
@@ -129,7 +129,7 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Dema
     block is T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
     """
     T, E1 = delayed.T, delayed.dc()
-    return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
+    return Demand(T * _regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
 
 
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
@@ -166,10 +166,10 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
         return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
-    return least_multiple(free, gain)
+    return _least_multiple(free, gain)
 
 
-def least_multiple(free: Complex, gain: Complex) -> Array:
+def _least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
     If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
@@ -207,7 +207,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
 
 
 def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
-    """Return `least_multiple` of 2 x 2 matrices with det(gain) = room, by a quadratic equation.
+    """Return `_least_multiple` of 2 x 2 matrices with det(gain) = room, by a quadratic equation.
 
     The closed form is 20 times as fast as LAPACK.
     """
@@ -431,7 +431,7 @@ def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> 
 
 def this_environment(F: Lti, loop: Loop) -> Requirement:
     """Return the damping that this-environment requires for the force map F; the loop's environment is not used."""
-    dampings(loop.delta, F.inputs)
+    _dampings(loop.delta, F.inputs)
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
@@ -449,7 +449,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     def needed(w: Array) -> Array:
         F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
         demand = this_environment_demand(F, loop)
-        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+        return _least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
     grid = frequencies(E, chain, low=_LOWEST)
     return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
@@ -488,7 +488,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 
     With phi (m,) [N s/m] (see `any_environment_demand`) the environment is the loop's own, with its delay psi.
     """
-    available = dampings(loop.delta, V.inputs)
+    available = _dampings(loop.delta, V.inputs)
 
     def refused(reason: str) -> Requirement:
         return refusal("any-environment", available, reason)
@@ -535,7 +535,7 @@ def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     _, sizes, right = np.linalg.svd(response) if V.inputs > 1 else (1, np.abs(response[..., 0]), np.ones((1, 1)))
     static = float(np.abs(demand.static["V(1)"]).max())
     idle = (sizes <= _VANISHES * static) * (_SOFTENED * static)
-    return least_multiple(free, gain + np.conj(np.swapaxes(right, -1, -2)) @ (idle[..., None] * right))
+    return _least_multiple(free, gain + np.conj(np.swapaxes(right, -1, -2)) @ (idle[..., None] * right))
 
 
 def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
@@ -547,7 +547,7 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
     return Requirement("any-environment", required, available, worst.frequency_hz, worst.reason)
 
 
-def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong or negative one."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
@@ -568,7 +568,7 @@ _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which 
 _CHUNK = 256  # ticks summed at once
 
 
-def l1_gain(F: Lti) -> Array:
+def _l1_gain(F: Lti) -> Array:
     """Return an upper bound of the sum over all ticks of |impulse response|, (p, m); inf for an unstable F.
 
     Ticks are summed until the bound of the remaining sum is small. With A'PA <= r^2 P and r < 1 this bound follows from
@@ -611,7 +611,7 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
         raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
-    W = l1_gain(F) @ (q / 2)
+    W = _l1_gain(F) @ (q / 2)
     return magnitudes(W[:, None], axes)[:, 0] if axes else W
 
 
@@ -648,10 +648,10 @@ def any_environment_ratios(
 
 
 def _least_scales(demand: Demand[Sampled]) -> Array:
-    return least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G))
+    return _least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G))
 
 
-def regular_part(E: Lti) -> Lti:
+def _regular_part(E: Lti) -> Lti:
     """Return a block with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle, except z = 1; stable if E is."""
     _, regular = E.over_z_minus_one()
     return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

@@ -114,7 +114,7 @@ class _Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
-_MANY_ROWS = 8  # number of rows above which `strictly_positive` is tried before the elimination
+_MANY_ROWS = 8  # number of rows above which `_strictly_positive` is tried before the elimination
 
 
 def definiteness(S: Matrix) -> _Definiteness:
@@ -122,9 +122,9 @@ def definiteness(S: Matrix) -> _Definiteness:
 
     The pivots of the elimination are the leading minors themselves. If a pivot is zero, S is semidefinite only if the
     pivot's entire row in the Schur complement is zero; the row is then skipped. A large matrix is tested with
-    `strictly_positive` first. Raises ValueError if S is not exactly symmetric.
+    `_strictly_positive` first. Raises ValueError if S is not exactly symmetric.
     """
-    if S.shape[0] > _MANY_ROWS and strictly_positive(S):
+    if S.shape[0] > _MANY_ROWS and _strictly_positive(S):
         return _Definiteness(True, True)
     work = S.reduced().num.copy()
     if not (work == work.T).all():
@@ -153,16 +153,16 @@ def definiteness(S: Matrix) -> _Definiteness:
 # be exact, too, but its numbers grow with every pivot.
 
 
-BITS = 192  # binary places of the rounded matrix whose definiteness is tested
+_BITS = 192  # binary places of the rounded matrix whose definiteness is tested
 _FACTOR_BITS = 46  # bits of the largest entry of R; the others are rounded to the same unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
-def strictly_positive(S: Matrix) -> bool:
+def _strictly_positive(S: Matrix) -> bool:
     """Return whether S > 0 is proved, for an exactly symmetric S (n, n).
 
-    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-BITS. The error
-    is at most 2^-BITS / 2 per entry, hence at most n 2^-BITS in norm, which is subtracted from the diagonal. Rounding
+    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-_BITS. The error
+    is at most 2^-_BITS / 2 per entry, hence at most n 2^-_BITS in norm, which is subtracted from the diagonal. Rounding
     keeps the numbers in the products short, however long those of S are. Raises ValueError if S is not exactly
     symmetric.
     """
@@ -170,7 +170,7 @@ def strictly_positive(S: Matrix) -> bool:
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
     if any(v <= 0 for v in np.diag(S.num)):
         return False
-    return _definite(_less(_rounded(S, _halves(S), BITS), S.shape[0]), BITS)
+    return _definite(_less(_rounded(S, _halves(S), _BITS), S.shape[0]), _BITS)
 
 
 def _halves(S: Matrix) -> list[int]:
@@ -325,7 +325,7 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     return W >> bits + finer, 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
 
 
-def too_large(states: int) -> str | None:
+def _too_large(states: int) -> str | None:
     """Return the reason why no proof is tried for this number of states, or None."""
     if states <= budgets.PROOF_STATES:
         return None
@@ -334,11 +334,11 @@ def too_large(states: int) -> str | None:
 
 def require_size(states: int, requirement: Requirement | None = None) -> None:
     """Raise NotProved if exact arithmetic over this number of states would take minutes."""
-    if reason := too_large(states):
+    if reason := _too_large(states):
         raise NotProved(reason, requirement)
 
 
-def prove_positive_real(G: Lti, P: Matrix) -> str | None:
+def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
     """Return None if P proves that G is strictly positive real, otherwise the reason.
 
     Floating point with an a-priori error bound may refuse early; only exact arithmetic accepts.
@@ -427,7 +427,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
         kind = Violated if margin < -_CLEARLY else str
         return None, kind(f"the condition is violated at {w:.6g} rad/sample")
     if G.order == 0:
-        return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
+        return Matrix.zeros(0, 0), _prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None
     for share, white in ((0.5, True), (0.5, False), (0.9, True)):
         try:
@@ -437,7 +437,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
             continue
         P = _congruent(out, riccati, half)
         for stored in (_shortened(P), P):
-            reason = prove_positive_real(G, stored)
+            reason = _prove_positive_real(G, stored)
             if reason is None:
                 return stored, None
     return None, reason
@@ -614,6 +614,6 @@ def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | 
     except (ValueError, ZeroDivisionError) as error:
         return f"{name} has an entry that is not a rational number: {error}"
     try:
-        return prove_positive_real(block, P)
+        return _prove_positive_real(block, P)
     except OverflowError:
         return f"{name} has an entry beyond the range of floating point"

@@ -163,10 +163,10 @@ def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
-        share = magnitudes(sequential(block.system, inputs).T, block.limiter.sizes).T / block.limiter.limit
+        share = magnitudes(_sequential(block.system, inputs).T, block.limiter.sizes).T / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
     inputs = inputs.astype(block.dtype)
-    return _Trial(inputs, sequential(block.system, inputs, block.limiter, block.dtype))
+    return _Trial(inputs, _sequential(block.system, inputs, block.limiter, block.dtype))
 
 
 def single_precision_error(block: ExportedBlock, seed: int = 0) -> tuple[float, float]:
@@ -177,7 +177,7 @@ def single_precision_error(block: ExportedBlock, seed: int = 0) -> tuple[float, 
     """
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_COMPARED, block.system.inputs))
-    double, single = (sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
+    double, single = (_sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
     return float(np.abs(double - single).max()), float(np.abs(double).max())
 
 
@@ -195,7 +195,7 @@ def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
     return np.where(limits > limiter.limit, np.nextafter(limits, dtype(0)), limits)
 
 
-def sequential(
+def _sequential(
     system: Lti, inputs: Array, limiter: Limiter | None = None, dtype: type[np.floating] = np.float64
 ) -> Array:
     """Return outputs (ticks, p) for inputs (ticks, m) from rest, with the order of sums in the exported file."""

@@ -64,7 +64,7 @@ class _Units:
 # loses no generality, because a change of state leads to any such F.
 
 
-class FixedOrder:
+class _FixedOrder:
     """The couplings with `order` states per channel; unknowns are the free entries p of A, B and V1.
 
     phi (N,) [N s/m] is the multiplier that psi >= 1 needs.
@@ -126,14 +126,14 @@ class FixedOrder:
 # Storage matrices of a given coupling, with which the inequalities of a fixed-order design hold at the start.
 
 
-def _passivity_storage(family: FixedOrder, p: Array) -> Array:
+def _passivity_storage(family: _FixedOrder, p: Array) -> Array:
     """Return the P > 0 of (2) with the largest margin for the coupling p, which must be strictly feasible."""
     G = family.block(p)
     zero = np.zeros_like(G.D)
     return _roomiest(lambda P: lmi.lemma1(lmi.Ports.same(G), P, zero, zero), G.order, "the storage of V-hat")
 
 
-def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
+def _gain_storage(family: _FixedOrder, p: Array, mu: float) -> Array:
     """Return the U = X^-1 > 0 of Lemma 3 that proves ||W1 L W2||_inf < mu with the largest margin."""
     G = family.weighted_loop(p) * (1 / mu)
     S = lmi.reachability_scaled(G)
@@ -163,7 +163,7 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
 class _Lemmas:
     """Lemmas 2 and 3 of a family around the coupling `at`, in coordinates where its Q and U are I and its norm is 1."""
 
-    def __init__(self, family: FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
+    def __init__(self, family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
         self.at, self.LQ, self.LU, self.norm = at, np.linalg.cholesky(Q), np.linalg.cholesky(U), norm
         self._block = _affine(family.block, at, self.LQ)
         self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
@@ -219,7 +219,7 @@ _FIRST_ROOM = 0.05  # relative room above the initial norm for the first certifi
 _LEAST, _MOST = 0.1, 1.99  # bounds of Q and U, which were I before the step; unexcited states may degenerate
 
 
-def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
+def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
     """Yield the couplings p of successive steps from a strictly feasible one with the given norm.
 
     The descent ends where a certificate is singular to rounding: the coupling is then on the boundary.
@@ -236,9 +236,9 @@ def _singular(Q: Array, U: Array) -> bool:
     return min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) <= 0
 
 
-def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
+def _descended(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
     """Return the best coupling and the number of semidefinite programs solved."""
-    steps, sdps = descend(family, p, norm), 0
+    steps, sdps = _descend(family, p, norm), 0
     while sdps < budget:
         try:
             trial = next(steps, None)
@@ -281,13 +281,13 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
 #
 # For fixed mu the inversions Y = Q^-1 and X = U^-1 are relaxed to [[Y, I], [I, Q]] >= 0 and [[X, I], [I, U]] >= 0.
 # tr(QY) + tr(UX), which reaches its minimum only if the inversions hold, is linearised and minimised repeatedly. mu is
-# determined by bisection. The sequence stalls far from the optimum, so that `descend` is the default.
+# determined by bisection. The sequence stalls far from the optimum, so that `_descend` is the default.
 
 
 _WIDTH = 5e-3  # relative width at which the bisection ends
 
 
-def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
+def _bisect(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
     """Return the best coupling and the number of SDPs solved; the start p must be feasible for `norm`."""
     Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     if _singular(Q, U):
@@ -346,7 +346,7 @@ def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> 
 _GAP = 1e-5  # relative gap between the norm on a refined sweep and the bound at the sampled frequencies
 
 
-class FixedPoles:
+class _FixedPoles:
     """The fixed-pole problem of one loop. The frequencies of the cuts are kept when the poles change."""
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None) -> None:
@@ -447,11 +447,11 @@ def design(
         return lmi.ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
 
     if method == "fixed-poles":
-        problem = FixedPoles(shaping, phi)
+        problem = _FixedPoles(shaping, phi)
         V, _ = problem.search((gains.B / (gains.B + gains.K * loop.T)).tolist(), most_sdps)
         sdps = problem.sdps
     else:
-        family = FixedOrder(shaping, phi, order, diagonal)
+        family = _FixedOrder(shaping, phi, order, diagonal)
 
         def holds(p: Array, mu: float) -> bool:
             """Return whether the coupling p is certified and ||W1 L W2||_inf <= mu, judged from the coupling alone."""

@@ -129,27 +129,27 @@ _JACOBI_SWEEPS = 12  # converges quadratically: 6 axes need about five
 _BELOW = 1e-11  # relative distance of d below its exact bound, which covers rounding
 
 
-def straightened(loop: Loop) -> Loop:
-    """Return the loop with the diagonal levels d of `principal_axes`; the loop itself if it has no matrix levels."""
+def _straightened(loop: Loop) -> Loop:
+    """Return the loop with the diagonal levels d of `_principal_axes`; the loop itself if it has no matrix levels."""
     if loop.levels is None:
         return loop
-    parts = [principal_axes(level) for level in loop.levels]
+    parts = [_principal_axes(level) for level in loop.levels]
     return msgspec.structs.replace(loop, delta=tuple(v for _, d in parts for v in d), levels=None)
 
 
 def _turned(G: Lti, loop: Loop) -> Lti:
-    """Return the map G in the coordinates of `straightened`; inputs and outputs of walls stay as they are."""
+    """Return the map G in the coordinates of `_straightened`; inputs and outputs of walls stay as they are."""
     if loop.levels is None:
         return G
     Q = np.eye(G.inputs, dtype=int).astype(object)
     for own, level in zip(loop.devices, loop.levels, strict=True):
-        Q[own, own] = principal_axes(level)[0]
+        Q[own, own] = _principal_axes(level)[0]
     Q = numbers(Q, G.T)
     return Q.T @ G @ Q
 
 
 @lru_cache(maxsize=64)
-def principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
+def _principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
     """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
 
     Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
@@ -182,7 +182,7 @@ _BITS = 320  # precision of the balls (intervals) that enclose q
 _MOST_ULPS = 8  # largest distance between q and its bounds, in units in the last place; one is usually enough
 
 
-def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return decimals [s] below q(shortest period) and decimals above q(longest period), (m,) each.
 
     q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the loop's damping. Raises NotProved if beta is too large.
@@ -209,7 +209,7 @@ def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> fl
     raise NotProved("q of the known device could not be enclosed")
 
 
-def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
+def _check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
     """Raise NotProved unless interval arithmetic shows below < q(T1) and q(T2) < above on every channel."""
     import flint
 
@@ -260,10 +260,10 @@ def _fmpq(value: Fraction) -> Any:
     return flint.fmpq(value.numerator, value.denominator)
 
 
-def exact_cost(
+def _exact_cost(
     loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]
 ) -> PeriodCost:
-    """Return a rational lower bound of the cost at the loop's damping, from bounds of q that `check_q` accepts."""
+    """Return a rational lower bound of the cost at the loop's damping, from bounds of q that `_check_q` accepts."""
     exact = loop.period(True)
     c0, c2 = _checked_rates(loop, beta)
     longest = rational(loop.T_max) if loop.T_max else exact
@@ -292,7 +292,7 @@ _WEIGHTS = 1e4  # 1/alpha is searched from 1/_WEIGHTS to _WEIGHTS of its unit
 _DIGITS = 7  # digits of beta and multipliers; the exact proof uses these rounded values
 
 
-class Best(NamedTuple):
+class _Best(NamedTuple):
     """The least share of the damping that a form of Theorem B needs."""
 
     share: float  # inf if no beta needs less than the allowed share
@@ -342,7 +342,7 @@ class Sweep:
 
     def holds(self, idle: Complex, z: Complex, share: Any, beta: Array) -> NDArray[np.bool_]:
         """Return whether the block is positive at each frequency, (k,)."""
-        return positive(with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
+        return positive(_with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
     def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
         """Return the least share (k,) up to `high` at each frequency; inf if `high` is not enough."""
@@ -378,7 +378,7 @@ class Sweep:
             return np.inf, 0.0
         return max(supremum(self.response(i, beta, values, high), grid) for i, grid in enumerate(self.grids))
 
-    def best(self, high: float) -> Best:
+    def best(self, high: float) -> _Best:
         """Return the least share below `high` over all beta and multipliers."""
         return _Search(self, high).run()
 
@@ -454,7 +454,7 @@ class _Search:
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
         """Return the block (k, n, n), concave in x because inputs w are scaled by 1/alpha relative to that in `at`."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
-        block, ratio = with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
+        block, ratio = _with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:
             own = np.real(np.diagonal(parts[1 + a], axis1=1, axis2=2)).min(axis=0) > 0
             ratio[own] = x[a] / at[a]
@@ -500,19 +500,19 @@ class _Search:
     def room(self, z: Complex, parts: Complex, idle: Complex, x: Array) -> Array:
         """Return the least eigenvalue (k,) of the block with L, each scaled to a diagonal of about one."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
-        block = with_cost(idle, z, cost, self.sweep.moves)
+        block = _with_cost(idle, z, cost, self.sweep.moves)
         terms = np.abs(np.diagonal(parts, axis1=2, axis2=3)) * np.abs(np.concatenate([[1.0], x[:-1]]))[:, None, None]
         size = terms.max(axis=(0, 1)) + np.abs(np.diagonal(block - idle, axis1=1, axis2=2)).max(axis=0)
         root = 1 / np.sqrt(size)
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
-    def run(self) -> Best:
+    def run(self) -> _Best:
         """Return the best of all beta and multipliers that the search tries."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
             self.cut(x)
-        x, best, bound = at_once[1], Best(self.high, 0.0, (), self.sweep.usual), 0.0
+        x, best, bound = at_once[1], _Best(self.high, 0.0, (), self.sweep.usual), 0.0
         least, candidate = self.high, None
         for _ in range(budgets.BETA_ROUNDS):
             share, binding = self.least(x, least)
@@ -541,11 +541,11 @@ class _Search:
             best = min(best, self.swept(candidate))
         return best._replace(bound=min(bound, best.share)) if best.beta else best._replace(share=np.inf)
 
-    def swept(self, x: Array) -> Best:
+    def swept(self, x: Array) -> _Best:
         """Return the share at beta and multipliers of x after their rounding, by a refined sweep."""
         beta = tuple(float(f"{b:.{_DIGITS}g}") for b in self.beta(x))
         values = tuple(float(f"{v:.{_DIGITS}g}") for v in self.values(x))
-        return Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
+        return _Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
 
     def add(self, w: float) -> None:
         """Add a frequency [rad/sample] to the sampled ones."""
@@ -604,7 +604,7 @@ def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
     return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
 
 
-def with_cost(idle: Complex, z: Complex, cost: PeriodCost, moves: Sequence[NDArray[np.intp]]) -> Complex:
+def _with_cost(idle: Complex, z: Complex, cost: PeriodCost, moves: Sequence[NDArray[np.intp]]) -> Complex:
     """Return the matrices `idle` (k, n, n) with L added. Entries of `cost` are (k, m); `moves` is `Sweep.moves`."""
     own, cross, speed = device_rows(z, cost)
     block, m = idle.copy(), own.shape[1]
@@ -672,7 +672,7 @@ class KnownDevice(Condition):
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
         """Return the demand of a `map`, in any arithmetic."""
-        return compose(G, straightened(loop), self.facts(loop), values, hands=hands)
+        return compose(G, _straightened(loop), self.facts(loop), values, hands=hands)
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         """Return the map of `plain` in principal axes of the levels."""
@@ -683,14 +683,14 @@ class KnownDevice(Condition):
         maps = [self.map(each, coupling) for each in self._loops(loop)]
         one = loop.at(loop.environment)
         return Sweep(
-            straightened(one), maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop)
+            _straightened(one), maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop)
         )
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
-        m, straight = loop.channels, straightened(loop)
+        m, straight = loop.channels, _straightened(loop)
         beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
         own, unknowns = tuple(multiplier[3 * m :]), self.unknowns(loop)
         if not any(beta):
@@ -700,8 +700,8 @@ class KnownDevice(Condition):
             each.check(values[each.name])
         if exact:
             rationals = [[rational(v) for v in part] for part in (beta, below, above)]
-            check_q(straight, *rationals)
-            hands = KnownMotor(exact_cost(straight, *rationals), rationals[0])
+            _check_q(straight, *rationals)
+            hands = KnownMotor(_exact_cost(straight, *rationals), rationals[0])
         else:
             hands = KnownMotor(period_cost(straight, 1.0, np.array(beta, dtype=float)), beta)
         G = self.map(loop, coupling, exact)
@@ -731,7 +731,7 @@ class KnownDevice(Condition):
             return plain
         bounds = (0.0,) * 2 * m
         if suffices(best.share):
-            below, above = q_bounds(straightened(loop), [rational(b) for b in best.beta])
+            below, above = _q_bounds(_straightened(loop), [rational(b) for b in best.beta])
             bounds = below + above
         requirement = from_ratio(self.name, best.share, loop.delta, best.w / (2 * np.pi * loop.T))
         return replace(requirement, multiplier=(*best.beta, *bounds, *best.values))
@@ -815,7 +815,7 @@ class KnownDevice(Condition):
                 )
                 cost = period_cost(loop, np.repeat(share[left], w.size), np.repeat(beta, w.size, axis=0))
                 flat = block.reshape(-1, *block.shape[2:])
-                right = positive(with_cost(flat, np.tile(z, left.size), cost, [np.arange(m)]))
+                right = positive(_with_cost(flat, np.tile(z, left.size), cost, [np.arange(m)]))
                 served[left] = right.reshape(left.size, -1).all(axis=1)
                 last[left[served[left]]] = which[served[left]]
             return served
@@ -862,7 +862,7 @@ class _KnownDeviceAny(KnownDevice):
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
-        return compose_any(G, straightened(loop), self.facts(loop), values, hands=hands)
+        return compose_any(G, _straightened(loop), self.facts(loop), values, hands=hands)
 
     def sampled(self, loop: Loop, coupling: Coupling, z: Complex) -> Sampled:
         return coupling.sampled(z, loop.T)

@@ -8,7 +8,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so E-hat without its pole plus
       E(1)/2 satisfies the same condition and is stable (`design.conditions.delayed_environment_demand`).
   V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) would be 0 > 0.
-      Remedy: divide by |1 - 1/z|^2 (`design.conditions.v_hat`).
+      Remedy: divide by |1 - 1/z|^2 (`design.conditions._v_hat`).
 """
 
 from __future__ import annotations
@@ -150,13 +150,13 @@ def symmetric_from(vector: Array, n: int) -> Array:
 # State coordinates and units in which matrix inequalities are well scaled.
 
 
-def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
+def _unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
     """Return E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
     root = 1 / np.sqrt(np.asarray(delta))
     return Lti(E.A, E.B * root, E.T * root[:, None] * E.C, E.T * root[:, None] * E.D * root, 1.0)
 
 
-def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
+def _balanced(G: Lti, negligible: float = 1e-11) -> Lti:
     """Return a stable G with equal diagonal Gramians, by the square-root method.
 
     States with a Hankel value below `negligible` times the largest are dropped. They are unreachable or unobservable to
@@ -253,7 +253,7 @@ def least_multiplier(loop: Loop) -> Array:
     Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
     delta = even_damping(loop)
-    unit = unit_environment(loop.E(), delta)
+    unit = _unit_environment(loop.E(), delta)
     none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
     least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
     each, root = least, np.linalg.inv(np.linalg.cholesky(level))
@@ -265,7 +265,7 @@ def least_multiplier(loop: Loop) -> Array:
     if regular.order > _MOST_STATES:
         return max(each, 0.0) * delta
     # Phi is bounded halfway between its least value and Delta_D, because the least trace alone could reach Delta_D.
-    return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
+    return np.maximum(_of_least_trace(_balanced(regular), (1 + least) / 2 * level), 0.0) * delta
 
 
 def _of_least_trace(regular: Lti, most: Array) -> Array:

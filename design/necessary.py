@@ -25,7 +25,7 @@ from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import Requirement
 
 
-def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
+def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
     """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m].
 
     sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n). Here
@@ -65,7 +65,7 @@ _LOWEST = 1e-4  # [rad/sample]; at z = 1 the disk touches the point that it must
 _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the damping
 
 
-def necessary_share(F: Lti, loop: Loop) -> _Necessary:
+def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand destabilises linear motors, by a refined sweep.
 
     For one channel or equal devices the share is a lower bound for every condition on these devices. Otherwise it is
@@ -76,7 +76,7 @@ def necessary_share(F: Lti, loop: Loop) -> _Necessary:
 
     def holds(w: Array, response: Complex, share: Array) -> Any:
         sums = [
-            alias_sums(w, T, d.motor_mass_min, share * delta, d.transmission_stiffness_max, d.transmission_damping_min)
+            _alias_sums(w, T, d.motor_mass_min, share * delta, d.transmission_stiffness_max, d.transmission_damping_min)
             for d, delta in zip(known, loop.delta, strict=True)
         ]
         radius = np.stack([np.maximum(sig0, 1e-300) / 2 for sig0, _ in sums], axis=1)
@@ -147,7 +147,7 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
         return None
     if not all(F.is_stable() for F in maps):
         return None
-    each, proved = [necessary_share(F, loop) for F in maps], proved or KNOWN_DEVICE.judge(loop, coupling)
+    each, proved = [_necessary_share(F, loop) for F in maps], proved or KNOWN_DEVICE.judge(loop, coupling)
     largest = max(each, key=lambda one: one.share)
     if not (all(one.held for one in each) and np.isfinite(largest.share)):
         return None

@@ -33,7 +33,7 @@ from haptic_loop.design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
-BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
+_BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
 _FASTER = 0.25  # Modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
@@ -68,7 +68,7 @@ class Options:
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: a soft row keeps the force low instead
     limiter: bool = False  # whether the coupling is also safe while forces are limited
     seconds: float | None = None  # time [s] after which no larger basis is tried; None: no time limit
-    bases: tuple[tuple[int, int], ...] = BASES  # (taps, real poles)
+    bases: tuple[tuple[int, int], ...] = _BASES  # (taps, real poles)
 
     def __post_init__(self) -> None:
         one_of("objective", self.objective, OBJECTIVES)

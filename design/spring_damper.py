@@ -123,7 +123,7 @@ class _Channel:
         return np.linspace(0, np.pi, finer * _PER_LOBE * (self.theta + 1) + 1)
 
 
-class GainSet:
+class _GainSet:
     """The gains of any-environment in units of the usable damping, with phi (m,) [N s/m] if psi >= 1."""
 
     def __init__(self, loop: Loop, phi: Array | None = None, most_stored: int = _MOST_STORED) -> None:
@@ -166,7 +166,7 @@ class GainSet:
 # increases the norm, and mu^2 enters linearly, without bisection.
 
 
-def step(shaping: Shaping, gains: GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
+def step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """Return (gains, bound on the norm at the frequencies w) after one convex-concave step from the gains `at`."""
     cost = np.append(np.zeros(at.size), 1.0)
     cuts = _tangent(shaping, at, norm, w)
@@ -286,7 +286,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
     started, loop = time.perf_counter(), shaping.loop
     phi = least_phi(loop)
-    certified = GainSet(loop, phi)
+    certified = _GainSet(loop, phi)
     gains, sdps = _start(loop, certified, start), 1
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
@@ -543,12 +543,12 @@ _SPARE_OF_SLOW_WORLDS = 0.25  # With this e ringing decays per tick by a factor 
 
 
 def _spare(loop: Loop) -> float:
-    """Return e of `moving_average`: a rounding reserve, or more if the world stands still between its steps."""
+    """Return e of `_moving_average`: a rounding reserve, or more if the world stands still between its steps."""
     world = loop.environment.world
     return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
 
 
-def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
+def _moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
     V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. Let n = theta + 1. With the
@@ -679,7 +679,7 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
 
 
-def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> Array:
+def _start(loop: Loop, certified: _GainSet, start: SpringDamper | None) -> Array:
     """Return the gains of the set nearest to `start`, or the stiffest ones of the set."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)

@@ -47,7 +47,7 @@ class HapticDevice(Protocol):
         ...
 
 
-class BytePort(Protocol):
+class _BytePort(Protocol):
     """A port for bytes. Every method raises PortLost where the port is gone."""
 
     def wait(self, seconds: float) -> bool:
@@ -68,7 +68,7 @@ class SerialDevice:
     """A device at a serial port. The device has the clock, not the host."""
 
     def __init__(
-        self, port: BytePort, clock: Callable[[], float] = time.monotonic, patience: float = _LONGEST_WAIT
+        self, port: _BytePort, clock: Callable[[], float] = time.monotonic, patience: float = _LONGEST_WAIT
     ) -> None:
         """Take `clock` and `patience`, the longest wait of a call, both in seconds."""
         self._port, self._clock, self._patience = port, clock, patience

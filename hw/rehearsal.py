@@ -111,7 +111,7 @@ class _Cable:
 
 
 @dataclass(frozen=True)
-class Further:
+class _Further:
     """One more emulated board of a rehearsal, with a clock of its own (hw/boards.py)."""
 
     emulator: Emulator
@@ -140,7 +140,7 @@ class Rehearsal:
     clock: float = 1.0  # length of a tick of the device in T
     keep: bool = True  # whether to record every tick of the device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
-    further: Sequence[Further] = ()
+    further: Sequence[_Further] = ()
     moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -149,7 +149,7 @@ class Rehearsal:
         self._done: set[int] = set()
         self.now = self._ended = 0.0  # [us]
         self._cables: list[_Cable] = []
-        for board in (Further(self.emulator, self.clock, self.faults), *self.further):
+        for board in (_Further(self.emulator, self.clock, self.faults), *self.further):
             lines = [Line(way, board.faults, self.seed, self.latency_us) for way in ("up", "down")]
             period = 1e6 * self.session.scenario.T * board.clock
             self._cables.append(_Cable(self, board.emulator, lines[0], lines[1], period))

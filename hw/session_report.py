@@ -134,13 +134,13 @@ class _Ran:
 
 
 @dataclass(frozen=True)
-class WorldSession(WorldRecord):
+class _WorldSession(WorldRecord):
     """The figures of a world in one arming: its energy, its contacts and the time of its steps."""
 
     step_us: dict[str, float] | None  # percentiles of the CPU time of a step of the scene
 
     @classmethod
-    def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[WorldSession]:
+    def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[_WorldSession]:
         """Return the figures of each arming. `trace` is that of the session; `arming` (N,) counts armings from 0."""
         sessions, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
         for i, world in enumerate(session.worlds):
@@ -178,7 +178,7 @@ class SessionReport:
     run: _Ran = off_table()
     growth: list[Growth] = off_table()
     energy_budget: list[BudgetFigures] | None = off_table()  # one per arming
-    world: list[WorldSession] | None = off_table()  # one per arming
+    world: list[_WorldSession] | None = off_table()  # one per arming
     scene: SceneRecord | None = off_table()
 
 
@@ -192,7 +192,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
-    worlds = WorldSession.all_of(session, trace, recorder.link()["arming"]) if trace and session.worlds else None
+    worlds = _WorldSession.all_of(session, trace, recorder.link()["arming"]) if trace and session.worlds else None
     grown = growths(trace) if trace and not worlds else []  # the motion of a scene is no oscillation of the loop
     stage, cause = str(session.stage), session.cause
     if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, recorder)):

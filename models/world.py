@@ -31,7 +31,7 @@ Array = NDArray[np.floating[Any]]
 
 _CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
 ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
-MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
+_MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
 _DIRECTION_SLACK = 1e-6  # repetitions end when they change limited forces by less than this part of the limit
 _TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
@@ -55,7 +55,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Part:
+class _Part:
     """One kind of part of a scene, and which bound holds for the energy that it generates at the contacts."""
 
     what: str
@@ -296,7 +296,7 @@ class World:
                 listed.append(f"callback mjcb_{name}")
         return listed
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[_Part]:
         """Return the kinds of parts in the scene, with the bound on the energy of each (docs/worlds.md)."""
         return list(_parts(self.model, set(self._joint.tolist())))
 
@@ -482,7 +482,7 @@ class Port:
         self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if any_limit else None
         self.ticks = 0
         self.created = 0.0  # [J] energy that contacts have created, D2 of the lemma
-        self.unsettled = 0  # ticks in which the limited channels still changed after MOST_REPETITIONS
+        self.unsettled = 0  # ticks in which the limited channels still changed after _MOST_REPETITIONS
         self._at_first = self._potential()
         self.released = 0.0  # [J] largest energy that gravity and the scene's springs have released so far
 
@@ -567,7 +567,7 @@ class Port:
             off = np.abs(force - push) > _DIRECTION_SLACK * np.where(held, self._limits, np.inf)
             if settled := bool((limited == pushed).all() and not off.any()):
                 break
-            if repetition == MOST_REPETITIONS:
+            if repetition == _MOST_REPETITIONS:
                 break
             repetition, pushed, push = repetition + 1, limited, force
             mujoco.mj_setState(model, data, saved, _STATE)
@@ -655,7 +655,7 @@ _TURNING = "measured: small for slow motion; the shell"
 _SHELL = "the shell only"
 
 
-def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
+def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[_Part]:
     joints = [i for i in range(m.njnt) if i not in slides]
     soft = {*m.flex_vertbodyid.tolist(), *m.flex_nodebodyid.tolist()}  # points of soft bodies
     movable, turns = set(m.jnt_bodyid[joints].tolist()) - soft, np.zeros(m.nbody, dtype=bool)
@@ -664,43 +664,43 @@ def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
         turns[body] |= turns[m.body_parentid[body]]
     turning = sum(bool(turns[body]) for body in movable)
     if len(movable) > turning:
-        yield Part("bodies that translate", len(movable) - turning, _NONE)
+        yield _Part("bodies that translate", len(movable) - turning, _NONE)
     if turning:
-        yield Part("bodies that turn", turning, _TURNING)
+        yield _Part("bodies that turn", turning, _TURNING)
     springs = int((m.jnt_stiffness[joints] != 0).sum())
     if springs:
-        yield Part("joint springs", springs, _NONE)
+        yield _Part("joint springs", springs, _NONE)
     constants = (m.jnt_stiffness, m.tendon_stiffness, m.dof_damping, m.tendon_damping)
     negative = sum(int((values < 0).sum()) for values in constants)
     if negative:
-        yield Part("springs and dampers of negative constants", negative, _SHELL)
+        yield _Part("springs and dampers of negative constants", negative, _SHELL)
     higher = (m.jnt_stiffnesspoly, m.tendon_stiffnesspoly, m.dof_dampingpoly, m.tendon_dampingpoly)
     curved = sum(int((values != 0).any(axis=1).sum()) for values in higher)
     if curved:
-        yield Part("springs and dampers that are not linear", curved, _SHELL)
+        yield _Part("springs and dampers that are not linear", curved, _SHELL)
     yielding = int((m.jnt_springyield != 0).sum() + (m.tendon_springyield != 0).sum())
     if yielding:
-        yield Part("springs that yield", yielding, _SHELL)
+        yield _Part("springs that yield", yielding, _SHELL)
     if m.ntendon:
-        yield Part("tendons", m.ntendon, _SMALL)
+        yield _Part("tendons", m.ntendon, _SMALL)
     rubbing = int((m.dof_frictionloss > 0).sum() + (m.tendon_frictionloss > 0).sum())
     if rubbing:
-        yield Part("friction losses", rubbing, _ROW)
+        yield _Part("friction losses", rubbing, _ROW)
     limited = [i for i in joints if m.jnt_limited[i]]
     if limited:
         constant = all(m.jnt_solimp[i, 0] == m.jnt_solimp[i, 1] for i in limited)
-        yield Part("joint limits", len(limited), _BOUNDED if constant else _VARYING)
+        yield _Part("joint limits", len(limited), _BOUNDED if constant else _VARYING)
     solid = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
     if solid.any():
         constant = bool((m.geom_solimp[solid, 0] == m.geom_solimp[solid, 1]).all() and not m.geom_margin[solid].any())
         constant &= bool((m.pair_solimp[:, 0] == m.pair_solimp[:, 1]).all()) and not m.pair_margin.any()
         constant &= not m.pair_solreffriction.any() and not m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
         name = "geoms in contact, " + ("constant impedance" if constant else "other impedance, margin or friction")
-        yield Part(name, int(solid.sum()), _BOUNDED if constant else _VARYING)
+        yield _Part(name, int(solid.sum()), _BOUNDED if constant else _VARYING)
     if m.neq:
-        yield Part("equality constraints", m.neq, _SMALL)
+        yield _Part("equality constraints", m.neq, _SMALL)
     if m.nflex:
-        yield Part("soft bodies", m.nflex, _SMALL)
+        yield _Part("soft bodies", m.nflex, _SMALL)
     active = {"actuators": m.nu, "motion capture": m.nmocap, "plugins": m.nplugin}
     active["wind"] = int(m.opt.wind.any() and (m.opt.density > 0 or m.opt.viscosity > 0))
-    yield from (Part(what, count, _SHELL) for what, count in active.items() if count)
+    yield from (_Part(what, count, _SHELL) for what, count in active.items() if count)

@@ -133,7 +133,7 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
         raise InputError(f"environment.world needs a coupling: {_no_spring(coupling)}")
     from haptic_loop.models.world import World, digest_of
 
-    contacts = contacts_of(scenario.environment)
+    contacts = _contacts_of(scenario.environment)
     try:
         if digest_of(Path(world.file)) != world.digest:
             raise ValueError(f"world {world.file} has changed since the scenario was loaded; load it again")
@@ -151,7 +151,7 @@ def _no_spring(coupling: Coupling) -> str:
     return f"coupling {coupling.kind} has no compliance V with a direct part, so there is no spring to the devices"
 
 
-def contacts_of(environment: Network) -> list[Contact]:
+def _contacts_of(environment: Network) -> list[Contact]:
     """Return the bodies that the devices touch, with the directions in which they slide."""
     from haptic_loop.models.world import Contact
 
@@ -405,7 +405,7 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
         file = world.environment.world
         if file is None:
             raise InputError("linearise: the scenario has no environment.world")
-        path, touched, T = file.file, contacts_of(world.environment), world.T
+        path, touched, T = file.file, _contacts_of(world.environment), world.T
     else:
         path, touched = str(world), [Contact(name) for name in contacts]
     unit = [np.eye(len(contact.along)) for contact in touched]

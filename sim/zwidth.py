@@ -301,7 +301,7 @@ _Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class _Grid:
     """The grid of a map, every K with every B."""
 
     K: Array  # (n,) [N/m]
@@ -324,7 +324,7 @@ class Grid:
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
-def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
+def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> _Grid:
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
     The scale of K is the loop's stiffness_scale; the scale of B is delta, the largest damping of a linear law. A linear
@@ -347,7 +347,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
         ends.append((low, high))
     spread = np.linspace if scale == "linear" else np.geomspace
     along_K, along_B = (spread(low, high, n) for low, high in ends)
-    return Grid(along_K, along_B, scale)
+    return _Grid(along_K, along_B, scale)
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
@@ -378,7 +378,7 @@ _SAMPLE = 25  # cells that decide which humans are the leading ones
 class Map:
     """Results over the grid, (cells,) each, B running fastest; nan for cells that an interruption left out."""
 
-    grid: Grid
+    grid: _Grid
     ratio: dict[str, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the tried humans; all humans are tried if no leading one is unstable
     unstable: Array  # number of tried humans that make the cell unstable
@@ -389,7 +389,7 @@ class Map:
 
 def draw_map(
     sweep: Sweep,
-    grid: Grid,
+    grid: _Grid,
     held: limit_cycles.HeldDevices,
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],

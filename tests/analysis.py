@@ -12,13 +12,13 @@ import numpy as np
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Block
 from haptic_loop.controller.lti import Array, Lti, taps
-from haptic_loop.design.conditions import dampings, regular_part
+from haptic_loop.design.conditions import _dampings, _regular_part
 from haptic_loop.design.lmi import (
     Ports,
-    balanced,
+    _balanced,
+    _unit_environment,
     lemma1,
     symmetric,
-    unit_environment,
 )
 
 
@@ -30,7 +30,7 @@ def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
 
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
     """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
-    return regular_part(delay(psi, E.T) @ E)
+    return _regular_part(delay(psi, E.T) @ E)
 
 
 def theta_hat(theta: Sequence[int]) -> Lti:
@@ -77,13 +77,13 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
     Delta_V + s >= 0; the margin is -s. Raises ValueError for an environment that is not passive.
     """
     Block.of(environment)
-    delta = dampings(delta, environment.inputs)
+    delta = _dampings(delta, environment.inputs)
     if not V.is_stable():
         return Analysis(-np.inf, reason="the coupling V has a pole on or outside the unit circle")
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return Analysis(-np.inf, reason="the static compliance V(1) is not symmetric")
-    shortage = balanced(e_hat_regular(unit_environment(environment, delta), psi))
+    shortage = _balanced(e_hat_regular(_unit_environment(environment, delta), psi))
     excess = balanced_ports(unit_coupling(V, delta), theta)
     return _solve(shortage, excess)
 
@@ -91,7 +91,7 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
 def balanced_ports(V: Lti, theta: Sequence[int]) -> Ports:
     """`v_hat_ports` with both outputs balanced together (V in unit coordinates)."""
     G, m = v_hat_ports(V, theta), V.outputs
-    both = balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
+    both = _balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
     return Ports(both.A, both.B, both.C[:m], both.D[:m], both.C[m:], both.D[m:])
 
 

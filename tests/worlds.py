@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from haptic_loop.controller.coupling import ForceFilter, InternalModel, SpringDamper
+from haptic_loop.controller.coupling import ForceFilter, SpringDamper, _InternalModel
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import Loop
@@ -45,7 +45,7 @@ DIAGONAL = (
     (-5.3162829524e-05, 7.7158066584e-05),
     (-0.000183213977119, 0.000179575913546),
 )
-VERTICES_ONLY = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
+VERTICES_ONLY = _InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
 
 
 def force_map(E, coupling, theta, psi):

@@ -184,7 +184,7 @@ def _list(values: tuple[int, ...]) -> str:
     return ", ".join(map(str, values))
 
 
-class ShownScene:
+class _ShownScene:
     """The scene of devices and object in a picture, with handles that the mouse can hold."""
 
     def __init__(
@@ -257,7 +257,7 @@ class ShownScene:
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
-class _ShownWorld(ShownScene):
+class _ShownWorld(_ShownScene):
     """The MuJoCo scene of a world in a picture, with each device as a stylus whose tip is the device's position."""
 
     def __init__(self, world: World, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
@@ -319,12 +319,12 @@ class _ShownWorld(ShownScene):
             camera.azimuth, camera.elevation, camera.distance = 110.0, -20.0, 2.8 * self.model.stat.extent
 
 
-def stage_for(session: LiveLoop) -> ShownScene:
+def stage_for(session: LiveLoop) -> _ShownScene:
     """Return the stage of a loop."""
     simulation = session.prepared.simulation
     if session.world:
         return _ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
-    return ShownScene(simulation.scene, simulation.process.force_limit, drawn=object_of(simulation))
+    return _ShownScene(simulation.scene, simulation.process.force_limit, drawn=object_of(simulation))
 
 
 def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
@@ -453,7 +453,7 @@ def _display() -> bool:
     return probe.returncode == 0
 
 
-def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> None:
+def show(session: LiveLoop, stage: _ShownScene, until: float | None = None) -> None:
     """Run the session in a window until the window is closed, or for `until` [s].
 
     Raises NoWindow without a display, and on macOS without MuJoCo's own launcher.
@@ -481,7 +481,7 @@ def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> No
 
 def _loop(
     session: LiveLoop,
-    stage: ShownScene,
+    stage: _ShownScene,
     window: viewer.Handle,
     clock: Callable[[], float],
     sleep: Callable[[float], None],
@@ -498,7 +498,7 @@ def _loop(
         sleep(max(0.0, 1 / _RATE - (clock() - begun)))
 
 
-def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
+def _shown(stage: _ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
     """Show a frame, and return the grip of the mouse afterwards."""
     with window.lock():
         stage.show(frame)
@@ -534,7 +534,7 @@ _COLOURS = 48  # of a GIF: few, so that it stays small
 _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
 
-class FlatPictures:
+class _FlatPictures:
     """Pictures of a film by Pillow: the scene from above, and the forces. A body grows when it moves along z."""
 
     def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
@@ -648,7 +648,7 @@ class FlatPictures:
                     pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_shade(i, axis)), 2)
 
 
-class _WorldPictures(FlatPictures):
+class _WorldPictures(_FlatPictures):
     """Pictures of a film of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
 
     def __init__(self, stage: _ShownWorld, scene: Scene, force_limit: Array) -> None:
@@ -686,12 +686,12 @@ class _WorldPictures(FlatPictures):
         image.paste(Image.fromarray(self.rendered(frame, image.width, bottom - top - 8)), (0, top + 4))
 
 
-def pictures_for(session: LiveLoop) -> FlatPictures:
+def pictures_for(session: LiveLoop) -> _FlatPictures:
     """Return the painter of a film's pictures. Raises InputError if a world needs OpenGL and there is none."""
     simulation, stage = session.prepared.simulation, stage_for(session)
     if isinstance(stage, _ShownWorld):
         return _WorldPictures(stage, simulation.scene, simulation.process.force_limit)
-    return FlatPictures(simulation.scene, simulation.process.force_limit, stage.object)
+    return _FlatPictures(simulation.scene, simulation.process.force_limit, stage.object)
 
 
 def _offscreen(width: int, height: int) -> Any:

@@ -14,13 +14,13 @@ from haptic_loop.design import optimal, spring_damper
 from haptic_loop.design.audit import audit
 from haptic_loop.design.certificate import prove, requirements_of, verify
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.program import BASES, Options
+from haptic_loop.design.program import _BASES, Options
 from haptic_loop.design.transparency import decibels
 from haptic_loop.sim.scenario import load, parse
 
 pytestmark = pytest.mark.benchmark(group="design")
 LOOP = load().loop("I")
-ASKED = {"smallest basis": Options(bases=BASES[:1]), "all bases": Options()}
+ASKED = {"smallest basis": Options(bases=_BASES[:1]), "all bases": Options()}
 
 
 def test_spring_damper(benchmark):

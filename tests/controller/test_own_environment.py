@@ -8,7 +8,7 @@ import pytest
 
 from haptic_loop import load
 from haptic_loop.controller.arithmetic import rational
-from haptic_loop.controller.environment import Block, Network, Spring, Wall, environment, parts_of
+from haptic_loop.controller.environment import Block, Network, Spring, Wall, _parts_of, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.passivity import hermitian_floor, sizes_around
 from haptic_loop.design.exact import Matrix, definiteness
@@ -66,7 +66,7 @@ def test_an_element_is_put_among_springs_and_walls():
     assert made.elements == ()
     assert made == msgspec.json.decode(msgspec.json.encode(made), type=Network)
     with pytest.raises(ValueError, match="element int: it is 3, expected a class whose parts"):
-        parts_of(3)
+        _parts_of(3)
     with pytest.raises(ValueError, match="the network has 8 walls, allowed are 6"):
         Network(("a",), elements=(Hardening(("a", "ground"), 100.0, 2e-3),) * 4)
 

@@ -20,7 +20,7 @@ from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import budgets, certificate, coupling_file
 from haptic_loop.design.api import certify
 from haptic_loop.design.assessment import assess
-from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
+from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _remedies, audit, edge, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
 from haptic_loop.design.guarantees import ANY, CAVEATS
 from tests.asked import needs, safe_with
@@ -185,12 +185,12 @@ def test_figures_that_do_not_exist_say_why():
 
 def test_remedies_are_tried_and_mild():
     subject = wall(5000, 0.5, 1)
-    changes = {r.change.split(":")[0]: r for r in remedies(*subject, "this-environment")}
+    changes = {r.change.split(":")[0]: r for r in _remedies(*subject, "this-environment")}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["less delay"].requirement.certified
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
-    assert remedies(*wall(500, 0), "this-environment") == []
+    assert _remedies(*wall(500, 0), "this-environment") == []
     assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 
 

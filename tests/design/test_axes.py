@@ -12,7 +12,7 @@ from haptic_loop.cli.options import delay_range
 from haptic_loop.controller.arithmetic import Number, numbers, positive_definite
 from haptic_loop.controller.budget import EPS, EnergyBudget, Packets
 from haptic_loop.controller.complementarity import BallProblem, BoxProblem, magnitudes
-from haptic_loop.controller.coupling import Compliance, ForceFilter, MatrixSpringDamper, SpringDamper
+from haptic_loop.controller.coupling import Compliance, ForceFilter, SpringDamper, _MatrixSpringDamper
 from haptic_loop.controller.environment import Network, Networks, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
@@ -23,7 +23,7 @@ from haptic_loop.design.conditions import encoder_friction
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.gain_search import SwitchingLoop
-from haptic_loop.design.known_device import KNOWN_DEVICE, principal_axes
+from haptic_loop.design.known_device import KNOWN_DEVICE, _principal_axes
 
 LEVELS = ((1.5, 0.4), (0.4, 0.9)), ((1.2, -0.3), (-0.3, 2.0))
 TIPS = ("a.x", "a.y", "b.x", "b.y")
@@ -134,7 +134,7 @@ CORNER = Plane(
     np.kron([[1, -1], [-1, 1.2]], np.diag([900.0, 300.0])),
 )
 TURN = np.array([[0.8, 0.6], [-0.6, 0.8]])
-BUILT = MatrixSpringDamper(
+BUILT = _MatrixSpringDamper(
     [[1500, 300, 0, 0], [300, 800, 0, 0], [0, 0, 1000, -200], [0, 0, -200, 700]], 0.2 * np.eye(4)
 )
 
@@ -289,7 +289,7 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
     loop = Loop(1e-3, (2, 2), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1])
-    stiff = MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
     largest = np.linalg.eigvals(np.linalg.solve(level, K)).real.max()
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.5e-3 * largest, rel=1e-5)
     isotropic = msgspec.structs.replace(loop, environment=wall.turned(np.eye(2)))
@@ -305,7 +305,7 @@ def test_a_wall_meets_the_level_along_its_normal(theta: int, damping: float, nee
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
     network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})
     loop = Loop(1e-3, (theta,) * 2, (0, 0), (0, 0), (1.5, 0.9), network, axes=(2,), levels=LEVELS[:1])
-    stiff = MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
     expected = needs * normal @ np.linalg.solve(level, normal)
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(expected, rel=1e-4)
 
@@ -315,7 +315,7 @@ def test_longest_period_scales_matrix_levels() -> None:
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
     loop = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1], T_max=1.4e-3)
-    stiff = MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
     largest = np.linalg.eigvals(np.linalg.solve(level, K)).real.max()
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.1e-3 * largest, rel=1e-5)
 
@@ -348,7 +348,7 @@ def test_turning_the_axes_changes_nothing(turns: int) -> None:
         Q[:2, :2], Q[2:, 2:] = parts
         whole = np.zeros((6, 6))
         whole[:4, :4], whole[4:, 4:] = Q, np.linalg.qr(rng.normal(size=(2, 2)))[0]  # the mass may turn, too
-        coupling = MatrixSpringDamper(symmetric(Q.T @ BUILT.K @ Q), BUILT.B)
+        coupling = _MatrixSpringDamper(symmetric(Q.T @ BUILT.K @ Q), BUILT.B)
         i = number % len(asked)
         loop, condition, values = asked[i]
         after = required_damping(turned(loop, whole), coupling, condition, values).ratio
@@ -445,7 +445,7 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
     for n in (2, 3, 3, 3):
         A = np.round(rng.normal(size=(n, n)), 4)
         level = np.round(A @ A.T + 0.01 * np.eye(n), 6)
-        Q, d = principal_axes(tuple(map(tuple, level.tolist())))
+        Q, d = _principal_axes(tuple(map(tuple, level.tolist())))
         np.testing.assert_array_equal(Q.T @ Q, np.eye(n, dtype=int))
         np.testing.assert_allclose(sorted(d), np.linalg.eigvalsh(level), rtol=1e-6)
         left = numbers(level, Fraction(1)) - Q @ np.diag(numbers(d, Fraction(1))) @ Q.T
@@ -464,7 +464,7 @@ def test_full_levels_meet_walls(known: bool, condition: str) -> None:
     bounds = (BOUNDS,) * 2 if known else None
     loop = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), network, axes=(2,), levels=LEVELS[:1], known_devices=bounds)
     design = design_by_kind(loop, "spring-damper", condition)
-    assert isinstance(design.coupling, MatrixSpringDamper)
+    assert isinstance(design.coupling, _MatrixSpringDamper)
     assert 0.99 < design.requirement.ratio <= 1 or np.allclose(design.coupling.K, 1e6 * ONE)
     assert prove(loop, design.coupling, condition).proof == "rational"
 
@@ -491,9 +491,9 @@ def test_turned_filters_keep_a_symmetric_compliance() -> None:
 
 def test_a_matrix_is_symmetric_and_definite() -> None:
     with pytest.raises(ValueError, match="symmetric"):
-        MatrixSpringDamper([[1.0, 2.0], [1.0, 9.0]], np.zeros((2, 2)))
+        _MatrixSpringDamper([[1.0, 2.0], [1.0, 9.0]], np.zeros((2, 2)))
     with pytest.raises(ValueError, match="positive definite"):
-        MatrixSpringDamper([[1.0, 2.0], [2.0, 1.0]], np.zeros((2, 2)))
+        _MatrixSpringDamper([[1.0, 2.0], [2.0, 1.0]], np.zeros((2, 2)))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -622,7 +622,7 @@ def test_designs_turn_with_the_axes(condition: str) -> None:
     aslant = turned(straight, Q)
     assert aslant.levels is not None
     design = design_by_kind(aslant, "spring-damper", condition)
-    assert isinstance(design.coupling, MatrixSpringDamper)
+    assert isinstance(design.coupling, _MatrixSpringDamper)
     assert design.objective == pytest.approx(objective, rel=1e-4)
     assert prove(aslant, design.coupling, condition).proof == "rational"
 

@@ -16,7 +16,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import lmi, spring_damper
 from haptic_loop.design.conditions import any_environment_demand
-from haptic_loop.design.fixed_order import _START_ROOM, FixedOrder, FixedPoles, descend
+from haptic_loop.design.fixed_order import _START_ROOM, _descend, _FixedOrder, _FixedPoles
 from haptic_loop.design.lmi import RESERVE, Shaping
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
@@ -40,7 +40,7 @@ def inner():
 def test_every_family_contains_the_spring_damper(order, diagonal):
     gains = SpringDamper([500.0, 900.0], [0.4, 1.0])
     loop = asked(delta=(2.0, 0.8))
-    family = FixedOrder(Shaping(loop), None, order, diagonal)
+    family = _FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(gains)
     assert p.shape == (family.unknowns,)
     np.testing.assert_allclose(family.coupling(p).at(Z), gains.compliance(T).at(Z), atol=1e-15)
@@ -50,7 +50,7 @@ def test_every_family_contains_the_spring_damper(order, diagonal):
 @pytest.mark.parametrize("case", [(1, 2), (0, 0)])
 def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case):
     loop = asked(case, delta=(2.0, 0.8))
-    family = FixedOrder(Shaping(loop), None, order, diagonal)
+    family = _FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(SpringDamper([500.0, 900.0], [0.4, 1.0]))
     p = p + 0.05 * np.random.default_rng(0).normal(size=p.size)
     left, right, late = Shaping(loop).parts(np.angle(Z))
@@ -65,7 +65,7 @@ def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case
 
 @pytest.mark.parametrize("diagonal", [True, False])
 def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
-    family = FixedOrder(Shaping(asked((0, 0))), np.array([0.4, 0.3]), 2, diagonal)
+    family = _FixedOrder(Shaping(asked((0, 0))), np.array([0.4, 0.3]), 2, diagonal)
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, family.unknowns))
 
@@ -95,11 +95,11 @@ def test_results_are_certified_from_the_coupling_alone(inner):
 
 def test_every_descent_step_is_feasible_and_better():
     loop = asked((0, 0))
-    family = FixedOrder(Shaping(loop))
+    family = _FixedOrder(Shaping(loop))
     gains = spring_damper.design(asked((0, 0), delta=(1.36, 1.36))).coupling
     p = family.start(gains)
     norm = Shaping(loop).norm(gains.compliance(T))[0]
-    for _, step in zip(range(6), descend(family, p, norm), strict=False):
+    for _, step in zip(range(6), _descend(family, p, norm), strict=False):
         V = family.coupling(step)
         before, norm = norm, Shaping(loop).norm(V)[0]
         assert any_environment(V, loop.theta, DELTA).certified
@@ -114,7 +114,7 @@ def test_the_fixed_pole_reference_agrees(inner):
 
 
 def test_more_poles_never_hurt(structured):
-    problem = FixedPoles(Shaping(asked()))
+    problem = _FixedPoles(Shaping(asked()))
     gains = structured.coupling
     rate = gains.B / (gains.B + gains.K * T)
     _, one = problem.best([[rate[0]], [rate[1]]])

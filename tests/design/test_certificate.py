@@ -486,7 +486,7 @@ def test_every_block_is_measured_before_it_is_proved(monkeypatch):
         wall.walled(one).order + 2: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [1.0] * 4),
     }
     for states, make in blocks.items():
-        monkeypatch.setattr(exact, "too_large", lambda n, most=states: "too many" if n >= most else None)
+        monkeypatch.setattr(exact, "_too_large", lambda n, most=states: "too many" if n >= most else None)
         with pytest.raises(NotProved, match="too many"):
             make()
 

@@ -9,7 +9,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
-from haptic_loop.design.conditions import encoder_friction, l1_gain
+from haptic_loop.design.conditions import _l1_gain, encoder_friction
 from haptic_loop.design.guarantees import EncoderSteps
 
 T, STEP = 1.2e-3, 1e-5
@@ -18,7 +18,7 @@ F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
 
 
 def test_friction_needed_by_ten_micrometre_steps():
-    assert l1_gain(F).sum(axis=1) == pytest.approx([10019.6547, 7563.3655], abs=1e-4)
+    assert _l1_gain(F).sum(axis=1) == pytest.approx([10019.6547, 7563.3655], abs=1e-4)
     assert encoder_friction(F, [STEP, STEP]) == pytest.approx([0.050098, 0.037817], abs=1e-6)
     assert encoder_friction(F, [0.0, 0.0]) == pytest.approx([0.0, 0.0])
     with pytest.raises(ValueError, match="expected 2 encoder steps"):
@@ -40,21 +40,21 @@ def test_the_bound_is_above_and_close():
     total, X = np.abs(F.D), F.B
     for _ in range(60_000):
         total, X = total + np.abs(F.C @ X), F.A @ X
-    assert (l1_gain(F) >= total * (1 - 1e-13)).all()  # rounding of 60,000 terms
-    assert l1_gain(F) == pytest.approx(total, rel=1e-8)
+    assert (_l1_gain(F) >= total * (1 - 1e-13)).all()  # rounding of 60,000 terms
+    assert _l1_gain(F) == pytest.approx(total, rel=1e-8)
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.9, -0.99, 1 - 1e-5])
 def test_first_order_closed_form(pole):
     one = Lti([[pole]], [[1.0]], [[1 - pole]], [[0.5]], T)
-    assert l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
+    assert _l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
     slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed: still a bound
-    assert 1e9 <= l1_gain(slow)[0, 0] < np.inf
+    assert 1e9 <= _l1_gain(slow)[0, 0] < np.inf
 
 
 def test_taps_delays_and_unstable_maps():
-    assert l1_gain(delay((3,), T) @ taps([1.0, -2.0, 0.5], T))[0, 0] == pytest.approx(3.5)
-    assert l1_gain(Lti([[1.0]], [[1.0]], [[1.0]], [[0.0]], T))[0, 0] == np.inf
+    assert _l1_gain(delay((3,), T) @ taps([1.0, -2.0, 0.5], T))[0, 0] == pytest.approx(3.5)
+    assert _l1_gain(Lti([[1.0]], [[1.0]], [[1.0]], [[0.0]], T))[0, 0] == np.inf
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 3.0, 100.0])

@@ -13,7 +13,14 @@ from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import budgets, exact
-from haptic_loop.design.exact import Matrix, definiteness, find_storage, prove_positive_real, reached, strictly_positive
+from haptic_loop.design.exact import (
+    Matrix,
+    _prove_positive_real,
+    _strictly_positive,
+    definiteness,
+    find_storage,
+    reached,
+)
 
 T = 1.2e-3
 STAR = Network(
@@ -59,7 +66,7 @@ def test_definiteness_agrees_with_eigenvalues():
         outcome = definiteness(Matrix.of(S.tolist()))
         if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
             assert outcome.definite == (least > 0)
-            assert strictly_positive(Matrix.of(S.tolist())) == (least > 0)
+            assert _strictly_positive(Matrix.of(S.tolist())) == (least > 0)
         assert outcome.semidefinite == (least > -1e-9)
         seen.add(outcome.definite)
         if not outcome.definite:
@@ -76,7 +83,7 @@ def test_singular_matrices_with_negative_directions_are_rejected():
         outcome = definiteness(gram)
         assert outcome.semidefinite
         assert not outcome.definite
-        assert not strictly_positive(gram)
+        assert not _strictly_positive(gram)
     assert not definiteness(Matrix.of([[0, 1], [1, 5]])).semidefinite
     with pytest.raises(ValueError, match="not exactly symmetric"):
         definiteness(Matrix.of([[1, 2], [3, 9]]))
@@ -86,29 +93,29 @@ def test_definiteness_below_rounding_is_not_proved():
     tiny = Fraction(1, 2**400)
     S = Matrix.of([[Fraction(1), 1 - tiny], [1 - tiny, Fraction(1)]])
     assert definiteness(S).definite
-    assert not strictly_positive(S)
+    assert not _strictly_positive(S)
 
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
 def test_what_rounding_makes_definite_is_not_proved(monkeypatch, bits):
     """J + u M with |M| <= 1/2: rounded to multiples of u it is J + u I, which is definite; as it is, it is not."""
-    monkeypatch.setattr(exact, "BITS", bits)
+    monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
     M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
     S = Matrix.of([[1 + u * entry for entry in row] for row in M])
     assert not definiteness(S).semidefinite
-    assert not strictly_positive(S)
-    assert strictly_positive(Matrix.of([[1 + 8 * u * (i == j) for j in range(3)] for i in range(3)]))
+    assert not _strictly_positive(S)
+    assert _strictly_positive(Matrix.of([[1 + 8 * u * (i == j) for j in range(3)] for i in range(3)]))
 
 
 def test_coarse_rounding_never_proves_what_elimination_refuses(monkeypatch):
-    monkeypatch.setattr(exact, "BITS", 10)
+    monkeypatch.setattr(exact, "_BITS", 10)
     rng, proved = np.random.default_rng(5), 0
     for _ in range(400):
         n = int(rng.integers(2, 6))
         half = rng.integers(-9, 10, (n, n))
         S = half @ half.T * 1000 + np.diag(rng.integers(0, 60, n)) - int(rng.integers(0, 400)) * np.eye(n, dtype=int)
-        if strictly_positive(Matrix.of(S.tolist())):
+        if _strictly_positive(Matrix.of(S.tolist())):
             assert definiteness(Matrix.of(S.tolist())).definite
             proved += 1
     assert proved > 50
@@ -116,9 +123,9 @@ def test_coarse_rounding_never_proves_what_elimination_refuses(monkeypatch):
 
 def test_huge_entries_prove_nothing(recwarn):
     for size in (10**200, 10**400, 10**4000):
-        assert not strictly_positive(Matrix.of([[1, size], [size, 1]]))
-        assert not strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
-        assert strictly_positive(Matrix.of([[size, 1], [1, Fraction(2, size)]]))
+        assert not _strictly_positive(Matrix.of([[1, size], [size, 1]]))
+        assert not _strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
+        assert _strictly_positive(Matrix.of([[size, 1], [1, Fraction(2, size)]]))
     assert not recwarn.list
 
 
@@ -133,9 +140,9 @@ def test_definiteness_is_proved_beyond_double_precision():
         while high - low > high / 1000:
             middle = (low + high) / 2
             low, high = (middle, high) if definiteness(hilbert(n, middle)).definite else (low, middle)
-        assert strictly_positive(hilbert(n))
-        assert strictly_positive(hilbert(n, low))
-        assert not strictly_positive(hilbert(n, high))
+        assert _strictly_positive(hilbert(n))
+        assert _strictly_positive(hilbert(n, low))
+        assert not _strictly_positive(hilbert(n, high))
 
 
 def test_the_exact_inverse_is_an_inverse():
@@ -180,21 +187,21 @@ def test_exact_delays_and_sums_are_what_runs():
 def test_a_wrong_storage_matrix_proves_nothing():
     # G = 1 + 0.5/(z - 0.5): He G >= 2/3 on the circle
     G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
-    assert prove_positive_real(G, Matrix.of([["1/2"]])) is None
-    assert "negative direction" in prove_positive_real(G, Matrix.of([[5]]))
+    assert _prove_positive_real(G, Matrix.of([["1/2"]])) is None
+    assert "negative direction" in _prove_positive_real(G, Matrix.of([[5]]))
     # with P = 1 the matrix is diag(3/4, 2 D - 1): 1e-30 below zero, or zero, is beyond floating point
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
-        told = prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
+        told = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
         assert told is reason or told.startswith(reason)
     zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # P = 1 makes all of its matrix exactly zero
-    assert prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
+    assert _prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
-    assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
+    assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or by so little that it is not proved"
     )
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
-    assert prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the model has 1 states"
+    assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the model has 1 states"
 
 
 def random_exact(rng: np.random.Generator, n: int, m: int) -> Lti:
@@ -250,7 +257,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
     low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
     for p, expected in ((low, (False, True)), (high, (True, False))):
         for factor, proved in zip((1 - 1e-9, 1 + 1e-9), expected, strict=True):
-            found = prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
+            found = _prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
             assert (found is None) == proved
 
 
@@ -295,14 +302,14 @@ def test_a_wrong_riccati_solution_proves_nothing(monkeypatch):
 
 def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
-    assert prove_positive_real(G, Matrix.of([[1]])) is None
-    assert prove_positive_real(G, Matrix.of([[-1]])) is not None
+    assert _prove_positive_real(G, Matrix.of([[1]])) is None
+    assert _prove_positive_real(G, Matrix.of([[-1]])) is not None
     assert not recwarn.list
 
 
 def test_models_with_too_many_states_are_reported():
-    assert exact.too_large(budgets.PROOF_STATES) is None
-    assert exact.too_large(budgets.PROOF_STATES + 1) == "a proof over 801 states takes long: up to 800 are tried"
+    assert exact._too_large(budgets.PROOF_STATES) is None
+    assert exact._too_large(budgets.PROOF_STATES + 1) == "a proof over 801 states takes long: up to 800 are tried"
 
 
 @pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])
@@ -324,4 +331,4 @@ def test_integer_products_are_exact(bits, others):
 
 def test_a_matrix_that_is_not_symmetric_is_refused():
     with pytest.raises(ValueError, match="not exactly symmetric"):
-        strictly_positive(Matrix.of([[2, 1], [0, 2]]))
+        _strictly_positive(Matrix.of([[2, 1], [0, 2]]))

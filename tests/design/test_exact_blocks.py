@@ -23,7 +23,7 @@ from scipy.optimize import minimize_scalar
 from worlds import FIGURE_4, SOFT, STIFF, T
 
 from haptic_loop.controller.arithmetic import rational
-from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel
 from haptic_loop.controller.environment import Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
@@ -33,7 +33,7 @@ from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.conditions import delayed_environment_demand
 from haptic_loop.design.coupling_file import Stored, digest, sealed
 from haptic_loop.design.environments import SWITCHING, LimitedForces
-from haptic_loop.design.exact import find_storage, prove_positive_real
+from haptic_loop.design.exact import _prove_positive_real, find_storage
 from haptic_loop.design.result import NotProved, from_ratio
 
 CLOSE = 1e-6  # relative, on either side of a limit
@@ -45,8 +45,8 @@ def assert_limit(block: Callable[[float], Lti], limit: float) -> None:
     above, below = block(limit * (1 + CLOSE)), block(limit * (1 - CLOSE))
     P, reason = find_storage(above)
     assert P is not None, reason
-    assert prove_positive_real(above, P) is None
-    assert prove_positive_real(below, P) is not None
+    assert _prove_positive_real(above, P) is None
+    assert _prove_positive_real(below, P) is not None
     assert find_storage(below)[0] is None
 
 
@@ -460,7 +460,7 @@ def test_a_slightly_indefinite_static_stiffness_is_refused():
     asked = loop(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
 
     def model(tap):
-        return InternalModel([0.0], [[[0.0, 0.0], [0.0, 0.001]], [[0.0, 0.0], [0.0, tap]]])
+        return _InternalModel([0.0], [[[0.0, 0.0], [0.0, 0.001]], [[0.0, 0.0], [0.0, tap]]])
 
     made = prove(asked, model(0.0), "this-environment")
     assert forged(asked, model(0.0), made) is None

@@ -24,7 +24,7 @@ from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design import export as export_module
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, load, save
-from haptic_loop.design.export import c_source, process_block, sequential, single_precision_error, trial
+from haptic_loop.design.export import _sequential, c_source, process_block, single_precision_error, trial
 from haptic_loop.design.files import InputError, one_command
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
@@ -197,7 +197,7 @@ def test_a_vector_without_solution_is_zero(space, monkeypatch):
     block = vectors(space[0], (0,) * 4)
     inputs = trial(block).inputs
     monkeypatch.setattr(export_module, "_MOST_STEPS", 1)
-    assert (np.linalg.norm(sequential(block.system, inputs, block.limiter)[:, :2], axis=1) < 2).all()
+    assert (np.linalg.norm(_sequential(block.system, inputs, block.limiter)[:, :2], axis=1) < 2).all()
 
 
 def test_force_limits_that_no_certificate_covers_are_refused(place, limited_files):
@@ -218,7 +218,7 @@ def test_export_and_simulator_differ_by_rounding(data):
     for k, x in enumerate(test.inputs):
         buffer.x[k, :, 0] = x
         buffer.tick(k)
-    z = sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), test.inputs)  # states before each tick
+    z = _sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), test.inputs)  # states before each tick
     terms = G.order + G.inputs
     gamma = terms * 2.0**-53 / (1 - terms * 2.0**-53)
     local = 2 * gamma * (np.abs(z) @ np.abs(G.A).T + np.abs(test.inputs) @ np.abs(G.B).T)
@@ -261,8 +261,8 @@ def test_single_precision_stays_within_its_error_bound(data):
     """Coefficients, inputs and sums are rounded to 2^-24: each row errs by gamma_(N+2) |row| |v|, carried on by A."""
     block = process_block(Stored.of(PAIR, data))
     G, inputs = block.system, trial(block).inputs
-    single, double = sequential(G, inputs, dtype=np.float32), sequential(G, inputs)
-    z = sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), inputs, dtype=np.float32).astype(float)
+    single, double = _sequential(G, inputs, dtype=np.float32), _sequential(G, inputs)
+    z = _sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), inputs, dtype=np.float32).astype(float)
     terms = G.order + G.inputs + 2
     gamma = terms * 2.0**-24 / (1 - terms * 2.0**-24)
     local = gamma * (np.abs(z) @ np.abs(G.A).T + np.abs(inputs) @ np.abs(G.B).T)
@@ -321,7 +321,7 @@ def test_other_code_can_close_the_loop(place):
     f = np.array([float.fromhex(line) for line in out.split()]).reshape(40, 2)
     x = 1e-3 * np.stack([np.arange(40) % 5, np.arange(40) % 6], axis=1)
     F = Gains(SOFT.K, SOFT.B).around(Lti.constant(900 * np.eye(2), T))
-    np.testing.assert_allclose(f, sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
+    np.testing.assert_allclose(f, _sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
 
 
 def test_the_process_is_the_papers_force_map():

@@ -26,21 +26,21 @@ from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import LimitedForces
-from haptic_loop.design.exact import find_storage, prove_positive_real
+from haptic_loop.design.exact import _prove_positive_real, find_storage
 from haptic_loop.design.facts import KnownMotor, Limiter, compose, compose_any
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
     KNOWN_DEVICE,
-    Best,
     LimitedKnownDevice,
     Sweep,
-    check_q,
-    exact_cost,
+    _Best,
+    _check_q,
+    _exact_cost,
+    _q_bounds,
     period_cost,
-    q_bounds,
 )
-from haptic_loop.design.necessary import alias_sums, left_over, necessary_share
+from haptic_loop.design.necessary import _alias_sums, _necessary_share, left_over
 from haptic_loop.design.result import NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
@@ -96,7 +96,7 @@ def test_constants_of_one_period():
 
 
 @cache
-def best_for(coupling: str) -> Best:
+def best_for(coupling: str) -> _Best:
     """The best beta for the paper's loop without coupling, or with published gains."""
     made, present = {"none": (NoCoupling(), 1.72293), "I": (PUBLISHED["I"], 1.39871)}[coupling]
     return sweep_of(KNOWN.F(made), KNOWN).best(present / 1.37)
@@ -325,7 +325,7 @@ def test_sums_over_aliases_have_a_closed_form():
     g, a = b * wn**2 / (k**2 + b**2 * wn**2), delta + 1j * m * wn
     weight = 1 / (wn**2 * (delta + g * np.abs(a) ** 2))
     turn = 4 * np.sin(w / 2) ** 2 / T**2
-    sig0, sig2 = alias_sums(w, T, m, np.full(4, delta), k, b)
+    sig0, sig2 = _alias_sums(w, T, m, np.full(4, delta), k, b)
     assert sig0 == pytest.approx(turn * weight.sum(axis=1), rel=1e-9)
     assert sig2 == pytest.approx(turn * (weight * g * np.conj(a)).sum(axis=1), rel=1e-9)
 
@@ -334,7 +334,7 @@ def test_sums_over_aliases_have_a_closed_form():
 def test_the_proof_is_tight_for_the_papers_loop(coupling):
     """Theorem A, which no condition undercuts for equal devices, is a tenth of a percent below Theorem B."""
     F = KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"])
-    exact = necessary_share(F, KNOWN)
+    exact = _necessary_share(F, KNOWN)
     assert exact.held
     assert 0.999 * best_for(coupling).share < exact.share < best_for(coupling).share
 
@@ -410,7 +410,7 @@ def test_no_lossless_hand_grows_above_the_requirement(K, B, theta, T):
 @pytest.mark.parametrize(("K", "B", "theta", "T"), ATTACKED[:3])
 def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
     loop, F = one(T, 1.0, theta), wall(K, B, theta, T)
-    assert worst_hand(F, loop, 0.98 * necessary_share(F, loop).share, np.random.default_rng(2)) > 1
+    assert worst_hand(F, loop, 0.98 * _necessary_share(F, loop).share, np.random.default_rng(2)) > 1
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -458,11 +458,11 @@ def test_uneven_periods_need_more():
 
 def enclosed(loop, beta):
     """The bounds of q as the exact proof takes them."""
-    return [[Fraction(repr(v)) for v in part] for part in q_bounds(loop, beta)]
+    return [[Fraction(repr(v)) for v in part] for part in _q_bounds(loop, beta)]
 
 
 def exactly(loop, block_of, beta):
-    return block_of(exact_cost(loop, beta, *enclosed(loop, beta)))
+    return block_of(_exact_cost(loop, beta, *enclosed(loop, beta)))
 
 
 def test_the_paper_loop_is_proved_exactly():
@@ -473,7 +473,7 @@ def test_the_paper_loop_is_proved_exactly():
     P, reason = find_storage(block)
     assert reason is None
     assert P is not None
-    assert prove_positive_real(block, P) is None
+    assert _prove_positive_real(block, P) is None
     short = change(KNOWN, delta=(0.95, 0.95))  # less than the 0.963 that the sweep asks
     _, block = exactly(short, lambda cost: known_device_block(F, cost, beta), beta)
     assert find_storage(block)[0] is None
@@ -510,7 +510,7 @@ def test_a_sweep_sees_what_the_block_is():
 def test_bounds_of_q_enclose_it_and_are_checked():
     beta = (Fraction(33, 10**6),) * 2
     below, above = enclosed(KNOWN, beta)
-    check_q(KNOWN, beta, below, above)
+    _check_q(KNOWN, beta, below, above)
     for spoiled in (
         ((below[0] + Fraction(1, 10**15), below[1]), above),
         (below, (above[0] - Fraction(1, 10**15), above[1])),
@@ -518,9 +518,9 @@ def test_bounds_of_q_enclose_it_and_are_checked():
         (below[:1], above),
     ):
         with pytest.raises(NotProved, match="q"):
-            check_q(KNOWN, beta, *spoiled)
+            _check_q(KNOWN, beta, *spoiled)
     with pytest.raises(NotProved, match="beta"):
-        q_bounds(KNOWN, (Fraction(1, 1000),) * 2)
+        _q_bounds(KNOWN, (Fraction(1, 1000),) * 2)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -934,7 +934,7 @@ def test_the_audit_says_what_is_left_before_walls():
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
     left = left_over(loop, NoCoupling(), required_damping(loop, NoCoupling(), "this-environment"))
     assert left.attained
-    assert left.required_damping[0] == pytest.approx(1.37 * necessary_share(F, one(1e-3, 1.37, 1)).share, rel=1e-4)
+    assert left.required_damping[0] == pytest.approx(1.37 * _necessary_share(F, one(1e-3, 1.37, 1)).share, rel=1e-4)
     assert left.required_damping[0] < left.proved_damping[0]
     drawn = ladders(np.random.default_rng(2), 400, 1, 1e-3)
     assert radii(F, loop, 0.9 * left.required_damping[0], drawn).max() > 1

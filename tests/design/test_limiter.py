@@ -13,7 +13,7 @@ from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.lti import Lti, Sampled, taps
 from haptic_loop.design import budgets, environments
 from haptic_loop.design.certificate import lag, prove, required_damping, verify
-from haptic_loop.design.conditions import least_multiple
+from haptic_loop.design.conditions import _least_multiple
 from haptic_loop.design.coupling_file import Certificate, Stored, load, save, sealed
 from haptic_loop.design.environments import LIMITER, LimitedForces
 from haptic_loop.design.frequency import hermitian, on_circle
@@ -174,7 +174,7 @@ def test_the_least_multiple_of_a_singular_gain(rank):
         free = hermitian(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))) + 0.5 * np.eye(3)
         null = np.linalg.svd(half)[0][:, rank:]
         feasible = rank == 3 or np.linalg.eigvalsh(null.conj().T @ free @ null)[0] > 0
-        s = least_multiple(free[None], gain[None])[0]
+        s = _least_multiple(free[None], gain[None])[0]
         assert np.isfinite(s) == feasible
         if feasible:
             assert np.linalg.eigvalsh(free + (s + 1e-6) * gain)[0] > 0

@@ -9,13 +9,13 @@ from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.environment import environment
 from haptic_loop.design.bound import bound
 from haptic_loop.design.designs import design_by_kind
-from haptic_loop.design.program import BASES
+from haptic_loop.design.program import _BASES
 
 LOOP = load().loop("I")
 
 
 def optimum(loop, bases):
-    return design_by_kind(loop, "optimal", bases=BASES[:bases])
+    return design_by_kind(loop, "optimal", bases=_BASES[:bases])
 
 
 def test_more_damping_is_never_worse():

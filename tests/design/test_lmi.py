@@ -11,15 +11,15 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
-from haptic_loop.design.conditions import v_hat
+from haptic_loop.design.conditions import _v_hat
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.lmi import (
     Ports,
-    balanced,
+    _balanced,
+    _unit_environment,
     lemma1,
     lemma2,
     lemma3,
-    unit_environment,
 )
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
@@ -70,14 +70,14 @@ def strength(matrix, *storages):
 def test_balancing_leaves_the_response_alone(seed):
     G = random_stable(np.random.default_rng(seed), 5)
     padded = Lti.diag(G, Lti([[0.5]], [[0.0]], [[1.0]], [[2.0]], 1.0))
-    found = balanced(padded)
+    found = _balanced(padded)
     assert found.order == 5
     np.testing.assert_allclose(found.at(Z), padded.at(Z), atol=1e-8 * np.abs(padded.at(Z)).max())
 
 
 def test_units_preserve_the_loop():
     E, V = environment(FIGURE_4, T), SpringDamper([500, 900], [1, 2]).compliance(T)
-    scaled = unit_environment(E, (2.0, 0.8)).at(Z) @ unit_coupling(V, (2.0, 0.8)).at(Z)
+    scaled = _unit_environment(E, (2.0, 0.8)).at(Z) @ unit_coupling(V, (2.0, 0.8)).at(Z)
     np.testing.assert_allclose(np.linalg.eigvals(scaled), np.linalg.eigvals(E.at(Z) @ V.at(Z)), rtol=1e-9)
 
 
@@ -89,11 +89,11 @@ def test_the_realisation_16_and_its_quotient():
     ports = v_hat_ports(V, theta)
     y2 = Lti(ports.A, ports.B, ports.C2, ports.D2, 1.0).at(Z)
     np.testing.assert_allclose(hermitian(y2), hermitian(hat) / np.abs(1 - 1 / Z)[:, None, None] ** 2, atol=1e-9)
-    np.testing.assert_allclose(y2, v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the home of the formula
+    np.testing.assert_allclose(y2, _v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the home of the formula
 
 
 def test_e_hats_regular_part_keeps_the_hermitian_part():
-    E = unit_environment(environment(FIGURE_4, T), DELTA)
+    E = _unit_environment(environment(FIGURE_4, T), DELTA)
     regular, printed = e_hat_regular(E, (0, 2)), e_hat_printed(E, (0, 2))
     np.testing.assert_allclose(hermitian(regular.at(Z)), hermitian(printed.at(Z)), atol=1e-9)
     assert regular.is_stable()
@@ -151,21 +151,21 @@ def test_lemma_3_is_the_norm(seed):
 
 
 def test_15_as_printed_is_strictly_infeasible():
-    E = unit_environment(environment(FIGURE_4, T), DELTA)
+    E = _unit_environment(environment(FIGURE_4, T), DELTA)
     printed = e_hat_printed(E, (0, 0))
     n = printed.order
     P = cp.Variable((n, n), symmetric=True)
     Phi = cp.Variable((2, 2), symmetric=True)
     assert strength(lemma1(Ports.same(printed), P, np.zeros((2, 2)), -Phi), P) < 1e-6
     # the reason, for every P: v'(A'PA - P)v = 0 where A v = v
-    regular = balanced(e_hat_regular(E, (0, 0)))
+    regular = _balanced(e_hat_regular(E, (0, 0)))
     P = cp.Variable((regular.order,) * 2, symmetric=True)
     assert strength(lemma1(Ports.same(regular), P, np.zeros((2, 2)), -np.eye(2)), P) > 1e-3
 
 
 def test_2_as_printed_is_infeasible_for_v_hat():
     V = unit_coupling(SpringDamper([300, 300], [0.3, 0.3]).compliance(T), DELTA)
-    printed = balanced(v_hat_printed(V, (1, 2)))
+    printed = _balanced(v_hat_printed(V, (1, 2)))
     P = cp.Variable((printed.order,) * 2, symmetric=True)
     assert strength(lemma1(Ports.same(printed), P, np.zeros((2, 2)), np.zeros((2, 2))), P) < 1e-6
     assert analysis(
@@ -204,9 +204,9 @@ def scalar_any_environment(V, E, theta, psi, delta):
     z = on_circle(frequencies(*systems, points=4000))
     e_hat = T * z / (z - 1) * z**-psi * E.at(z)[:, 0, 0]
     window = sum(z**-j for j in range(theta + 1)) * T / (2 * delta)
-    v_hat = (z - 1) / (T * z) * (V.at(z)[:, 0, 0] - window)
+    _v_hat = (z - 1) / (T * z) * (V.at(z)[:, 0, 0] - window)
     phi = max(0.0, float(np.max(-e_hat.real)))
-    excess = float(np.min(v_hat.real / np.abs(v_hat) ** 2))
+    excess = float(np.min(_v_hat.real / np.abs(_v_hat) ** 2))
     return phi, (excess - phi / (1 - phi / delta) if phi < delta else -np.inf)
 
 

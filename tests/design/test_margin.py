@@ -9,7 +9,7 @@ from worlds import FIGURE_4, STIFF, force_map
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.lti import Lti
-from haptic_loop.design.conditions import least_multiple, least_scale, regular_part
+from haptic_loop.design.conditions import _least_multiple, _regular_part, least_scale
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
@@ -177,14 +177,14 @@ def test_the_least_multiple_is_a_generalised_eigenvalue(n):
     free, half = (RNG.normal(size=(9, n, n)) + 1j * RNG.normal(size=(9, n, n)) for _ in range(2))
     free, gain = hermitian(free), half @ np.conj(np.swapaxes(half, 1, 2)) + 0.1 * np.eye(n)
     expected = [eigh(-one, other, eigvals_only=True)[-1] for one, other in zip(free, gain, strict=True)]
-    np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
+    np.testing.assert_allclose(_least_multiple(free, gain), expected, rtol=1e-9)
 
 
 def test_the_regular_part_keeps_the_hermitian_part():
     """E z/(z-1) less its pole, on the circle."""
     z = np.exp(1j * np.array([0.1, 0.7, 2.9]))
     whole = E.at(z) * (z / (z - 1))[:, None, None]
-    np.testing.assert_allclose(hermitian(regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(hermitian(_regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
 
 
 def test_supremum_finds_a_needle():
@@ -240,4 +240,4 @@ def test_a_map_of_rounding_needs_no_damping():
 
 
 def test_an_indefinite_gain_is_never_enough():
-    assert least_multiple(np.eye(2)[None], np.diag([-1.0, 1.0])[None]) == np.inf
+    assert _least_multiple(np.eye(2)[None], np.diag([-1.0, 1.0])[None]) == np.inf

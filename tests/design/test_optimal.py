@@ -197,7 +197,7 @@ def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
         return found, _BasisResult(taps, poles, taps, search.decibels(found), g, reason, 0.0)
 
     monkeypatch.setattr("haptic_loop.design.optimal._Search.over_basis", over_basis)
-    found = design(loop_of("n3"), Options(bases=program.BASES[: len(script)]))
+    found = design(loop_of("n3"), Options(bases=program._BASES[: len(script)]))
     assert (found.figures.rms_mismatch, found.g) == script[taken]
     assert [i for i, each in enumerate(found.bases) if each.taken][-1] == taken
     for each in found.bases[taken + 1 :]:

@@ -13,7 +13,7 @@ from haptic_loop.controller.coupling import Compliance, Coupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, as_like, constant_like, numbers, taps
 from haptic_loop.design import compare
-from haptic_loop.design.assessment import assess, covered_limits
+from haptic_loop.design.assessment import _covered_limits, assess
 from haptic_loop.design.certificate import lag, prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import BEYOND, Condition, Demand
 from haptic_loop.design.coupling_file import Stored, filed, sealed
@@ -214,9 +214,11 @@ def test_own_conditions_state_environments_and_limits():
     needs = requirements_of(PAIR, stiff, own=own)
     assert assess(PAIR, stiff, condition=own).guarantee.any_environment
     assert not needs["any-environment"].certified
-    assert covered_limits(PAIR, stiff, needs).within((9.0, 9.0)).words.endswith("limited to 9 N, in this environment")
+    assert _covered_limits(PAIR, stiff, needs).within((9.0, 9.0)).words.endswith("limited to 9 N, in this environment")
     assert assess(PAIR, stiff).guarantee.environments == "this environment"
-    assert covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
+    assert (
+        _covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
+    )
 
 
 @dataclass(frozen=True)

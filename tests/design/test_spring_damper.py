@@ -24,7 +24,7 @@ from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop
 from haptic_loop.design.lmi import RESERVE, Shaping
 from haptic_loop.design.result import DesignFailed, Infeasible
-from haptic_loop.design.spring_damper import GainSet, design
+from haptic_loop.design.spring_damper import _GainSet, design
 from haptic_loop.design.transparency import decibels
 from haptic_loop.sim.scenario import load
 
@@ -98,7 +98,7 @@ def test_a_handful_of_convex_problems_suffices():
 
 def stiffest(loop):
     """The gains of largest total stiffness, each channel's own largest."""
-    gains = GainSet(loop).solve(np.repeat([-1.0, 0.0], loop.channels), "a test")
+    gains = _GainSet(loop).solve(np.repeat([-1.0, 0.0], loop.channels), "a test")
     return spring_damper._coupling(loop, gains)
 
 
@@ -142,7 +142,7 @@ def gains_of_least(cost, theta, sigma):
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """Its furthest points, by one matrix inequality and by many, against cvxpy: 5e-6, since the many miss 2e-6."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
-    certified = GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
+    certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in (np.array([-1.0, -0.2]), np.array([-0.2, -1.0]), np.array([-1.0, 1.0])):
         found = certified.solve(cost, "a test")
         assert cost @ found == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
@@ -156,7 +156,7 @@ def test_the_gain_set_equals_its_block(theta, phi):
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
     unit = msgspec.structs.replace(unit, delta=(1.0,))
     for k, b in np.random.default_rng(theta).uniform(0.05, 2, (5, 2)):
-        (channel,) = GainSet(loop, np.array([phi]) if phi else None).channels
+        (channel,) = _GainSet(loop, np.array([phi]) if phi else None).channels
         V = SpringDamper([k], [b]).sampled(z, 1.0)
         demand = conditions.any_environment_demand(V, unit, [phi])
         block = hermitian((demand.free + demand.gain).G[0])

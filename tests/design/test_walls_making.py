@@ -8,7 +8,7 @@ import pytest
 from asked import any_environment, this_environment
 from scipy.linalg import expm
 
-from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
@@ -285,7 +285,7 @@ def test_longer_periods_scale_it():
 def test_what_is_not_covered_is_said():
     loop = held(3000.0)
     with pytest.raises(NotProved, match="linear model of the environment"):
-        prove(loop, InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
+        prove(loop, _InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
     one_way = Compliance(Lti.constant([[1e-3, 5e-4], [0.0, 1e-3]], PAIR.T))
     assert "not symmetric" in required_damping(PAIR, one_way, "this-environment").reason
     judged = requirements_of(pressed_at_rest(), SpringDamper([1300.0], [0.45]))

@@ -9,7 +9,7 @@ import pytest
 from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from haptic_loop.cli.check import main as check_main
-from haptic_loop.controller.coupling import ForceFilter, InternalModel
+from haptic_loop.controller.coupling import ForceFilter, _InternalModel
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from haptic_loop.design import optimal
@@ -40,7 +40,7 @@ def known():
     return check_ranges(RANGED, VERTICES_ONLY)
 
 
-def needed(network: Network, coupling: InternalModel) -> float:
+def needed(network: Network, coupling: _InternalModel) -> float:
     """The share of the damping that is needed, from the raw matrices on a dense grid: no code of the project."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, 2000), np.linspace(1e-3, np.pi, 2000)])
     z = np.exp(1j * w)

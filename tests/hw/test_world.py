@@ -82,7 +82,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
 
 def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
     """Without a repetition of the step, these are the ticks on which the scene's force is at the cap."""
-    monkeypatch.setattr(world_of, "MOST_REPETITIONS", 0)
+    monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
     _, report, shown = session(tmp_path, capsys, *words)
     _, link = read(tmp_path / "out" / "trace.npz")

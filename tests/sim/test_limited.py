@@ -11,7 +11,7 @@ from worlds import SOFT, STIFF
 
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.design.assessment import covered_limits
+from haptic_loop.design.assessment import _covered_limits
 from haptic_loop.design.certificate import requirements_of
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.sim.api import simulate
@@ -32,14 +32,14 @@ def weak(*limits):
 def test_which_limiter_a_coupling_may_have():
     scenario = weak(12.0, 5.657)
     loop = scenario.loop("I")
-    any_environment = covered_limits(loop, SOFT, requirements_of(loop, SOFT))
+    any_environment = _covered_limits(loop, SOFT, requirements_of(loop, SOFT))
     assert any_environment.rho == (0.0, 0.0)
-    own = covered_limits(loop, BUILT, requirements_of(loop, BUILT))
+    own = _covered_limits(loop, BUILT, requirements_of(loop, BUILT))
     assert own.rho == pytest.approx((11.4167, 11.4167))
     assert own.requirement is not None
     assert own.requirement.proof == "rational"
     stiff = STIFF
-    refused = covered_limits(loop, stiff, requirements_of(loop, stiff))
+    refused = _covered_limits(loop, stiff, requirements_of(loop, stiff))
     assert refused.rho is None
     assert "needs 1.385" in refused.reason
 

@@ -13,7 +13,7 @@ import pytest
 from worlds import VERTICES_ONLY
 
 from haptic_loop.cli import export, run, validate
-from haptic_loop.controller.coupling import ForceFilter, InternalModel
+from haptic_loop.controller.coupling import ForceFilter, _InternalModel
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Sampled
 from haptic_loop.design.certificate import prove, verify
@@ -62,7 +62,7 @@ def test_its_file_proves_and_drives_the_process(files, form):
     scenario, _, path = files[form]
     stored, loop = load_file(path), scenario.loop("I")
     assert verify(stored).proved
-    assert isinstance(stored.built(), InternalModel if form == "pair" else ForceFilter)
+    assert isinstance(stored.built(), _InternalModel if form == "pair" else ForceFilter)
     strong = tuple(msgspec.structs.replace(device, force_limit=1e4) for device in scenario.device)
     simulation = assemble(scenario.replace(device=strong, duration=0.2), stored.built(), None)
     exact, own = (close_loop(simulation, engine) for engine in ("exact", "mujoco"))

@@ -49,16 +49,16 @@ from haptic_loop.sim.view.session import (
 )
 from haptic_loop.sim.view.stage import (
     _COLUMNS,
-    FlatPictures,
-    ShownScene,
     _apart,
     _dressed,
     _envelope,
+    _FlatPictures,
     _loop,
     _overlay,
     _owners,
     _places,
     _scale,
+    _ShownScene,
     _typed,
     keys_help,
     pictures_for,
@@ -299,7 +299,7 @@ def test_the_mouse_draws_and_releases_handles():
 
 
 def test_the_viewer_s_selection_is_a_grip(none):
-    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
+    stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     q = np.array([0.001, 0.002, 0.003, 0.004])
     stage.show(replace(session(none).frame(0.0), q=q))
     perturb = mujoco.MjvPerturb()
@@ -497,7 +497,7 @@ class FakeWindow:
 def test_the_window_s_loop_without_the_window(none):
     """Frames come at 60 Hz of an injected clock, the mouse reaches the session, the words reach the window."""
     running = LiveLoop(none, Inline())
-    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
+    stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(40, stage), [100.0]
 
     def sleep(seconds):
@@ -523,7 +523,7 @@ def test_the_window_s_loop_without_the_window(none):
 
 
 def test_the_window_s_loop_ends_when_it_should(none):
-    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
+    stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(1000, stage), [0.0]
 
     def sleep(seconds):
@@ -570,7 +570,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
 
 def test_flat_pictures_show_where_things_are(none):
     """The first device's handle, by its colour: it moves as many pixels as its position says."""
-    painter = FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
+    painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)
 
     def middle(q):
@@ -584,7 +584,7 @@ def test_flat_pictures_show_where_things_are(none):
 
 
 def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
-    made, picture = [], FlatPictures.picture
+    made, picture = [], _FlatPictures.picture
 
     def interrupted(self, frame):
         if len(made) == 4:
@@ -592,7 +592,7 @@ def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
         made.append(frame)
         return picture(self, frame)
 
-    monkeypatch.setattr(FlatPictures, "picture", interrupted)
+    monkeypatch.setattr(_FlatPictures, "picture", interrupted)
     where = tmp_path / "a.gif"
     run("--coupling", "none", "--video", str(where), "--duration", "2", code=130)
     with Image.open(where) as image:

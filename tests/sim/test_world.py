@@ -21,7 +21,7 @@ from haptic_loop.models import world as world_of
 from haptic_loop.sim.couplings import choose, read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, Touched, contacts_of, linearise, scene_of, thrown
+from haptic_loop.sim.world import START_J, Touched, _contacts_of, linearise, scene_of, thrown
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -277,7 +277,7 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
 
 def test_ticks_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
     """Without a repetition of the step, these are the ticks on which a force is at its limit."""
-    monkeypatch.setattr(world_of, "MOST_REPETITIONS", 0)
+    monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     scenario(tmp_path, TRAY, more=UP)
     text = (tmp_path / "loop.toml").read_text().replace("12.0", "0.5").replace("[1, 2]", "[0, 0]")
     hand = "\n[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
@@ -451,7 +451,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     with pytest.raises(InputError, match="filters the forces of its linear model and has no V"):
         simulate(loop, design_coupling(linear.loop("I"), "optimal", seconds=0.0))
     assert THIS_ENVIRONMENT.judge(linear.loop("I"), certified(linear).coupling).reason is None
-    assert [contact.body for contact in contacts_of(loop.environment)] == ["left", "right"]
+    assert [contact.body for contact in _contacts_of(loop.environment)] == ["left", "right"]
 
 
 @pytest.mark.parametrize("every", [2, 4])

@@ -29,7 +29,7 @@ from haptic_loop.sim.limit_cycles import HeldDevices, Plan
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import dominant_mode, exact_loops
 from haptic_loop.sim.trace import oscillation, slowest_seen
-from haptic_loop.sim.zwidth import CouplingSweep, Grid, draw_map, make_grid
+from haptic_loop.sim.zwidth import CouplingSweep, _Grid, draw_map, make_grid
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")
@@ -329,7 +329,7 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
 def points(sweep, K, B, **changes):
     """The simulated points of a 2 x 2 map whose corners they are."""
     settings = {"points": 2, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
-    grid = Grid(np.array(K), np.array(B), "linear")
+    grid = _Grid(np.array(K), np.array(B), "linear")
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     return draw_map(sweep, grid, crowd, Plan(**settings), lambda *stage: None).points
 
