@@ -543,12 +543,12 @@ _SPARE_OF_SLOW_WORLDS = 0.25  # With this e ringing decays per tick by a factor 
 
 
 def _spare(loop: Loop) -> float:
-    """Return e of `_moving_average`: a rounding reserve, or more if the world stands still between its steps."""
+    """Return e of `moving_average`: a rounding reserve, or more if the world stands still between its steps."""
     world = loop.environment.world
     return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
 
 
-def _moving_average(loop: Loop, condition: str = "any-environment") -> Design:
+def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
     V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. Let n = theta + 1. With the
