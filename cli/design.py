@@ -13,7 +13,7 @@ import msgspec
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.assessment import SAMPLES, Assessment, assess
+from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import off_table, out_file
@@ -49,8 +49,6 @@ def main(argv: list[str]) -> int:
 
         return world.design(args, scenario, out)
     loop = _loop(args, scenario)
-    if args.samples is not None and loop.ranges is None:
-        raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
@@ -87,13 +85,9 @@ def _parser() -> options.Parser:
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
-    ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
+    ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order (Remark 5)")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    ways = "complementarity (as printed), inner or fixed-poles (default inner)"
-    ccl.add_argument("--method", metavar="NAME", help=ways)
     _add_optimal_options(parser, "optimal: the filter of the environment's forces with the least transparency error")
-    samples = f"random points in the ranges, beside the search (default {SAMPLES})"
-    parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>].json)")
     return parser
 
@@ -245,7 +239,6 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             certificate=design.certificate,
             condition=design.asked,
             ranges_seed=args.seed,
-            ranges_samples=SAMPLES if args.samples is None else args.samples,
             searched=design.searched,
             limiter=args.limiter,
             force_limit=tuple(device.force_limit for device in scenario.axis_devices),

@@ -33,7 +33,6 @@ class DesignOptions(TypedDict, total=False):
     """Options of the kinds in design.designs.KINDS."""
 
     order: int  # ccl: states per channel
-    method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
     limiter: bool  # spring-damper and optimal for this-environment: cover limited forces, too (the default)

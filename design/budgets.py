@@ -64,10 +64,8 @@ PROGRAM_SWEEPS = 6
 #: Rounds with further frequencies of the bound on linear couplings, sums of coefficients in it, and intervals of its
 #: integral. Cases I and II take 2 rounds and 568 intervals. Each step of a delay in a row gives a sum per column.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
-#: Convex problems for a coupling of fixed order: in total, and for one norm by complementarity. The third number limits
-#: the cuts for one choice of poles. In case I inner approximation takes 32 in total. Fixed poles (105) and
-#: complementarity (103, 20 for one norm) spend the budget. A choice of poles takes 2 cuts.
-FIXED_ORDER_PROBLEMS, COMPLEMENTARITY_PROBLEMS, FIXED_POLE_CUTS = 100, 20, 20
+#: Convex problems for a coupling of fixed order. Case I takes 32.
+FIXED_ORDER_PROBLEMS = 100
 #: Cuts of the least share of a known device at one beta, and rounds of tangents for beta and multipliers. The pair of
 #: omega.3 with known transmissions takes 4 and 11, one with walls and limited forces 20.
 BETA_CUTS, BETA_ROUNDS = 40, 60

@@ -58,7 +58,7 @@ KINDS = {
     "moving-average": _Kind(
         (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), softened=True
     ),
-    "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
+    "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "diagonal")),
     "optimal": _Kind(
         (THIS_ENVIRONMENT, KNOWN_DEVICE),
         "optimal",

@@ -1,11 +1,8 @@
-"""State-space couplings of fixed order under Theorem 4, by three methods.
+"""State-space couplings of fixed order under Theorem 4 (Remark 5), by inner convex approximation.
 
-    complementarity   the procedure of Remark 5: cone complementarity as printed, with bisection on mu
-    inner             inner convex approximation: feasible descent, no bisection (the default)
-    fixed-poles       one state per channel, diagonal; the global optimum for poles that a simplex search chooses
-
-All methods start from the structured spring-damper design and minimise ||W1 L W2||_inf (23). The returned coupling
-satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone.
+The descent starts from the structured spring-damper design and minimises ||W1 L W2||_inf (23). The returned coupling
+satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone. The cone complementarity that
+Remark 5 prints is not offered, because its bisection on mu stalls near its start.
 """
 
 from __future__ import annotations
@@ -22,13 +19,11 @@ from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets, lmi, spring_damper
-from haptic_loop.design.arguments import of_kind, one_of, whole
-from haptic_loop.design.conditions import any_environment, any_environment_demand
+from haptic_loop.design.arguments import of_kind, whole
+from haptic_loop.design.conditions import any_environment_demand
 from haptic_loop.design.cone import ConeProgram, Inequality
-from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
-_METHODS = ("complementarity", "inner", "fixed-poles")
 _MOST_STATES = 10  # per channel; each adds a row and a column to every cone
 _SPARE_POLE = 0.5  # initial pole of further states
 
@@ -276,148 +271,6 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
     return lemmas.at + p, lemmas.LQ @ Q @ lemmas.LQ.T, lemmas.LU @ U @ lemmas.LU.T
 
 
-# ----------------------------------------------------------------------------------------------------
-# Fixed-order couplings by cone complementarity, as Remark 5 of the paper prints it (with the remedied inequalities).
-#
-# For fixed mu the inversions Y = Q^-1 and X = U^-1 are relaxed to [[Y, I], [I, Q]] >= 0 and [[X, I], [I, U]] >= 0.
-# tr(QY) + tr(UX), which reaches its minimum only if the inversions hold, is linearised and minimised repeatedly. mu is
-# determined by bisection. The sequence stalls far from the optimum, so that `_descend` is the default.
-
-
-_WIDTH = 5e-3  # relative width at which the bisection ends
-
-
-def _bisect(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """Return the best coupling and the number of SDPs solved; the start p must be feasible for `norm`."""
-    Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
-    if _singular(Q, U):
-        return p, 0
-    lemmas = _Lemmas(family, p, Q, U, norm)
-    low, high, best, sdps = 0.5 * norm, norm, p, 0
-    while high - low > _WIDTH * high and sdps < budget:
-        mu = (low + high) / 2
-        candidate, spent = _complementary(lemmas, mu, holds, min(budgets.COMPLEMENTARITY_PROBLEMS, budget - sdps))
-        sdps += spent
-        if candidate is None:
-            low = mu
-        else:
-            best, high = candidate, mu
-    return best, sdps
-
-
-def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> tuple[Array | None, int]:
-    """Return a coupling that is feasible for mu, or None, and the number of SDPs solved, at most `patience`."""
-    sizes = (lemmas.LQ.shape[0],) * 2 + (lemmas.LU.shape[0],) * 2  # of Q, Y, U and X
-    ends = np.cumsum([lemmas.at.size, *map(lmi.packed, sizes)])
-
-    def parts(v: Array) -> Sequence[Any]:
-        p, *vectors = np.split(v, ends[:-1])
-        return p, *map(lmi.symmetric_from, vectors, sizes), (mu / lemmas.norm) ** 2
-
-    def pair(first: int) -> Callable[[Array], Array]:
-        one = np.eye(sizes[first])
-        return lambda v: lmi.symmetric([[parts(v)[first + 2], one], [one, parts(v)[first + 1]]])
-
-    every = range(ends[-1])
-    blocks = [*lemmas.inequalities(parts, every), *(Inequality.of(pair(i), every) for i in (0, 2))]
-    Q, Y, U, X = map(np.eye, sizes)
-    for spent in range(1, patience + 1):
-        # The slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X).
-        both = [(2 * M - np.diag(np.diag(M)))[np.triu_indices(len(M))] for M in (Y, Q, X, U)]
-        try:
-            x = ConeProgram(np.concatenate([np.zeros(lemmas.at.size), *both]), blocks).solve(
-                "a step of complementarity"
-            )
-        except DesignFailed:
-            return None, spent
-        p, Q, Y, U, X, _ = parts(x)
-        if holds(lemmas.at + p, mu):
-            return lemmas.at + p, spent
-    return None, patience
-
-
-# ----------------------------------------------------------------------------------------------------
-# Diagonal couplings with fixed poles: one convex problem, globally optimal for these poles.
-#
-# V_i = v_i + sum_j f_ij (1 - z)/(z - a_ij). With the poles fixed, Lemma 1 is linear in the storage P and in (v, f),
-# and W1 L W2 is affine in (v, f): its norm is bounded at sampled frequencies, with cutting planes.
-
-
-_GAP = 1e-5  # relative gap between the norm on a refined sweep and the bound at the sampled frequencies
-
-
-class _FixedPoles:
-    """The fixed-pole problem of one loop. The frequencies of the cuts are kept when the poles change."""
-
-    def __init__(self, shaping: lmi.Shaping, phi: Array | None = None) -> None:
-        self.shaping, self.phi, self.units = shaping, phi, _Units(shaping, phi)
-        self.frequencies = [0.0]
-        self.sdps = 0
-
-    def best(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
-        """Return V in SI units and ||W1 L W2||_inf for `poles`, one real sequence per channel, each pole in (-1, 1)."""
-        cuts = 0
-        while True:
-            V, bound = self._solve(poles)
-            (norm, peak), cuts = self.shaping.norm(V), cuts + 1
-            if norm <= bound * (1 + _GAP) or cuts == budgets.FIXED_POLE_CUTS:
-                return V, norm
-            self.frequencies.append(peak)
-
-    def search(self, start: Sequence[float], evaluations: int = 60) -> tuple[Lti, float]:
-        """Minimise `best` over one pole per channel, by a simplex search from `start`."""
-        import scipy
-
-        def norm(x: Array) -> float:
-            try:
-                return self.best([[a] for a in np.tanh(x)])[1]
-            except DesignFailed:
-                return np.inf
-
-        options = {"maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4}
-        result = scipy.optimize.minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
-        return self.best([[a] for a in np.tanh(result.x)])
-
-    def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
-        import scipy
-
-        N, ends = len(poles), np.cumsum([len(a) for a in poles])
-        A = np.diag(np.concatenate(poles))
-        B = np.asarray(scipy.linalg.block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
-
-        def unit(x: Array) -> Lti:
-            F = np.asarray(scipy.linalg.block_diag(*(row[None] for row in np.split(x[N : N + ends[-1]], ends[:-1]))))
-            return Lti.with_rest(A, B, F, np.diag(x[:N]), 1.0)
-
-        gains = N + ends[-1]
-        states = self.units.block(unit(np.zeros(gains))).order
-
-        def storage(x: Array) -> Array:
-            return lmi.symmetric_from(x[gains:], states)
-
-        def passive(x: Array) -> Array:
-            block = self.units.block(unit(x))
-            zero = np.zeros_like(block.D)
-            return lmi.lemma1(lmi.Ports.same(block), storage(x), zero, zero)
-
-        every = range(gains + lmi.packed(states))
-        w = np.array(self.frequencies)
-        left, right, late = self.shaping.parts(w)
-        slopes = np.stack([left @ self.units.si(unit(e)).at(on_circle(w)) @ right for e in np.eye(gains)])
-        # [[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies; t is the last unknown.
-        base = np.eye(N, dtype=np.complex128) * np.ones((w.size, 1, 1))
-        cuts = lmi.gain_block([*range(gains), len(every)], late @ right, slopes, base, 0 * slopes[:, :, :N])
-        blocks = [Inequality.of(passive, every), Inequality.of(storage, every), cuts]
-
-        def certified(x: Array) -> bool:
-            """Return whether a sweep certifies the coupling; the solver's tolerance could hide a violation."""
-            return any_environment(self.units.si(unit(x)), self.shaping.loop, self.phi).certified
-
-        x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)
-        self.sdps += 1
-        return self.units.si(unit(x)), float(np.sqrt(max(x[-1], 0.0)))
-
-
 _START_ROOM = 1e-3  # The first point is found for damping that is less by this share, so that it is strictly feasible.
 
 
@@ -425,18 +278,14 @@ def design(
     loop: Loop,
     order: int = 1,
     diagonal: bool = True,
-    method: str = "inner",
     most_sdps: int = budgets.FIXED_ORDER_PROBLEMS,
 ) -> Design:
-    """Design a coupling with `order` states per channel by `method`, from strictly feasible spring-damper gains.
+    """Design a coupling with `order` states per channel, from strictly feasible spring-damper gains.
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
     whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
-    one_of("method", method, _METHODS)
-    if method == "fixed-poles" and (order, diagonal) != (1, True):
-        raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
     started, shaping, phi = time.perf_counter(), lmi.Shaping(loop), lmi.least_phi(loop)
     reserved = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
     first = spring_damper.design(reserved)
@@ -446,24 +295,18 @@ def design(
     def judged(V: Lti) -> Requirement:
         return lmi.ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
 
-    if method == "fixed-poles":
-        problem = _FixedPoles(shaping, phi)
-        V, _ = problem.search((gains.B / (gains.B + gains.K * loop.T)).tolist(), most_sdps)
-        sdps = problem.sdps
-    else:
-        family = _FixedOrder(shaping, phi, order, diagonal)
+    family = _FixedOrder(shaping, phi, order, diagonal)
 
-        def holds(p: Array, mu: float) -> bool:
-            """Return whether the coupling p is certified and ||W1 L W2||_inf <= mu, judged from the coupling alone."""
-            V = family.coupling(p)
-            return V.is_stable() and judged(V).certified and shaping.norm(V)[0] <= mu
-
-        search = _descended if method == "inner" else _bisect
-        p = family.start(gains)
-        p, sdps = search(family, p, shaping.norm(family.coupling(p))[0], holds, most_sdps)
+    def holds(p: Array, mu: float) -> bool:
+        """Return whether the coupling p is certified and ||W1 L W2||_inf <= mu, judged from the coupling alone."""
         V = family.coupling(p)
+        return V.is_stable() and judged(V).certified and shaping.norm(V)[0] <= mu
+
+    p = family.start(gains)
+    p, sdps = _descended(family, p, shaping.norm(family.coupling(p))[0], holds, most_sdps)
+    V = family.coupling(p)
     requirement = judged(V)
     if not requirement.certified:
-        raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies")
+        raise DesignFailed(None, (), "the descent gave no coupling that Theorem 4 certifies")
     norm, wall_s = shaping.norm(V)[0], time.perf_counter() - started
     return Design(Compliance(V), "any-environment", "loop-norm", norm, requirement, first.sdps + sdps, wall_s, phi=phi)

@@ -1,7 +1,8 @@
-"""State-space couplings: the realisation, what each method reaches, and that every result stands on its own."""
+"""State-space couplings: the realisation, what the descent reaches, and that every result stands on its own."""
 
 import warnings
 
+import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import lmi, spring_damper
 from haptic_loop.design.conditions import any_environment_demand
-from haptic_loop.design.fixed_order import _START_ROOM, _descend, _FixedOrder, _FixedPoles
+from haptic_loop.design.fixed_order import _START_ROOM, _descend, _FixedOrder
 from haptic_loop.design.lmi import RESERVE, Shaping
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
@@ -106,21 +107,31 @@ def test_every_descent_step_is_feasible_and_better():
         assert norm < before
 
 
-def test_the_fixed_pole_reference_agrees(inner):
-    reference = ccl.design(asked(), method="fixed-poles", most_sdps=40)
-    assert reference.objective == pytest.approx(9.745, abs=0.01)
-    assert inner.objective >= reference.objective * (1 - 1e-3)
-    assert reference.requirement.certified
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # to 1e-4, which is enough
+def test_the_zeros_are_optimal_for_the_poles(inner):
+    """With the poles of the design fixed, condition and norm are convex at each frequency: cvxpy finds the optimum."""
+    shaping, poles = Shaping(asked()), np.diag(inner.coupling.V.A)
+    w = np.unique(
+        [*np.geomspace(1e-2, np.pi, 40), *np.linspace(0.04, 0.05, 21), Shaping(asked()).norm(inner.coupling.V)[1]]
+    )
+    z = np.exp(1j * w)
+    x, t = cp.Variable(4), cp.Variable()  # V_i = x_2i + x_(2i+1) (1 - z)/(z - pole_i) [mm/N]
+    left, right, late = shaping.parts(w)
+    terms = []
+    feasible = []
+    for i, (pole, delta, theta) in enumerate(zip(poles, DELTA, (1, 2), strict=True)):
+        window = abs(sum(z**-k for k in range(theta + 1)))
+        least = 1e3 * T * window**2 / (4 * delta * (1 - RESERVE))  # Theorem 4, psi = 0
+        feasible.append(x[2 * i] / 2 + (1 / (z - pole)).real * x[2 * i + 1] >= least)
+        for part in (1 + 0 * z, (1 - z) / (z - pole)):
+            terms.append(1e-3 * part[:, None, None] * left[:, :, i : i + 1] @ right[:, i : i + 1])
 
+    def real(M):
+        return np.block([[M.real, -M.imag], [M.imag, M.real]]) / inner.objective
 
-def test_more_poles_never_hurt(structured):
-    problem = _FixedPoles(Shaping(asked()))
-    gains = structured.coupling
-    rate = gains.B / (gains.B + gains.K * T)
-    _, one = problem.best([[rate[0]], [rate[1]]])
-    V, two = problem.best([[rate[0], 0.0, 0.9], [rate[1], 0.0, 0.9]])
-    assert two < one <= structured.objective * (1 + 1e-4)
-    assert any_environment(V, (1, 2), DELTA).certified
+    felt = [real(fixed) + sum(x[n] * real(terms[n][k]) for n in range(4)) for k, fixed in enumerate(late @ right)]
+    cp.Problem(cp.Minimize(t), [*feasible, *(cp.sigma_max(M) <= t for M in felt)]).solve(solver=cp.CLARABEL)
+    assert t.value == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize(("order", "diagonal"), [(1, False), (2, True), (3, True)])
@@ -142,18 +153,10 @@ def test_delay_in_the_environment_is_paid_for():
     assert found.objective <= spring_damper.design(room).objective * (1 + 1e-9)
 
 
-def test_as_printed_the_iteration_stalls_at_its_start():
-    start = spring_damper.design(asked()).objective
-    inner, printed = (ccl.design(asked(), method=name, most_sdps=3).objective for name in ("inner", "complementarity"))
-    assert inner < printed <= start * 1.01
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "bisection"}, "method is 'bisection', allowed are complementarity, inner, fixed-poles"),
         ({"order": 0}, "order is 0, allowed are 1 to 10"),
-        ({"order": 2, "method": "fixed-poles"}, "method 'fixed-poles' is for one state per channel"),
     ],
 )
 def test_a_bad_request_gets_one_line(options, message):
@@ -161,13 +164,12 @@ def test_a_bad_request_gets_one_line(options, message):
         ccl.design(asked(), **options)
 
 
-@pytest.mark.parametrize("method", ["complementarity", "inner", "fixed-poles"])
-def test_a_free_mass_is_called_useless(method, tmp_path, capsys):
+def test_a_free_mass_is_called_useless(tmp_path, capsys):
     """It has no static stiffness to render, and its weighted loop is too stiff for SciPy's Lyapunov equation."""
     scenario = tmp_path / "free.toml"
     text = 'name = "free"\nT = 1e-3\nduration = 1.0\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\n'
     scenario.write_text(text + 'damping = 1.37\n[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')
-    words = ["--scenario", str(scenario), "--coupling", "ccl", "--method", method, "--out", str(tmp_path / "c.json")]
+    words = ["--scenario", str(scenario), "--coupling", "ccl", "--out", str(tmp_path / "c.json")]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert main(words) == 0

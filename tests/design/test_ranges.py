@@ -318,9 +318,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
         capsys.readouterr()
         return code, json.loads(report.read_text())
 
-    code, design = told(
-        design_main, "--coupling", "optimal", "--seconds", "0.1", "--samples", "8", "--out", str(file), *common
-    )
+    code, design = told(design_main, "--coupling", "optimal", "--seconds", "0.1", "--out", str(file), *common)
     assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (
         0,
         "these ranges",
@@ -364,7 +362,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
 
 
 def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, capsys):
-    stiff = ["--condition", "this-environment", "--scenario", str(scenario_file), "--samples", "4"]
+    stiff = ["--condition", "this-environment", "--scenario", str(scenario_file)]
     assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
     assert safe_with(outcome) == "this environment"

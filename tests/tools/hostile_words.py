@@ -183,7 +183,6 @@ SILENT = [
     (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
     (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
     (("design", "--order", "2"), "--order"),
-    (("design", "--method", "inner"), "--method"),
     (("design", "--compare"), "--compare"),
     (("design", "--objective", "rms"), "--objective"),
     (("design", "--band", "80,1"), "--band"),
@@ -192,7 +191,6 @@ SILENT = [
     (("design", "--coupling", "ccl", "--limiter"), "limiter"),
     (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
     (("design", "--coupling", "ccl", "--order", "99"), "--order"),
-    (("design", "--samples", "5"), "--samples"),
     (("export", "c.json", "--without-theta"), "--without-theta"),
     (("audit", "--K", "1,2"), "--K"),
     (("audit",), "nothing to audit"),
@@ -255,9 +253,9 @@ REFUSED = {
     "validate": """--environments ranges
         --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
-    "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5
+    "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%%
         --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
-        --method inner | --compare | --objective sup | --order 0 --coupling ccl
+        --compare | --objective sup | --order 0 --coupling ccl
         --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --coupling optimal
         --band 1,0 --coupling optimal | --best""",
     "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1
