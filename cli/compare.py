@@ -21,7 +21,7 @@ from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.guarantees import held_torques
 from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite
-from haptic_loop.design.robustness import Nearby, Robustness
+from haptic_loop.design.robustness import Robustness
 from haptic_loop.sim.alternatives import Alternative, alternatives
 from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
 from haptic_loop.sim.couplings import NAMES, choose
@@ -152,8 +152,7 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     chosen, failed = _chosen(scenario, args, args.coupling)
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
-    prices = [line for c in report.couplings for line in _price(c.name, c.nearby)]
-    lines = [*report.notes, *prices, *_held_torques(scenario, args.case)]
+    lines = [*report.notes, *_held_torques(scenario, args.case)]
     tables = [_guarantees(report), _feel(report)]
     render.publish(args, report, tables, lines, out, files, _guaranteed(report))
     return options.exit_code(not failed)
@@ -221,7 +220,7 @@ def _guarantees(report: Comparison) -> render.Table:
             "at Hz" + " " * i: lambda c, of=condition: _binds(c.conditions[of]),
         }
         if i == 0:
-            cells["at 10 %"] = lambda c: _robust(c.nearby.robustness, scale)
+            cells["at 10 %"] = lambda c: _robust(c.robustness, scale)
     cells |= {
         "sup dB": lambda c: _mismatch(c, "mismatch_db"),
         "rms dB": lambda c: _mismatch(c, "rms_mismatch_db"),
@@ -257,12 +256,6 @@ def _robust(part: Robustness | None, scale: float = 1.0) -> str:
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
-
-
-def _price(name: str, part: Nearby) -> Iterable[str]:
-    """Yield a line on a design for the environments within ten percent, if it was made."""
-    if price := part.designed_for_it:
-        yield f"{name}, designed for 10 % more or less of every spring and mass: {render.price_words(price)}"
 
 
 def _feel(report: Comparison) -> render.Table:

@@ -21,7 +21,7 @@ from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
-from haptic_loop.design.robustness import Nearby, ranges_around
+from haptic_loop.design.robustness import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
@@ -52,11 +52,11 @@ def main(argv: list[str]) -> int:
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    slow = args.coupling == "optimal"  # The bound and the price of an optimal coupling take seconds.
+    slow = args.coupling == "optimal"  # The bound of an optimal coupling takes seconds.
     if slow:
         render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
-    verdict = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby)
+    verdict = verdicts.lost(assessment, report.robustness) if slow else verdicts.verdict(assessment, report.robustness)
     lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
     render.publish(args, report, _tables(scenario, report), lines, verdict=verdict)
     return options.exit_code(assessment.holds, report.interrupted)
@@ -250,21 +250,20 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
     from haptic_loop.design import coverage
     from haptic_loop.design.bound import BoundBeside
-    from haptic_loop.design.designs import nearby as nearby_of
     from haptic_loop.design.optimal import Optimal
 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
     chosen_options = Options(**_options_of(args, "optimal")) if best else DEFAULT
-    nearby, limit, interrupted = Nearby(), None, False
+    nearby, limit, interrupted = None, None, False
     note = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
     try:
         if best:
             with render.progress(f"{note}: working out the bound"):
                 limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, chosen_options)
-        with render.progress(f"{note}: working out robustness and its price"):
-            nearby = nearby_of(loop, design.coupling, chosen_options, named(design.asked))
+        with render.progress(f"{note}: working out robustness"):
+            nearby = robustness_nearby(loop, design.coupling, named(design.asked))
     except KeyboardInterrupt:
         interrupted = True
     nominal = None
@@ -281,7 +280,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         assessment=assessment,
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
-        nearby=nearby,
+        robustness=nearby,
         best=best and _Best(limit, best.g, best.bases, best.hurried),
         sdps=design.sdps,
         stored=stored,
@@ -373,7 +372,7 @@ class _Report:
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
-    nearby: Nearby = render.several(render.robustness_rows, "inlined")
+    robustness: Robustness | None = render.several(render.robustness_rows)
     ringing: Ringing | None = render.figure("slowest mode", "{.words}", default=None, json="if given")
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # loaded only by commands that need them
     from rich.table import Table
 
     from haptic_loop.cli.screen import Screen
-    from haptic_loop.design.robustness import Nearby, Spread
+    from haptic_loop.design.robustness import Robustness
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 
@@ -291,25 +291,13 @@ def transparency_error(figures: Transparency) -> str:
 _MUCH = 2.0  # ratio of required to available damping nearby, above which the report proposes --ranges
 
 
-def robustness_rows(nearby: Nearby) -> Rows:
-    """Yield the rows on a wrong model of the environment: the required damping, and the cost of a robust design."""
-    if there := nearby.robustness:
+def robustness_rows(there: Robustness | None) -> Rows:
+    """Yield the rows on a wrong model of the environment: the required damping, and how to design for it."""
+    if there:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
-        if there.required_over_available > _MUCH and nearby.designed_for_it:
-            yield "", f"--ranges {there.percent:g}% gives a coupling that is safe in all of these environments"
-    if price := nearby.designed_for_it:
-        yield f"design for ±{there.percent if there else 10:g} %", price_words(price)
-
-
-def price_words(price: Spread) -> str:
-    """Return the mismatch, the cost and the proof of a design for several environments, in words."""
-    worse = f"at most {price.price_db:.2f} dB worse" if price.price_db >= 0 else f"{-price.price_db:.2f} dB better"
-    costs = worse if math.isfinite(price.price_db) else "not exact"
-    proved = f"proved in {price.proved} of {price.environments} environments"
-    rest = ", swept in the others" if price.proved < price.environments else ""
-    rest += f" ({price.reason})" if price.reason else ""
-    return f"{price.mismatch_db:z.2f} dB, {costs}: {proved}{rest}"
+        if there.required_over_available > _MUCH:
+            yield "", f"--ranges {there.percent:g}% designs for all of these environments"
 
 
 def verdict(word: str | None) -> str:

@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 if TYPE_CHECKING:
     from haptic_loop.controller.budget import BudgetFigures
     from haptic_loop.design.assessment import Assessment
-    from haptic_loop.design.robustness import Nearby
+    from haptic_loop.design.robustness import Robustness
     from haptic_loop.sim.api import ScenarioRun
     from haptic_loop.sim.report import PaperRow
     from haptic_loop.sim.run_report import Ran, RunReport
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     nearby = _nearby(scenario.loop(args.case), chosen, assessment)
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
-    report = replace(report, nearby=nearby)
+    report = replace(report, robustness=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
     render.announce(args, verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder))
@@ -142,16 +142,15 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
     return rows
 
 
-def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
-    """Return the damping needed in environments near the modelled one; empty if no guarantee depends on it."""
-    from haptic_loop.design.designs import nearby
-    from haptic_loop.design.robustness import Nearby
+def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | None:
+    """Return the damping needed in environments near the modelled one; None if no guarantee depends on it."""
+    from haptic_loop.design.robustness import robustness_nearby
 
     guarantee = assessment.guarantee
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
-        return Nearby()
-    with render.progress("working out robustness and its price"):
-        return nearby(loop, chosen.coupling, condition=named(chosen.asked))
+        return None
+    with render.progress("working out robustness"):
+        return robustness_nearby(loop, chosen.coupling, named(chosen.asked))
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
@@ -232,7 +231,7 @@ def _rows(report: RunReport) -> render.Rows:
     yield from verdicts.gain_rows(assessment)
     yield from verdicts.rows(assessment)
     yield "transparency error", felt and render.transparency_error(felt)
-    yield from render.robustness_rows(report.nearby)
+    yield from render.robustness_rows(report.robustness)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"

@@ -12,7 +12,7 @@ from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, R
 from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.guarantees import ANY, HERE, RANGES, EncoderSteps
 from haptic_loop.design.result import MAKING, Chosen, finite
-from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.robustness import Robustness
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.scenario import Scenario
@@ -63,7 +63,7 @@ _OBJECTS = {
 
 def verdict(
     assessment: Assessment,
-    nearby: Nearby | None = None,
+    nearby: Robustness | None = None,
     force_error: float | None = None,
     encoder: EncoderSteps | None = None,
 ) -> str:
@@ -110,12 +110,12 @@ def _useless(assessment: Assessment) -> str:
     return f"[red]Useless[/] on {where}: it renders next to nothing there." if where else ""
 
 
-def lost(assessment: Assessment, nearby: Nearby | None) -> str:
+def lost(assessment: Assessment, nearby: Robustness | None) -> str:
     """Return a sentence on the change within ten percent that ends the guarantee, or ""."""
-    there, guarantee = nearby and nearby.robustness, assessment.guarantee
-    if there is None or there.certified or guarantee is None or guarantee.any_environment:
+    guarantee = assessment.guarantee
+    if nearby is None or nearby.certified or guarantee is None or guarantee.any_environment:
         return ""
-    return f"Lost with {there.where}."
+    return f"Lost with {nearby.where}."
 
 
 def _who(guarantee: Guarantee) -> str:

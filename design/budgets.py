@@ -9,9 +9,6 @@ Measured on 23 loops, of which 22 are in benchmarks/loops, on one core of an AMD
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TypeVar
-
 # Work that is counted [units] -----------------------------------------------------------------------------------------
 
 #: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and one over 800, the largest, takes 30.
@@ -22,9 +19,6 @@ SWEEPS = 60.0
 GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of contacts.
 RANGES = 60.0
-#: Figures of a coupling for environments within 10 % (design.optimal.spread), by the largest number of devices. They
-#: take up to 2.2 for two devices, 6.6 for three and four, and 16.4 for more.
-PRICE = {2: 6.0, 4: 12.0, 10**3: 40.0}
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
@@ -88,10 +82,3 @@ INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
 #: Blocks of 256 ticks over which an impulse response is summed to a relative 1e-9; a bound covers the rest.
 #: Only a mode that takes 250,000 ticks to fall to 1/e spends them.
 GAIN_CHUNKS = 20_000
-
-_Value = TypeVar("_Value")
-
-
-def of_channels(table: Mapping[int, _Value], channels: int) -> _Value:
-    """Return the value of the first key that is at least `channels`."""
-    return next(value for most, value in table.items() if channels <= most)

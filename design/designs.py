@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
-from haptic_loop.controller.coupling import Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.environment import Environment, held
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Lti
@@ -25,11 +24,10 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, Know
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import Design, DesignFailed
-from haptic_loop.design.robustness import Nearby, robustness_nearby
 from haptic_loop.design.transparency import NO_FORCE, silent
 
 if TYPE_CHECKING:
-    from haptic_loop.design.program import Options
+    pass
 
 
 class _Kind(NamedTuple):
@@ -313,28 +311,3 @@ def _scaled(loop: Loop, share: float) -> dict[str, Any]:
     """Return the fields of a loop with this share of the damping."""
     levels = loop.levels and tuple(tuple(tuple(share * v for v in row) for row in level) for level in loop.levels)
     return {"delta": tuple(share * d for d in loop.delta), "levels": levels}
-
-
-def nearby(
-    loop: Loop,
-    coupling: Coupling,
-    options: Options | None = None,
-    condition: Condition = THIS_ENVIRONMENT,
-) -> Nearby:
-    """Return the condition's requirement for environments within ten percent, and the cost of a design for them.
-
-    The result is empty for a condition that holds in any environment. The cost is left out for a user's own condition,
-    for walls, for ranges, for an environment that is no network of springs, and for a coupling other than a force
-    filter or none.
-    """
-    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
-        return Nearby()
-    known, there = robustness_nearby(loop, coupling, condition), loop.environment
-    if known is None or loop.ranges or there.one_period or not condition.extensible:
-        return Nearby(known)
-    if not isinstance(coupling, ForceFilter | NoCoupling):
-        return Nearby(known)
-    from haptic_loop.design.optimal import spread  # slow to load
-    from haptic_loop.design.program import DEFAULT
-
-    return Nearby(known, spread(loop, coupling, options or DEFAULT))

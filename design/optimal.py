@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import TooLong, spent, spent_after, units_since, within
+from haptic_loop.controller.arithmetic import TooLong, spent, units_since, within
 from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
@@ -25,17 +25,12 @@ from haptic_loop.design.conditions import this_environment as requirement_of
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.known_device import KNOWN_DEVICE, KnownDevice, LimitedKnownDevice, largest_beta
-from haptic_loop.design.result import Design, DesignFailed, NotProved, from_ratio
-from haptic_loop.design.robustness import Spread, at, vertices
+from haptic_loop.design.result import Design, DesignFailed, NotProved
+from haptic_loop.design.robustness import at
 from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-# _PROVING is the share of the robustness budget that is reserved for proofs.
-# A proof costs _PROOF * states^2.7 units of counted work: 0.3 at 100 states.
-_PROVING, _PROOF = 1 / 3, 1.2e-6
-_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # largest number of channels: (taps, poles) of the basis in `spread`
-_FIRST = 3  # The program starts with the nominal environment and the _FIRST others that need the most damping.
 _SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
@@ -312,15 +307,6 @@ class _Search:
             return (replace(slip, c=condition.rows(self.loop, c)),)
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
-    def slip_of(self, coupling: Coupling) -> program.Slip | None:
-        """Return the limiter with which this coupling needs the least damping, with its best multiplier."""
-        if not self.options.limiter:
-            return None
-        slips = [slip for slip in self.slips(None) if slip]
-        needs = [required_damping(self.loop, coupling, slip.condition) for slip in slips]
-        slip, need = min(zip(slips, needs, strict=True), key=lambda pair: pair[1].ratio)
-        return replace(slip, c=slip.condition.rows(self.loop, need.multiplier)) if need.multiplier else slip
-
     def cases_with(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
         """Return the environments with their constraints, including the limiter's block for `slip`."""
         if slip is None:
@@ -411,7 +397,7 @@ class _Search:
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])
         problem = program.Problem(self.span(taps, poles), self.cases_with(slip), self.options, soft, heavier=heavier)
-        coupling, needs = self.kept_in_all(problem, [0])
+        coupling, needs = self.kept_in_all(problem)
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
         for share in (0.95, 2.5, 50.0):  # The unused share of the margin grows until the proof succeeds.
@@ -425,56 +411,20 @@ class _Search:
                 break
         return candidate
 
-    def kept_in_all(
-        self, problem: program.Problem, active: list[int], until: float = np.inf, **how: Any
-    ) -> tuple[ForceFilter, list[float]]:
-        """Find the optimum for the environments `active`, and add environments whose requirement is exceeded.
+    def kept_in_all(self, problem: program.Problem) -> tuple[ForceFilter, list[float]]:
+        """Find the optimum for the nominal environment, and add environments whose requirement is exceeded.
 
-        The search ends when the work counted so far (`spent`) exceeds `until`.
         Returns (coupling, share of the damping that each environment needs).
         """
+        active = [0]
         while True:
             some = replace(problem, cases=tuple(problem.cases[i] for i in active))
-            coupling = problem.span.filter(some.solve(self._start(some), until=until, **how))
+            coupling = problem.span.filter(some.solve(self._start(some)))
             needs = [ratio_in(case.loop, coupling) for case in self.cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
-            if not missed or spent() > until:
+            if not missed:
                 return coupling, needs
             active = active + missed[:2]
-
-    def fitted(self, coupling: ForceFilter, slip: program.Slip | None, limit: float) -> tuple[Optimal, list[float]]:
-        """Scale the coupling until no environment needs more than the share `limit` of the damping.
-
-        Returns (design, share of the damping that each environment needs after the scaling).
-        """
-        needs = [ratio_in(case.loop, coupling) for case in self.cases]
-        if slip:
-            needs[0] = max(needs[0], required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio)
-        scale = min(1.0, limit / max(needs))
-        scaled = _scaled(coupling, scale)
-        return self._assessed(scaled, scaled.g), [scale * need for need in needs]
-
-    def proofs(
-        self, candidate: Optimal, needs: Sequence[float], slip: program.Slip | None, work: float
-    ) -> tuple[int, str | None]:
-        """Prove the coupling in one environment after another, the worst first.
-
-        The proofs stop before their work, estimated from the number of states, exceeds `work`.
-        Returns (number of environments with a proof, reason why the next proof failed or None).
-        """
-        here = self._proved(candidate, slip)
-        if not here.proved:
-            return 0, str(here.reason)
-        worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
-        for count, i in enumerate(worst_first, start=1):
-            if count * _PROOF * candidate.states**2.7 > work:
-                return count, None
-            swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
-            try:
-                prove(self.cases[i].loop, candidate.coupling, "this-environment", swept=swept)
-            except NotProved as error:
-                return count, str(error)
-        return len(needs), None
 
     def between(self, candidate: Optimal) -> Optimal:
         """Return the coupling for ranges after the search between the vertices, with a proof at each vertex.
@@ -629,48 +579,4 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
     return program.Span(coupling.poles, coupling.pairs, every).filter(
         np.append(coupling.g, coupling.R[1:].ravel()), scale
-    )
-
-
-# ----------------------------------------------------------------------------------------------------
-# The mismatch that a design for several environments costs.
-
-
-def spread(
-    loop: Loop,
-    nominal: ForceFilter | NoCoupling,
-    options: program.Options = program.DEFAULT,
-    percent: float = 10.0,
-    work: float | None = None,
-) -> Spread:
-    """Return figures of a coupling that is safe at all `vertices`, `percent` around the environment's parameters.
-
-    The coupling is the better of a design over a small basis and the nominal one scaled down. The program has a dense
-    grid for the nominal environment. For vertices it has a sparse grid and the frequencies at which sweeps find a
-    violation.
-    """
-    work = work or budgets.of_channels(budgets.PRICE, loop.channels)
-    until = spent_after(work * (1 - _PROVING))
-    search = _Search.of(loop.at(loop.environment), options)
-    if isinstance(nominal, NoCoupling):
-        nominal = ForceFilter([], [], [np.eye(loop.channels).tolist()])
-    before = search.decibels(search._assessed(nominal, nominal.g))
-    others = [at(loop, network) for network in vertices(loop.network, percent).values()]
-    more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
-    search, slip = replace(search, cases=search.cases + more), search.slip_of(nominal)
-    taps, poles = budgets.of_channels(_PRICED_BY, loop.channels)
-    problem = program.Problem(
-        search.span(taps, poles), search.cases_with(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
-    )
-    hardest = np.argsort([-ratio_in(case.loop, nominal) for case in search.cases])
-    active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
-    tried = [nominal, search.kept_in_all(problem, active, until, forgiven=_TOLERATED)[0]]
-    for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
-        candidate, needs = min((search.fitted(one, slip, limit) for one in tried), key=lambda one: search.merit(one[0]))
-        proved, reason = search.proofs(candidate, needs, slip, work * _PROVING)
-        if reason is None:
-            break
-    db = search.decibels(candidate)
-    return Spread(
-        db, db - before, candidate.g, max(needs[1:], default=needs[0]), candidate.states, len(needs), proved, reason
     )

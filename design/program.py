@@ -7,7 +7,6 @@ frequencies, and a dense sweep adds the frequencies at which the solution violat
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -16,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.controller.arithmetic import spend, spent
+from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.coupling import ForceFilter, basis
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -53,7 +52,6 @@ _SMALL = 1e-5  # weight of the coefficients; some have no other effect if the en
 _DECIMALS = 10
 _GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or to its gain over zero force
 _FORGIVEN = 5e-4  # allowed violation of an inequality between its frequencies; scaling removes it
-_FEW = 12  # number of frequencies of a sparse grid besides the modes
 _STEEPER = 3.0  # factor between successive weights of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency
 _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]; the matrices are constant below it
@@ -340,7 +338,6 @@ class Problem:
     options: Options
     soft: float  # weight of the force above 100 Hz
     heavier: float = 1.0  # factor of the static stiffness's weight
-    sparse: bool = False  # whether environments of weight 0 start with few frequencies
 
     @property
     def own(self) -> list[tuple[int, int]]:
@@ -521,10 +518,6 @@ class Problem:
 
     def grid(self, case: Case, constraint: _Constraint) -> Array:
         """Return the initial frequencies of a constraint [rad/sample]."""
-        if self.sparse and not case.weight:
-            modes = case.E.poles()
-            w = np.union1d(np.geomspace(_SMALLEST, np.pi, _FEW), np.angle(modes[modes.imag > 1e-6]))
-            return w[(w >= constraint.low) & (w <= constraint.high)]
         even = np.linspace(constraint.low, constraint.high, 50)
         rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
@@ -558,18 +551,15 @@ class Problem:
                 worst = max(worst, float(fails(missing[-1]).max(initial=0.0)))
         return missing, worst
 
-    def solve(self, start: Array, forgiven: float = _FORGIVEN, until: float = math.inf) -> Array:
-        """Find the optimum from a strictly feasible start, with violations below `forgiven` on a dense sweep.
-
-        Violations may be larger if the search ends because the work counted so far (`spent`) exceeds `until`.
-        """
+    def solve(self, start: Array) -> Array:
+        """Find the optimum from a strictly feasible start, with violations below _FORGIVEN on a dense sweep."""
         pairs = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in pairs]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
         _, R = np.linalg.qr(np.column_stack([A, b]))
         A, b = R[:, :-1], R[:, -1]
-        x, t, gaps = start, None, list(_GAPS[:1] if self.sparse else _GAPS)
+        x, t, gaps = start, None, list(_GAPS)
         inner = start
         nothing = float(b @ b) + float(c.any())  # objective of zero force, for which tau is 1
         demanding = any(
@@ -583,13 +573,13 @@ class Problem:
             inner = back(y)
             while True:
                 value = program.value(y)
-                if spent() > until or program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
+                if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
             x = back(y)
             more, worst = self.missed(x)
-            if (worst < forgiven and len(gaps) == 1) or spent() > until:
+            if worst < _FORGIVEN and len(gaps) == 1:
                 break
             gaps = gaps[-1:]
             imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]

@@ -15,6 +15,7 @@ from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
+from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import suffices
 
 #: More than _FEW environments are first compared at every _THIN-th frequency. Only those within _NEAR of the worst one
@@ -30,28 +31,6 @@ class Robustness:
     required_over_available: float  # required over available damping in the worst environment
     where: str  # the parameter that differs in the worst environment, with its sign
     certified: bool  # whether the condition holds in the worst environment
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Figures of a coupling that is safe at all `vertices`. The budget is small, so the price is an upper bound."""
-
-    mismatch_db: float  # in the nominal environment
-    price_db: float  # mismatch minus the mismatch of the nominal design
-    g: float  # rendered share of the static stiffness
-    worst: float  # largest required over available damping at the vertices
-    states: int  # order of the loop
-    environments: int  # number of vertices, including the nominal environment
-    proved: int  # number of environments with an exact proof; the budget allows only sweeps for the others
-    reason: str | None = None  # why the next environment is not proved
-
-
-@dataclass(frozen=True)
-class Nearby:
-    """The requirement of a coupling in environments that differ by 10 %, and the price of a design for these."""
-
-    robustness: Robustness | None = None
-    designed_for_it: Spread | None = None
 
 
 def at(loop: Loop, network: Network) -> Loop:
@@ -119,8 +98,11 @@ def robustness(
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return the worst requirement within ten percent.
 
-    Returns None for walls, for environments given by a block, and if a stiffness or mass plus ten percent is too large.
+    Returns None for a condition that holds in any environment or is not varied, for walls, for environments given by a
+    block, and if a stiffness or mass plus ten percent is too large.
     """
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
+        return None
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
     try:

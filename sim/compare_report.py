@@ -6,26 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import compare
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.designs import nearby as nearby_with_price
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, Requirement
-from haptic_loop.design.robustness import Nearby, robustness_nearby
+from haptic_loop.design.robustness import Robustness, robustness_nearby
 from haptic_loop.sim.couplings import assessed
 from haptic_loop.sim.scenario import Scenario
-
-
-def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """Return a coupling's requirement in environments that differ by 10 %.
-
-    For a coupling that filters forces, the result also has the price of a design for all these environments.
-    """
-    filters_forces = coupling.in_series(loop.T) is not None
-    return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +35,7 @@ class ComparedCoupling:
     kind: str
     states: int
     assessment: Assessment
-    nearby: Nearby = off_table("inlined")
+    robustness: Robustness | None = off_table()
     curves: compare.Curves = off_table("inlined")
     conditions: dict[str, ConditionCurve] = off_table()
 
@@ -66,7 +55,7 @@ class ComparedCoupling:
             chosen.kind,
             judged.F.order,
             assessment,
-            nearby(loop, chosen.coupling),
+            robustness_nearby(loop, chosen.coupling),
             curves,
             conditions,
         )

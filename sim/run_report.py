@@ -11,7 +11,7 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, EncoderSteps
 from haptic_loop.design.result import MAKING, Chosen
-from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.robustness import Robustness
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun
 from haptic_loop.sim.passivity_layer import idle
@@ -73,7 +73,7 @@ class RunReport:
     credible: accuracy.Credible
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
-    nearby: Nearby = off_table("inlined", default=Nearby())
+    robustness: Robustness | None = off_table(default=None)
     paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the figures that the paper prints
     remarks: tuple[str, ...]
 

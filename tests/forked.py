@@ -42,18 +42,17 @@ def load() -> None:
 def share_designs(folder: Path, patch=setattr) -> None:
     """What commands work out again and again, seconds each, once for all tests and processes that ask for the same.
 
-    That is: designs, bounds, the price of a wrong model, what limited forces ask, and how the couplings beside a run's
+    That is: designs, bounds, what limited forces ask, and how the couplings beside a run's
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import haptic_loop.cli.check
     import haptic_loop.cli.design
-    from haptic_loop.design import api, assessment, bound, designs, optimal
+    from haptic_loop.design import api, assessment, bound, designs
     from haptic_loop.sim import couplings
 
     for made, modules in (
         (designs.design_by_kind, (haptic_loop.cli.design, api, couplings)),
         (bound.bound, (bound,)),
-        (optimal.spread, (optimal,)),
         (assessment.required_damping, (assessment,)),
         (assessment.requirements_of, (assessment,)),
         (assessment.search_ranges, (assessment, haptic_loop.cli.check)),

@@ -27,7 +27,7 @@ from haptic_loop.design.conditions import ratio_in
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.frequency import hermitian, on_circle
-from haptic_loop.design.optimal import _SETTLED, _BasisResult, design, spread
+from haptic_loop.design.optimal import _SETTLED, _BasisResult, design
 from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
 from haptic_loop.design.transparency import transparency
@@ -379,41 +379,6 @@ def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
         assert robustness(loop, coupling).required_over_available == pytest.approx(worst, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "objective"), [("n3", "rms"), ("n3", "sup"), pytest.param("n2", "rms", marks=pytest.mark.validate)]
-)
-def test_robust_designs_are_proved_and_cost_little(name, objective):
-    loop = loop_of(name)
-    found = spread(loop, best(name).coupling, replace(SHORT, objective=objective))
-    assert found.proved == found.environments == 1 + len(vertices(loop.network))
-    assert 0.99 < found.worst < 1
-    assert found.mismatch_db < (-0.3 if objective == "sup" else -4.0)
-    assert found.price_db < 2.5
-
-
-def test_robustness_costs_at_most_scaling_down(monkeypatch):
-    def nothing(self, start, *args, **how):
-        return 1e-3 * start
-
-    loop, nominal = loop_of("n3"), best("n3")
-    monkeypatch.setattr(Problem, "solve", nothing)
-    found = spread(loop, nominal.coupling, SHORT)
-    worst = robustness(loop, nominal.coupling).required_over_available
-    assert found.g == pytest.approx(nominal.g / worst, rel=0.01)
-    assert found.proved == found.environments
-
-
-def test_robustness_price_keeps_the_limiter(monkeypatch):
-    """A tenth of the environment: with a lag of .01 or .1 of the damping no multiplier covers it, with .5 one does."""
-    monkeypatch.setattr(Problem, "solve", lambda self, start, *args, **how: 1e-3 * start)
-    springs = [Spring(("a", "m"), 300.0, 0.1), Spring(("m", "b"), 500.0, 0.2), Spring(("m", "ground"), 30.0)]
-    network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.2})
-    loop = Loop(0.002, (1, 2), (1, 1), (0, 0), (0.3, 0.6), network)
-    found = spread(loop, ForceFilter([], [], [(0.1 * np.eye(2)).tolist()]), Options(limiter=True), work=0.1)
-    assert (found.g, found.price_db, found.reason) == (0.1, 0.0, None)
-    assert found.proved >= 1
-
-
 def test_partial_delay_constraints_leave_a_bound(monkeypatch):
     loop = loop_of("n3")
     whole = bound(loop, knots=8).rms
@@ -658,8 +623,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     options = ["--coupling", str(tmp_path / "c.json"), "--scenario", str(scenario), "--no-plot", "--out", str(tmp_path)]
     assert compare_main(options) == 0
     compared = json.loads((tmp_path / "report.json").read_text())["couplings"][0]
-    assert compared["designed_for_it"] == found["designed_for_it"]
-    assert "designed for 10 % more or less" in " ".join(capsys.readouterr().out.split())
+    assert compared["robustness"] == found["robustness"]
 
 
 def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch):

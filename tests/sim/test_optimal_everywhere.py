@@ -86,7 +86,6 @@ def test_single_runs_equal_batched_runs(files, form, tmp_path):
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["robustness"]["percent"] == 10
-    assert (report["designed_for_it"] is None) == (form == "pair")
     assert (report["assessment"]["force_limits"]["rho"] is not None) == (form == "filter")
     assert validate.main([*common, "--humans", "6", "--duration", "0.1", "--out", str(tmp_path)]) == 0
     batch = json.loads((tmp_path / "r.json").read_text())
