@@ -151,6 +151,9 @@ def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> b
     if args.no_plot or not content:
         remove(picture)
         return False
+    from matplotlib import artist
+
+    artist.kwdoc = lambda artist: ""  # Docstrings of classes take a quarter of matplotlib's import.
     return True
 
 

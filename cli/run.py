@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
-    from haptic_loop.sim.run_report import run_report
+    from haptic_loop.sim.report import encoder_steps
 
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError(
@@ -52,13 +52,18 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)  # the coupling V, Q or R
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
+    encoder = encoder_steps(scenario, args.case, chosen.coupling)
+    render.announce(args, verdicts.verdict(assessment, encoder=encoder))
+    from haptic_loop.sim.run_report import run_report
+
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     nearby = _nearby(scenario.loop(args.case), chosen, assessment)
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
     report = replace(report, robustness=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
-    render.announce(args, verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder))
+    if lost := verdicts.lost(assessment, nearby):
+        render.announce(args, lost)
     with render.progress("storing the trace and drawing the picture"):
         files = _save(args, out, run, report)
     render.publish(args, report, _tables(scenario, report), report.remarks, out, files, details=_details(report))

@@ -64,7 +64,6 @@ _OBJECTS = {
 def verdict(
     assessment: Assessment,
     nearby: Robustness | None = None,
-    force_error: float | None = None,
     encoder: EncoderSteps | None = None,
 ) -> str:
     """Return the verdict in one or two sentences: hands and objects of the guarantee, felt stiffness, restrictions.
@@ -72,7 +71,6 @@ def verdict(
     Args:
         assessment: The assessment of exactly the loop that the command runs or judges.
         nearby: The required damping in environments within ten percent, or None.
-        force_error: rms of a run, in percent of the ideal force.
         encoder: Whether friction covers the encoder steps of the devices; None without encoder steps.
     """
     guarantee = assessment.guarantee
@@ -81,8 +79,10 @@ def verdict(
     if guarantee.energy_J is not None:
         swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
         return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}"
-    felt = _felt(assessment, force_error)
-    words = [f"[green]Stable[/] for {_who(guarantee)}{': ' + felt if felt else ''}."]
+    figures = assessment.transparency
+    share = figures and finite(figures.dc_ratio)
+    felt = f": {_percent(share)} of the stiffness" if share else ""
+    words = [f"[green]Stable[/] for {_who(guarantee)}{felt}."]
     if not assessment.holds:
         words.append(f"[red]Not certified[/] {_missing(assessment)}")
     if guarantee.forces == BELOW_LIMITS and assessment.force_limits.force_limit:
@@ -124,14 +124,6 @@ def _who(guarantee: Guarantee) -> str:
     delays, facts = guarantee.delays, guarantee.facts
     late = f", with delays that switch within {delays}" if "switching" in facts else ""
     return f"{guarantee.hands} with {place}{late}"
-
-
-def _felt(assessment: Assessment, force_error: float | None) -> str:
-    """Return the rendered share of the stiffness and the force error of a run, as a text."""
-    figures = assessment.transparency
-    share = figures and finite(figures.dc_ratio)
-    words = [f"{_percent(share)} of the stiffness"] if share else []
-    return ", ".join([*words, *([] if force_error is None else [f"{_percent(force_error / 100)} force error"])])
 
 
 def _percent(ratio: float) -> str:

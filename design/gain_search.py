@@ -10,10 +10,14 @@ affine in G and affine in the multiplier, so these responses determine all its v
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +34,6 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_b
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, transparency
-
-if TYPE_CHECKING:  # slow to load
-    from scipy.optimize import OptimizeResult
 
 #: reserve of the sampled condition, 1.5 times that of the design, for frequencies between the samples
 _SAMPLED_RESERVE = 1.5 * RESERVE
@@ -254,16 +255,27 @@ class SampledLoop:
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
-    def search(self, x: Array, most: int) -> OptimizeResult:
+    def search(self, x: Array, most: int) -> Array:
         """Return the local optimum from x, by at most `most` steps."""
-        from scipy.optimize import minimize  # slow to load
-
         m = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
         condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
-        options = {"maxiter": most, "ftol": 1e-7}
-        problem = {"bounds": bounds, "constraints": condition, "options": options}
-        return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
+        slope, problem = self.square_mismatch_slope, {"bounds": bounds, "constraints": condition}
+        return _slsqp()(self.square_mismatch, x, jac=slope, **problem, maxiter=most, ftol=1e-7).x
+
+
+@cache
+def _slsqp() -> Any:
+    """Return the SLSQP of scipy.optimize without its other solvers, whose import takes half as long as a design."""
+    name = "scipy.optimize"
+    spec = find_spec(name)
+    if spec and name not in sys.modules:
+        sys.modules[name] = module_from_spec(spec)  # an empty package, so that its __init__ is not run
+        try:
+            return import_module(f"{name}._slsqp_py")._minimize_slsqp
+        finally:
+            del sys.modules[name]
+    return import_module(f"{name}._slsqp_py")._minimize_slsqp
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
@@ -422,7 +434,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
     """Return (x of a local optimum that passes the refined sweep or None, number of searches)."""
     x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
-        x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)]).x
+        x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)])
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
@@ -460,6 +472,6 @@ def least_rms(
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
     """Return the gains after a few steps from each start, sorted by mismatch, with infeasible gains last."""
-    points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]).x for start in starts]
+    points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]) for start in starts]
     points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
     return [sampled.coupling(x) for x in points]

@@ -1,6 +1,8 @@
 """The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
 
 import re
+import subprocess
+import sys
 from functools import partial
 
 import cvxpy as cp
@@ -339,3 +341,22 @@ def test_limits_help_no_loop_that_fails_without() -> None:
         with pytest.raises(DesignFailed, match="this-environment condition certifies for theta"):
             spring_damper.design_with(loop, "this-environment")
     assert not asked
+
+
+def test_slsqp_alone_is_that_of_scipy():
+    """The optimum of a function of Rosenbrock's inside a disc is equal bit for bit."""
+    code = """
+import sys
+from haptic_loop.design.gain_search import _slsqp
+
+alone = _slsqp()
+assert "scipy.optimize" not in sys.modules
+from scipy.optimize import minimize, rosen, rosen_der
+
+disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
+problem = {"jac": rosen_der, "bounds": [(-1.5, 0.9)] * 2, "constraints": disc}
+found = minimize(rosen, [-1.0, 1.0], method="SLSQP", **problem)
+assert found.success
+assert list(alone(rosen, [-1.0, 1.0], **problem).x) == list(found.x)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
