@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,7 +43,7 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome
 from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
-from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.device import Device, RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
 
 _LIMITS = (
@@ -126,7 +126,10 @@ def main(argv: list[str]) -> int:
         report = _with_transmissions(report, scenario, sittings, clamped)
     files = [sitting.trace for sitting in (*sittings, *clamped) if sitting.trace]
     if report.bounded:
-        tables = [_table(e, scenario, i, report.transmissions) for i, e in enumerate(report.axes)]
+        tables, end = list[str](), 0
+        for device in scenario.device:
+            own, end = slice(end, end + len(device.free)), end + len(device.free)
+            tables.append(_table(device, report.axes[own], report.transmissions and report.transmissions[own]))
         files.append(write(out / "devices.toml", "\n".join(tables)))
     shown = [_figures(report), *([_bounds(report.transmissions)] if report.transmissions else [])]
     render.publish(args, report, shown, report.lines(), out, files)
@@ -183,7 +186,7 @@ def _sitting(
 
     With `clamped` the excitation is a chirp at this share of the force, and the function estimates nothing.
     """
-    undamped = scenario.replace(delta=(1e-6,) * scenario.channels)  # No damping is required, as it is unknown.
+    undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # No damping is required, as it is unknown.
     r = scenario.lever  # the options state figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # stops a device that is lighter than declared
@@ -258,26 +261,43 @@ def _with_transmissions(
     return replace(report, transmissions=bounds)
 
 
-def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Write one [[device]] table for a scenario file, with the scenario's transmission if none was identified."""
-    device, mass = scenario.axis_devices[i], e.friction.mass
-    lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {_floored(e.delta, 6)}"]
+def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
+    """Write a device's [[device]] table for a scenario file, with its own transmission if none was identified.
+
+    `axes` and `bounds` have one entry per free axis. Masses and transmission of several axes are their means.
+    """
+
+    def listed(figures: Sequence[str]) -> str:
+        by_axis = dict(zip(device.free, figures, strict=True))
+        each = [by_axis.get(k, figures[0]) for k in range(device.axes)]  # a clamped axis has some number, too
+        return f"[{', '.join(each)}]" if device.axes > 1 else figures[0]
+
+    def mean(figures: Iterable[float]) -> float:
+        return sum(figures) / len(axes)
+
+    mass, speed = mean(e.friction.mass for e in axes), min(e.viscosity.speed for e in axes)
+    lines = ["[[device]]", f"damping = {listed([f'{e.viscous:.6g}' for e in axes])}"]
+    lines.append(f"delta = {listed([_floored(e.delta, 6) for e in axes])}")
     comment = in_unit("# [m/s] of the record: delta is not known beyond it")
-    lines.append(f"credible_speed = {_floored(e.viscosity.speed, 3)}  {comment}")
+    lines.append(f"credible_speed = {_floored(speed, 3)}  {comment}")
+    if device.axes > 1:
+        lines += [f"axes = {device.axes}", f"clamped = {list(device.clamped)}"]
     if isinstance(device, RigidDevice):
         return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
     if bounds:
-        known = bounds[i]
         names = "motor_mass", "handle_mass", "transmission_stiffness", "transmission_damping"
-        lines += ['kind = "compliant"', *(f"{name} = {getattr(known, name):.6g}" for name in names)]
+        figures = {name: [getattr(known, name) for known in bounds] for name in TransmissionBounds.__annotations__}
+        lines += ['kind = "compliant"', *(f"{name} = {mean(figures[name]):.6g}" for name in names)]
         lines += ["[device.guaranteed]  # with 95 % confidence, at the forces of the record"]
         least, most = ("motor_mass_min", "transmission_damping_min"), "transmission_damping_max"
-        lines += [f"{name} = {_floored(getattr(known, name), 6)}" for name in least]
-        lines += [f"{most} = {-float(_floored(-getattr(known, most), 6))}"]
-        stiffest = -float(_floored(-known.transmission_stiffness_max, 0))
+        lines += [f"{name} = {_floored(min(figures[name]), 6)}" for name in least]
+        lines += [f"{most} = {-float(_floored(-max(figures[most]), 6))}"]
+        stiffest = -float(_floored(-max(figures["transmission_stiffness_max"]), 0))
         return "\n".join([*lines, f"transmission_stiffness_max = {stiffest}", ""])
-    if (transmission := e.transmission) is not None:
-        motor, handle, stiffness = transmission.motor_mass, transmission.handle_mass, transmission.stiffness
+    known = [e.transmission for e in axes if e.transmission]
+    if len(known) == len(axes):
+        motor, handle = mean(each.motor_mass for each in known), mean(each.handle_mass for each in known)
+        stiffness = mean(each.stiffness for each in known)
     else:
         lines.insert(0, "# no transmission explained the record: its stiffness and how masses are shared are declared")
         motor = mass * device.motor_mass / (device.motor_mass + device.handle_mass)

@@ -245,11 +245,11 @@ class _EmulatedPlant:
 
 
 def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scenario:
-    """Return the scenario without hands and without the tap.
+    """Return the scenario without hands, persons and tap.
 
     Each handle carries a damper of `damping` [N s/m] and a `mass` [kg]; a large one clamps the handle.
     """
-    return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * scenario.channels, tap=None)
+    return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * len(scenario.device), person=(), tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:

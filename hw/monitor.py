@@ -515,26 +515,35 @@ class EncoderNoise:
 
 
 class Expected:
-    """How the encoders move under a force while the handles are free, or held by the scenario's hands."""
+    """How the encoders move under a force while the handles are free, or held by the scenario's hands.
+
+    For free handles, it also tells how they would move under hands that weigh as much as the devices.
+    """
 
     def __init__(self, scenario: Scenario, held: bool) -> None:
-        """Build the plant; the handles are free unless they are `held`."""
-        self.held = held
-        empty = (Human((Link(0.0, 0.0, 0.0),)),) * scenario.channels
-        scene = build(scenario.device, scenario.human, scenario.person) if held else build(scenario.device, empty)
-        plant = hold(scene.plant, scenario.T)
-        self._A, self._B = plant.A, -plant.B[:, scene.outside :]  # the wire carries -f
+        """Build the plants; the handles are free unless they are `held`."""
+        self.held, devices = held, scenario.device
+        if held:
+            scenes = [build(devices, scenario.human, scenario.person)]
+        else:
+            weights = [Link(sum(device.bodies.values()), 0.0, 0.0) for device in devices]
+            hands = [Human((Link(0.0, 0.0, 0.0),))] * len(devices), [Human((weight,)) for weight in weights]
+            scenes = [build(devices, each) for each in hands]
+        plants = [hold(scene.plant, scenario.T) for scene in scenes]
+        #: A and B of each plant; the wire carries -f
+        self._plants = [(p.A, -p.B[:, scene.outside :]) for p, scene in zip(plants, scenes, strict=True)]
         self.mass = [sum(device.bodies.values()) for device in scenario.axis_devices]  # (m,) [kg]
         self.rest()
 
     def rest(self) -> None:
         """Begin at rest."""
-        self._state = np.zeros(len(self._A))
+        self._states = [np.zeros(len(A)) for A, _ in self._plants]
 
-    def advance(self, axis: int, force: float) -> float:
-        """Hold a motor's force [N] for a tick and return the position [m] of its axis at the end."""
-        self._state = self._A @ self._state + self._B[:, axis] * force
-        return float(self._state[axis])
+    def advance(self, axis: int, force: float) -> tuple[float, float]:
+        """Hold a motor's force [N] for a tick and return the positions [m] of its axis, as expected and with a load."""
+        states = zip(self._plants, self._states, strict=True)
+        self._states = [A @ state + B[:, axis] * force for (A, B), state in states]
+        return float(self._states[0][axis]), float(self._states[-1][axis])
 
 
 class EncoderTest:
@@ -548,7 +557,9 @@ class EncoderTest:
     later than expected shows a hidden delay, because friction and hands make it come earlier.
 
     At the end of a session (`alive`) unknown hands may hold the handles and move them. Then it suffices that the axis
-    swings in the rhythm of the force at any phase. An axis with a dead motor does not.
+    swings in the rhythm of the force at any phase. An axis with a dead motor does not. A smaller motion is refused only
+    where it has the shape of a free handle and not that of one whose hand weighs as much as the device: the mode of a
+    transmission tells them apart, and a rigid device does not.
     """
 
     def __init__(
@@ -576,7 +587,7 @@ class EncoderTest:
     def _next_axis(self) -> None:
         self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._alive else 0
         self._expected.rest()
-        self._rows: list[tuple[float, ...]] = []  # tick, expected position [m] and counts (m,) in this block
+        self._rows: list[tuple[float, ...]] = []  # tick, two expected positions [m] and counts (m,) in this block
         self._pushed = 0.0  # [N] largest force on the axis in this block
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
@@ -588,7 +599,7 @@ class EncoderTest:
         pushed = acted.applied[self._axis] * self._units.force_step[self._axis] if acted else 0.0
         position = [self._expected.advance(self._axis, pushed) for _ in range(ticks)][-1]
         self._last, self._ticks, self._pushed = state, self._ticks + ticks, max(self._pushed, abs(pushed))
-        self._rows.append((self._ticks, position, *state.counts))
+        self._rows.append((self._ticks, *position, *state.counts))
         before, half = max(1, round(_TEST_BEFORE / self._T)), max(2, round(_TEST_HALF / self._T))
         if self._ticks > before + 4 * half:
             if self._answered():
@@ -598,7 +609,7 @@ class EncoderTest:
             elif self._block == _BLOCKS - 1:
                 raise SafetyStop(self._unanswered())
             else:
-                self._ticks, self._block, self._rows = before, self._block + 1, [(before, position, *state.counts)]
+                self._ticks, self._block, self._rows = before, self._block + 1, [(before, *position, *state.counts)]
                 self._pushed = 0.0
         since = self._ticks - before
         if since <= 0:
@@ -607,15 +618,16 @@ class EncoderTest:
         sign = -1 if (since + half // 2) // half % 2 else 1
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
-    def _compare(self) -> tuple[Array, Array, float, float]:
+    def _compare(self) -> tuple[Array, Array, float, float, bool]:
         """Compare all motions with the expected one.
 
-        Returns size and fit (m,) of all motions; size at any phase and delay [ticks] of the tested axis.
+        Returns size and fit (m,) of all motions; of the tested axis the size at any phase, the delay [ticks], and
+        whether it moves as the expected handle does and as no handle with a load.
         """
-        t, expected, *counts = np.array(self._rows).T
+        t, expected, loaded, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
-        parts = expected, np.cumsum(expected), np.gradient(expected, t)
-        wanted, shifted, rate = (a - smooth @ (smooth.T @ a) for a in parts)
+        parts = expected, np.cumsum(expected), np.gradient(expected, t), loaded
+        wanted, shifted, rate, heavy = (a - smooth @ (smooth.T @ a) for a in parts)
         moved = np.array(counts).T * self._units.encoder_step
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
@@ -626,15 +638,17 @@ class EncoderTest:
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
         same, ahead = np.linalg.lstsq(np.stack([wanted, rate], axis=1), moved[:, self._axis], rcond=None)[0]
         late = -float(ahead / same) if same else 0.0  # [ticks]
-        return size, fit, float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power)), late
+        alike = (heavy @ moved[:, self._axis]) ** 2 / ((heavy @ heavy or 1.0) * own[self._axis])
+        swing = float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power))
+        return size, fit, swing, late, bool(fit[self._axis] > _FIT > alike)
 
     def _counted(self, i: int) -> float:
         """Return the range of encoder i in this block [counts]."""
-        return float(np.ptp([row[2 + i] for row in self._rows]))
+        return float(np.ptp([row[3 + i] for row in self._rows]))
 
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
-        axis, name, (size, fit, swing, late) = self._axis, f"axis {self._axis + 1}", self._compare()
+        axis, name, (size, fit, swing, late, free) = self._axis, f"axis {self._axis + 1}", self._compare()
         moves = [self._counted(i) > self._still[i] for i in range(len(self._cap))]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
@@ -644,7 +658,7 @@ class EncoderTest:
         if follows[axis] and size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
-        if follows[axis] and not (0 if loose else 1 / _TEST_RATIO) <= size[axis] <= _TEST_RATIO:
+        if follows[axis] and not (0 if loose and not free else 1 / _TEST_RATIO) <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong")
         if follows[axis] and others:

@@ -652,13 +652,23 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 
 
 def _require_keys(raw: dict[str, Any]) -> None:
-    """Raise ValueError if a key that every scenario needs is missing.
+    """Raise ValueError if a key is missing that every scenario or every rotary device needs.
 
     Files with unknown keys pass this check, because `msgspec.convert` reports those keys.
     """
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
+    devices = raw.get("device") if raw.get("unit") == "rad" else None
+    for i, table in enumerate(devices if isinstance(devices, list) else [devices] if devices else (), start=1):
+        given = table if isinstance(table, dict) and "device" not in table else {}
+        needed = (
+            ("motor_mass", "handle_mass", "transmission_stiffness") if given.get("kind") == "compliant" else ("mass",)
+        )
+        if missing := [name for name in (*needed, "damping", "force_limit", "credible_speed") if name not in given]:
+            raise ValueError(
+                f"device #{i}: missing {', '.join(missing)}: a rotary device has no defaults, nor a catalogue"
+            )
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:

@@ -221,6 +221,12 @@ CASES = (
         )
     ),
     *(
+        Fault(f"{what} of axis {axis}, free, then the end", G.STOPPED, cause, (fault,), free=True, **_ENDED)
+        for axis in (1, 2)
+        for what, kind in (("encoder scale 0.4", "scale"), ("motor 0.4 times as strong", "motor"))
+        for fault, cause in ((f"axis{axis}:{kind}=0.4@0.6", f"axis {axis} moves 0.4.* times as far"),)
+    ),
+    *(
         Fault(
             f"encoder {axis} is read {n} ticks late before",
             G.STOPPED,

@@ -108,6 +108,12 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
         (("radius = 0.15", "radius = 3"), "radius is 3, allowed are"),
         (('unit = "rad"', ""), 'radius is 0.15, which is for unit = "rad" only'),
         (('"rad"', '"deg"'), "unit"),
+        (("credible_speed = 10.0", ""), "device #1: missing credible_speed: a rotary device has no defaults"),
+        (
+            ('kind = "rigid"', 'kind = "compliant"'),
+            "device #1: missing motor_mass, handle_mass, transmission_stiffness",
+        ),
+        (('kind = "rigid"', 'device = "omega.3"'), "nor a catalogue"),
         (("mass = 0.02\ndamping = 0.1", "mass = 1e9\ndamping = 0.1"), "mass is 1e+09, allowed are 1e-06 to 1000 kg m2"),
     ],
 )

@@ -12,7 +12,8 @@ from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import EncoderMonitor, EncoderNoise, EncoderTest, Expected, LinkSettings
 from haptic_loop.hw.protocol import Phase, SafetyStop, State
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Session
+from haptic_loop.hw.session import Session, session_for
+from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.scenario import InputError, load
 
 T = 1.2e-3
@@ -208,13 +209,46 @@ def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
     assert session.cause.startswith(f"axis {axis} moves {scale} times as far as expected")
 
 
+@pytest.mark.parametrize(("mass", "damping", "stiffness"), [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
+def test_hands_at_the_end_are_no_wrong_scale(scenario, rungs, mass, damping, stiffness):
+    """A hand that takes the handle during the session leaves less than half of the motion, in another shape."""
+    hand = Human((Link(mass, damping, stiffness),))
+    held = Emulator(scenario.replace(human=(hand, hand), tap=None)).plant
+    free = nobody(scenario)
+
+    def grasp(session, now):
+        states, rehearsal.emulator.plant = rehearsal.emulator.plant.s, held
+        held.s[:4] = states[:4]
+        return ()
+
+    def stop(session, now):
+        return session.stop("asked to", now)
+
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=False))
+    rehearsal = Rehearsal(session, Emulator(free), lambda ages: rungs, actions=[(0.7, grasp), (0.9, stop)])
+    rehearsal.run_until_armed(1.9)
+    assert session.stage == Stage.FINISHED, session.cause
+
+
+def test_devices_of_three_axes_run_without_hands():
+    """Six channels of two free devices: the first tick of each moves its mass alone by F T^2 / 2 m."""
+    space = load("omega-space")
+    session = session_for(space, LinkSettings(held=False))
+    for axis, mass in enumerate(session._expected.mass):
+        session._expected.rest()
+        far, loaded = session._expected.advance(axis, 1.0)
+        assert far == pytest.approx(space.T**2 / (2 * mass), rel=0.01)
+        assert loaded == pytest.approx(far / 2, rel=0.01)
+    assert nobody(space).channels == len(session._expected.mass) == 6
+
+
 def test_the_expected_motion_is_the_closed_form():
     """A mass from rest under forces that change at every tick: x is summed twice, in closed form."""
     expected, draw = Expected(free_pair(), False), np.random.default_rng(1)
     x = v = 0.0
     for force in draw.normal(0.0, 0.3, 200):
         x, v = x + v * T + force * T**2 / 0.5, v + force * T / 0.25
-        assert expected.advance(1, force) == pytest.approx(x, rel=1e-5, abs=1e-12)
+        assert expected.advance(1, force)[0] == pytest.approx(x, rel=1e-5, abs=1e-12)
 
 
 # noise

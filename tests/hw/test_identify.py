@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from runpy import run_path
@@ -11,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from haptic_loop.cli.identify import _table
 from haptic_loop.cli.identify import main as identify_command
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
@@ -309,6 +311,27 @@ def test_damping_in_one_sitting_is_refused(tmp_path):
     for axis in report["axes"]:
         assert 0.2 < axis["friction"]["delta"] <= 1.37  # so short a record excludes no memory that is large
         assert axis["friction"]["coulomb"] == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_device_of_three_axes_is_one_table():
+    """Each axis in the place of its number, a clamped one with some number, the bound of the slowest record."""
+    for clamped, figures in (((), (1.0, 1.1, 1.2)), (("y",), (1.0, 1.0, 1.1))):
+        device = RigidDevice(axes=3, clamped=clamped)
+        axes = [
+            SimpleNamespace(
+                viscous=1.0 + 0.1 * i,
+                delta=0.5,
+                friction=SimpleNamespace(mass=0.2 + 0.1 * i),
+                viscosity=SimpleNamespace(speed=0.6 - 0.1 * i),
+                transmission=None,
+            )
+            for i in range(len(device.free))
+        ]
+        text = _table(device, axes, None)
+        read = msgspec.convert(tomllib.loads(text)["device"][0], RigidDevice)
+        assert (read.free, read.damping, read.delta) == (device.free, figures, (0.5,) * 3)
+        assert read.mass == pytest.approx(0.2 + 0.05 * (len(axes) - 1))
+        assert read.credible_speed == pytest.approx(0.6 - 0.1 * (len(axes) - 1), abs=1e-3)
 
 
 @pytest.mark.parametrize("axis", [0, 1])

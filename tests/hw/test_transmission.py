@@ -111,7 +111,7 @@ def test_written_bounds_are_rounded_outwards():
     axis = SimpleNamespace(
         viscous=1.37, delta=1.36, viscosity=SimpleNamespace(speed=0.5), friction=SimpleNamespace(mass=1)
     )
-    (written,) = msgspec.toml.decode(_table(axis, known, 0, [found]))["device"]
+    (written,) = msgspec.toml.decode(_table(known.device[0], [axis], [found]))["device"]
     device = known.replace(device=[written] * 2).device[0]
     assert device.guaranteed.motor_mass_min <= found.motor_mass_min
     assert device.guaranteed.transmission_stiffness_max >= found.transmission_stiffness_max
