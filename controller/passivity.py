@@ -18,7 +18,7 @@ _INFLATED = 1.001  # factor on norms against rounding
 _TOGETHER = 2**18  # largest number of entries of resolvents in memory
 
 
-def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, float, float]:
+def hermitian_floor(G: Lti, enough: float, unwanted: float, rounding: float = 1.0) -> tuple[float, float, float]:
     """Bound the least eigenvalue of He G(e^jw) from below over all w, by intervals that are halved where necessary.
 
     R = (zI - A)^-1 at the middle of an interval bounds |G'| and |G''| on it. Near a narrow resonance |R| is large and
@@ -30,6 +30,7 @@ def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, floa
         G: A stable block of floats. It is real, so that the interval [0, pi] is enough.
         enough: The lower bound at which an interval is not halved any more.
         unwanted: The search ends at a frequency whose least eigenvalue is below this number.
+        rounding: A factor on the bound of the rounding errors, above 1 if A and B were computed with a larger error.
 
     Returns:
         (the lower bound, the least eigenvalue that was evaluated, its frequency [rad/sample]).
@@ -42,7 +43,7 @@ def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, floa
     floor, least, where = np.inf, np.inf, 0.0
     budget = int(_EVALUATIONS / max(1.0, G.order / 8) ** 1.5)
     while middle.size:
-        lower, here = _bounded(G, norms, lost, middle, half)
+        lower, here = _bounded(G, norms, lost, middle, half, rounding)
         worst = int(np.argmin(here))
         if here[worst] < least:
             least, where = float(here[worst]), float(middle[worst])
@@ -62,10 +63,11 @@ def _balanced(G: Lti) -> Lti:
         return G
     import scipy.linalg  # slow to load
 
+    large = np.abs(G.A) > 16 * _UNIT * np.abs(G.A).max()  # Rounding errors of zeros must not decide the scales.
     with np.errstate(invalid="ignore"):  # SciPy casts unused entries if A is nilpotent
-        A, scale = scipy.linalg.matrix_balance(G.A, permute=False)
+        _, scale = scipy.linalg.matrix_balance(np.where(large, G.A, 0.0), permute=False)
     size = np.diag(scale)
-    return Lti(A, G.B / size[:, None], G.C * size, G.D, G.T)
+    return Lti(G.A * size / size[:, None], G.B / size[:, None], G.C * size, G.D, G.T)
 
 
 _IDLE = 1e-13  # smaller singular values, relative to the largest one, belong to idle directions
@@ -111,7 +113,7 @@ def _norms(G: Lti) -> list[tuple[Array, Array]]:
 
 
 def _bounded(
-    G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array
+    G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array, rounding: float
 ) -> tuple[Array, Array]:
     """Return lower bounds (k,) for |w' - w| <= half, and the least eigenvalues (k,) at w."""
     A, B, C, D = G.A, G.B, G.C, G.D
@@ -134,7 +136,7 @@ def _bounded(
         growth = 1 / np.maximum(1 - half * reach, 1 - _REACH)
         curvature = growth**2 * left * right * (1 + 2 * growth * reach)
         lower = np.maximum(lower, np.where(half * reach <= _REACH, ends - half**2 * curvature / 2, -np.inf))
-    lower -= 16 * (n + m) * _UNIT * error
+    lower -= rounding * 16 * (n + m) * _UNIT * error
     if lost:  # |R| grows at most twofold on an interval
         lower = np.minimum(lower, 0) - 2 * (_size(CR) * lost[0] + _size(RB) * lost[1]) - lost[2]
     return lower, here

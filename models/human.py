@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, Self
 
@@ -19,6 +18,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.models.device import AXES, require, symmetric
 
 _Array = NDArray[np.floating[Any]]
@@ -78,74 +79,22 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected a stable A")
-    floor, least, w, size = _real_part(A, B, C, D)
-    hertz = f"{w / (2 * np.pi):.6g} Hz"
+    import scipy.linalg  # slow to load
+
+    scale = np.diag(scipy.linalg.matrix_balance(A, permute=False)[1]) if n else np.ones(0)  # powers of two
+    A, B, C, one = A * scale / scale[:, None], B / scale[:, None], C * scale, np.eye(n)
+    # With s = speed (z - 1)/(z + 1) the frequencies w = speed tan(t/2) become the unit circle, z = e^jt.
+    speed = float(np.exp(np.log(np.abs(np.linalg.eigvals(A))).mean())) if n else 1.0
+    into = np.linalg.inv(speed * one - A)
+    G = Lti((speed * one + A) @ into, into @ B, C @ (into @ (2 * speed * one)), D + C @ into @ B, 1.0)
+    size = float(np.abs(G.at(np.exp(1j * np.pi * (np.arange(64) + 0.5) / 64))).mean())
+    rounding = 1 + float(np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # of the division by speed I - A
+    floor, least, t = hermitian_floor(G, -_ROUNDING * size, -_ROUNDING * size, rounding)
+    hertz = f"{speed * math.tan(t / 2) / (2 * np.pi):.6g} Hz"
     if not least >= -_ROUNDING * size:
         raise ValueError(f"impedance: not passive, Re Z is {least:g} N s/m at {hertz}")
     if not floor >= -_ROUNDING * size:
         raise ValueError(f"impedance: passivity cannot be decided, the margin is too small near {hertz}; add damping")
-
-
-_FIRST, _EVALUATIONS = 64, 1 << 15  # number of intervals at the start, and largest number of evaluated intervals
-_REACH = 0.5  # largest half-width of an interval, in units of the reciprocal norm of the resolvent
-_UNIT = 2.0**-53
-
-
-def _real_part(A: _Array, B: _Array, C: _Array, D: _Array) -> tuple[float, float, float, float]:
-    """Bound Re Z from below at all frequencies, not only at those of a grid.
-
-    The substitution w = a tan(t/2) turns Z into a function G(z) on the unit circle, z = e^jt. On an interval of
-    half-width h around t0, Re G is at least its tangent less h^2/2 max |G''|. R = (zI - A)^-1 at t0 gives a bound on
-    |G''|, which is large near a narrow resonance. Intervals whose lower bound is negative are halved. A bound on the
-    rounding errors is subtracted.
-
-    Returns:
-        The lower bound, the least computed value [N s/m], its frequency [rad/s] and the mean of |Z| [N s/m].
-    """
-    import scipy
-
-    n, one = A.shape[0], np.eye(A.shape[0])
-    if not n:
-        return D.item(), D.item(), 0.0, abs(D.item())
-    scale = np.diag(scipy.linalg.matrix_balance(A, permute=False)[1])  # powers of two
-    A, B, C = A * scale / scale[:, None], B / scale[:, None], C * scale
-    states, noise = [one], B @ B.T + 1e-4 * np.linalg.norm(B) ** 2 * one
-    with suppress(np.linalg.LinAlgError):
-        states.append(np.linalg.cholesky(scipy.linalg.solve_continuous_lyapunov(A, -noise)))
-    speed = np.exp(np.log(np.abs(np.linalg.eigvals(A))).mean())
-    into = np.linalg.inv(speed * one - A)
-    lost = 16 * (n + 1) * _UNIT * (1 + np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # rounding error of A
-    A, B = (speed * one + A) @ into, into @ B
-    C, D = C @ (one + A), D + C @ B
-    half = np.full(_FIRST, np.pi / _FIRST / 2)
-    t, budget = half + np.linspace(0, np.pi, _FIRST + 1)[:-1], _EVALUATIONS
-    floor, least, where, size = np.inf, np.inf, 0.0, 0.0
-    while t.size:
-        z = np.exp(1j * t)[:, None, None]
-        R = np.linalg.inv(z * one - A)
-        CR, RB = C @ R, R @ B
-        value, slope = (CR @ B + D)[:, 0, 0], (-1j * z * (CR @ RB))[:, 0, 0]
-        size, sizes = size or float(np.abs(value).mean()), [np.linalg.norm(M, axis=(1, 2)) for M in (CR, R, RB)]
-        error = lost * (sizes[0] * sizes[2] * (1 + half * sizes[1]) + np.abs(value))
-        bound = np.full(t.size, -np.inf)
-        for L in states:
-            back = np.linalg.inv(L)
-            reach, left, right = (1.001 * np.linalg.norm(M, axis=(1, 2)) for M in (back @ R @ L, CR @ L, back @ RB))
-            growth = 1 / np.maximum(1 - half * reach, 1 - _REACH)
-            bend = growth**2 * left * right * (1 + 2 * growth * reach)
-            lower = value.real - half * np.abs(slope.real) - half**2 * bend / 2 - error
-            bound = np.maximum(bound, np.where(half * reach <= _REACH, lower, -np.inf))
-        k = int(np.argmin(value.real))
-        if value.real[k] < least:
-            least, where = float(value.real[k]), float(t[k])
-        rough = bound < -_ROUNDING * size
-        budget -= 2 * int(rough.sum())
-        if budget < 0 or least < -_ROUNDING * size:
-            rough[:] = False
-        floor = min(floor, float(bound[~rough].min(initial=np.inf)))
-        half = np.repeat(half[rough] / 2, 2)
-        t = np.repeat(t[rough], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
-    return floor, least, float(speed * np.tan(where / 2)), size
 
 
 @dataclass(frozen=True, eq=False)
