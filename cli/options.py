@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import msgspec
 
 from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.units import speak
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, DesignFailed
-from haptic_loop.models.device import MOST_DAMPING, Guaranteed
+from haptic_loop.models.device import MOST_DAMPING
 from haptic_loop.sim.scenario import (
     CASES,
     DEFAULT,
@@ -461,13 +461,13 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     return scenario.replace(**changes) if changes else scenario
 
 
-def _known_device(text: str) -> Guaranteed:
+def _known_device(text: str) -> DeviceBounds:
     """Parse MASS,K_MAX,B_MIN,B_MAX. Raises ArgumentTypeError."""
     values = several(float)(text)
     if len(values) != 4:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected MASS,K_MAX,B_MIN,B_MAX")
     try:
-        return Guaranteed(*values)
+        return DeviceBounds(*values)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

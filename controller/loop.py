@@ -57,17 +57,26 @@ class DelayRange(Strict, frozen=True):
 
 
 class DeviceBounds(Strict, frozen=True):
-    """Guaranteed bounds of a device's motor and transmission; a proof holds for every device within them."""
+    """Guaranteed bounds of a device's motor and transmission, `[device.guaranteed]` of a scenario.
+
+    A known-device proof holds for every device within them. The transmission, a spring and a damper in parallel, joins
+    the motor to everything else. Simulated devices must lie within the bounds.
+    """
 
     motor_mass_min: _Positive  # [kg] mass that moves rigidly with the motor's shaft, at the encoder's coordinate
-    transmission_stiffness_max: _Positive  # [N/m] between the motor and everything behind it
-    transmission_damping_min: _Positive  # [N s/m] in parallel to that stiffness
+    transmission_stiffness_max: _Positive  # [N/m]
+    transmission_damping_min: _Positive  # [N s/m]
     transmission_damping_max: _Positive  # [N s/m]
 
     def __post_init__(self) -> None:
-        least, most = self.transmission_damping_min, self.transmission_damping_max
-        if least > most:
-            raise ValueError(f"transmission_damping_min is {least:g} N s/m, above transmission_damping_max = {most:g}")
+        for name, low, high, unit in (
+            ("motor_mass_min", 1e-6, 1e3, "kg"),
+            ("transmission_stiffness_max", 1.0, 1e9, "N/m"),
+            ("transmission_damping_min", 1e-6, 1e5, "N s/m: a lossless transmission guarantees nothing"),
+            ("transmission_damping_max", self.transmission_damping_min, 1e5, "N s/m"),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} is {getattr(self, name):g}, allowed are {low:g} to {high:g} {unit}")
 
 
 class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of the digest

@@ -12,6 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.controller.loop import DeviceBounds
+
 # ----------------------------------------------------------------------------------------------------
 # Physical quantities with their units and the range in which a value makes sense.
 
@@ -66,30 +68,6 @@ def symmetric(field: str, value: Any, axes: int) -> _Matrix:
 
 def _listed(value: Any) -> Any:
     return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
-
-
-class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """Guaranteed bounds of a device's motor and transmission, `[device.guaranteed]` of a scenario.
-
-    The bounds hold for the real device, and the simulated values must lie within them. The known-device conditions use
-    them: the transmission, a spring and a damper in parallel, joins the motor to everything else.
-    """
-
-    motor_mass_min: float  # [kg] total mass of the parts that move rigidly with the motor's shaft
-    transmission_stiffness_max: float  # [N/m]
-    transmission_damping_min: float  # [N s/m]
-    transmission_damping_max: float  # [N s/m]
-
-    def __post_init__(self) -> None:
-        require("guaranteed.motor_mass_min", self.motor_mass_min, 1e-6, 1e3, "kg")
-        require("guaranteed.transmission_stiffness_max", self.transmission_stiffness_max, 1.0, 1e9, "N/m")
-        if self.transmission_damping_min == 0:
-            raise ValueError(
-                "guaranteed.transmission_damping_min is 0 N s/m: a lossless transmission guarantees nothing"
-            )
-        require("guaranteed.transmission_damping_min", self.transmission_damping_min, 1e-6, 1e5, "N s/m")
-        least = self.transmission_damping_min
-        require("guaranteed.transmission_damping_max", self.transmission_damping_max, least, 1e5, "N s/m")
 
 
 class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
@@ -164,7 +142,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
     credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted. Assumed: about three times the
     # 0.7 m/s that teleoperation masters exceed in a fifth of the fast part of a tapping task (abstract of a study)
-    guaranteed: Guaranteed | None = None  # bounds that the known-device conditions use
+    guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
@@ -214,7 +192,7 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping
     credible_speed: float = 2.0  # [m/s] as for a compliant device
-    guaranteed: Guaranteed | None = None  # refused, since a rigid device has no transmission
+    guaranteed: DeviceBounds | None = None  # refused, since a rigid device has no transmission
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 

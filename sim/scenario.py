@@ -301,8 +301,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def known_devices(self) -> tuple[DeviceBounds, ...] | None:
         """The guaranteed bounds of every device, None unless all devices have some."""
-        known = [device.guaranteed for device in self.axis_devices]
-        return None if None in known else tuple(DeviceBounds(**msgspec.structs.asdict(each)) for each in known if each)
+        known = tuple(device.guaranteed for device in self.axis_devices if device.guaranteed)
+        return known if len(known) == self.channels else None
 
     @property
     def usual_latency(self) -> list[float] | None:

@@ -13,10 +13,10 @@ from scipy.linalg import expm
 
 from haptic_loop.cli.identify import _table
 from haptic_loop.cli.identify import main as identify_command
+from haptic_loop.controller.loop import DeviceBounds
 from haptic_loop.hw.friction import friction
 from haptic_loop.hw.identify import chirp
 from haptic_loop.hw.transmission import transmission_bounds
-from haptic_loop.models.device import Guaranteed
 from haptic_loop.sim.scenario import load
 
 T, STEP, FAR = 1.2e-3, 5e-6, 1e9
@@ -130,7 +130,7 @@ def test_the_command_writes_bounds_for_known_device(tmp_path):
     written = msgspec.toml.decode(text)["device"]
     again = known.replace(device=written)  # what is simulated lies within the bounds
     for device in again.device:
-        assert isinstance(device.guaranteed, Guaranteed)
+        assert isinstance(device.guaranteed, DeviceBounds)
         assert 0.057 < device.guaranteed.motor_mass_min <= 0.06
         assert 14500 <= device.guaranteed.transmission_stiffness_max < 15000
         least, most = device.guaranteed.transmission_damping_min, device.guaranteed.transmission_damping_max
