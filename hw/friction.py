@@ -124,9 +124,11 @@ def _bristle(x: Array, reach: float) -> Array:
     """Return friction (N,) within +-1 that displacements x (N,) [m] build up over `reach` [m] before they slip."""
     z, out = 0.0, []
     for moved in np.diff(x, prepend=x[0]).tolist():
-        z = max(-reach, min(reach, z + moved))
-        out.append(z / reach)
-    return np.array(out)
+        z += moved
+        if not -reach <= z <= reach:
+            z = reach if z > 0 else -reach
+        out.append(z)
+    return np.array(out) / reach
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
@@ -154,7 +156,8 @@ class _Balance:
         self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # independent filtered samples
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
-        self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
+        windows = [_window(n, self.sigma, T) for n in range(5)]
+        self._filters = [np.fft.fft(window, self._length) for window in windows]
         self.speed = _filtered(self.x, 1, min(_speed_window(step, T), self.sigma / 2), T)
         applied, rate, bend = _held(force, self.sigma, T)
         self.applied = applied[self.rows]
@@ -164,29 +167,31 @@ class _Balance:
         drift = t[self.rows] - t[self.rows].mean()
         lag = [rate[self.rows], -bend[self.rows]]
         self.common = [acceleration, velocity, zero + 1.0, drift, place, *lag, jerk, snap]
-        self.drag = self.speed * np.abs(self.speed)
+        self._drag = self._of(self.speed * np.abs(self.speed), 0, 2)
 
-    def _complex(self, signal: NDArray[np.complex128] | Array, *orders: int) -> list[NDArray[np.complex128]]:
+    def _complex(self, signal: NDArray[np.complex128], *orders: int) -> list[NDArray[np.complex128]]:
         """Return derivatives (rows,) of the filtered signal (N,)."""
         spectrum = np.fft.fft(signal, self._length)
         return [np.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
 
     def _of(self, signal: Array, *orders: int) -> list[Array]:
-        return [one.real for one in self._complex(signal, *orders)]
+        """Return derivatives (rows,) of the filtered real signal (N,), by transforms of half the length."""
+        spectrum, half = np.fft.rfft(signal, self._length), self._length // 2 + 1
+        each = (np.fft.irfft(spectrum * self._filters[order][:half], self._length) for order in orders)
+        return [one[self.rows + self._reach] for one in each]
 
     def laws(self, step: float) -> list[tuple[float, float, Array]]:
         """Return slip [m/s], reach [m] and dry friction (N,) within +-1 of every law; either slip or reach is 0."""
         bristles = [(0.0, reach, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
         return [(slip, 0.0, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 
-    def matrix(self, dry: Array, periodic: list[_Pair]) -> Callable[[float], Array]:
+    def matrix(self, dry: Array) -> Callable[[float], Array]:
         """Return the columns (rows, p) of the balance, given the weight of friction's second derivative."""
-        laws = [self.drag, dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
-        plain, bent = zip(*(self._of(law, 0, 2) for law in laws), strict=True)
+        laws = [dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
+        plain, bent = zip(self._drag, *(self._of(law, 0, 2) for law in laws), strict=True)
 
         def columns(mode: float) -> Array:
-            friction = [one + mode * two for one, two in zip(plain, bent, strict=True)]
-            return np.hstack([np.stack([*self.common, *friction], axis=1), *(pair.columns for pair in periodic)])
+            return np.stack([*self.common, *(one + mode * two for one, two in zip(plain, bent, strict=True))], axis=1)
 
         return columns
 
@@ -220,24 +225,32 @@ class _Fit:
         return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
 
 
-def _solve(columns: Array, force: Array) -> Array:
+def _triangle(rows: Array) -> Array:
+    """Return the triangle of the QR factorization of rows [columns, force]: all that least squares needs of them."""
+    triangle: Any = np.linalg.qr(rows, mode="r")
+    return triangle
+
+
+def _solve(triangle: Array) -> Array:
     """Solve least squares with some parameters that must not be negative."""
     import scipy
 
-    scale = np.linalg.norm(columns, axis=0) + 1e-300
-    q, r = np.linalg.qr(columns / scale)
-    low = np.full(columns.shape[1], -np.inf)
+    r, right = triangle[:-1, :-1], triangle[:-1, -1]
+    scale = np.linalg.norm(r, axis=0) + 1e-300
+    free = scipy.linalg.solve_triangular(r / scale, right, check_finite=False)
+    if (free[list(_NOT_NEGATIVE)] >= 0).all():
+        return free / scale
+    low = np.full(len(r), -np.inf)
     low[list(_NOT_NEGATIVE)] = 0.0
-    return scipy.optimize.lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
+    return scipy.optimize.lsq_linear(r / scale, right, (low, np.inf), method="bvls").x / scale
 
 
-def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:
-    columns = balance.matrix(dry, periodic)
-    at = columns(0.0)
-    p = _solve(at, balance.applied)
-    for _ in range(_ROUNDS - 1):
-        at = columns(p[_MODE])
-        p = _solve(at, balance.applied)
+def _fitted(balance: _Balance, matrix: Callable[[float], Array], periodic: list[_Pair]) -> _Fit:
+    """Fit one law of dry friction, whose columns are those of `matrix`, and the periodic disturbances."""
+    p = at = np.zeros(_MODE + 1)
+    for _ in range(_ROUNDS):
+        at = np.hstack([matrix(p[_MODE]), *(pair.columns for pair in periodic)])
+        p = _solve(_triangle(np.column_stack([at, balance.applied])))
     return _Fit(p, at, balance.applied - at @ p)
 
 
@@ -275,11 +288,9 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
 
 def _scatter(fit: _Fit, force: Array) -> Array:
     """Return the covariance (p, p) of the free parameters from fits without each of _BLOCKS parts of the record."""
-    group = np.arange(len(force)) * _BLOCKS // len(force)
-    others = []
-    for g in range(_BLOCKS):
-        keep = group != g
-        others.append(_solve(fit.columns[keep], force[keep]))
+    rows, group = np.column_stack([fit.columns, force]), np.arange(len(force)) * _BLOCKS // len(force)
+    triangles = [_triangle(rows[group == g]) for g in range(_BLOCKS)]
+    others = [_solve(_triangle(np.vstack(triangles[:g] + triangles[g + 1 :]))) for g in range(_BLOCKS)]
     apart = np.array(others) - np.mean(others, axis=0)
     return (_BLOCKS - 1) / _BLOCKS * apart.T @ apart
 
@@ -336,10 +347,10 @@ def at_radius(figures: _Figures, r: float) -> _Figures:
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:
     """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
     balance = _Balance(x, force, T, step)
-    laws = balance.laws(step)
-    plain = min((_fitted(balance, dry, []) for *_, dry in laws), key=lambda fit: fit.squares)
-    periodic = _disturbances(balance, plain)
-    fits = [(slip, reach, _fitted(balance, dry, periodic)) for slip, reach, dry in laws]
+    laws = [(slip, reach, balance.matrix(dry)) for slip, reach, dry in balance.laws(step)]
+    fits = [(slip, reach, _fitted(balance, matrix, [])) for slip, reach, matrix in laws]
+    if periodic := _disturbances(balance, min((fit for *_, fit in fits), key=lambda fit: fit.squares)):
+        fits = [(slip, reach, _fitted(balance, matrix, periodic)) for slip, reach, matrix in laws]
     least = min(fit.squares for *_, fit in fits)
     slip, reach, best = min(
         fits, key=lambda entry: balance.independent * np.log(entry[2].squares / least) + entry[2].price
