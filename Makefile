@@ -34,6 +34,7 @@ check: .venv/ready build/typed
 validate: .venv/ready
 	$(PY) -m pytest -m validate tests
 	$(PY) -m tests.checks.faults
+	$(PY) tests/tools/hostile.py
 	$(PY) tests/tools/hostile.py --signals
 	$(PY) tests/tools/regenerate.py --check
 	$(MAKE) installed

@@ -20,5 +20,6 @@ def driven(*options: str) -> int:
     return int(number[1])
 
 
-def test_every_hostile_case_is_answered_well():
-    assert driven() >= 500
+def test_hostile_cases_are_answered_well():
+    """`make validate` has all pairs of commands, fields and values; here each occurs, in one pair of two or three."""
+    assert driven("--short") >= 500

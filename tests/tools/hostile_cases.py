@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,14 @@ from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.sim.scenario import SCENARIOS, load
 
 BUT = 2  # exit code of bad input
+SHORT = "--short" in sys.argv
+
+
+def pairs(left: Iterable, right: Iterable, every: int = 2) -> Iterator[tuple]:
+    """Return all pairs. A short run has one in `every`, evenly, so that each entry of both sides still occurs."""
+    for (i, one), (j, other) in product(enumerate(left), enumerate(right)):
+        if not SHORT or (i + j) % every == 0:
+            yield one, other
 
 
 @dataclass(frozen=True)
