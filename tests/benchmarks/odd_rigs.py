@@ -132,32 +132,33 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
     origin, phase = draw.uniform(size=len(many)), draw.uniform(0, 2 * np.pi, (2, len(many)))
     x, v, y, w, z, felt, wound = (np.zeros(len(many)) for _ in range(7))
     h, out, before = T / substeps, np.zeros((len(signal), len(many))), 0.0
-    dahl = bristle > 0
+    dahl, lags, followed, remembered = bristle > 0, lag > 0, -np.expm1(-h / np.maximum(lag, 1e-9)), memory / relax
+    reach, free, ends, turns = c / np.maximum(bristle, 1e-9), gap == 0, late * substeps, 2 * np.pi / period
     for n, force in enumerate(signal):
         seen = x + eccentric * np.sin(2 * np.pi * x / turn + phase[0])
         out[n] = step * np.round(seen / step + origin)
         shake = tremor * np.sin(2 * np.pi * 9.3 * n * T) * (1 + np.sin(2 * np.pi * 0.7 * n * T))
         outside = constant + drift * n * T
         for i in range(substeps):
-            now = np.where(i >= late * substeps, force, before)
-            felt = np.where(lag > 0, felt + (now - felt) * -np.expm1(-h / np.maximum(lag, 1e-9)), now)
-            stretch = x - y
+            now = np.where(i >= ends, force, before)
+            felt = np.where(lags, felt + (now - felt) * followed, now)
+            stretch, speed = x - y, np.abs(v)
             contact = np.sign(stretch) * np.maximum(np.abs(stretch) - gap / 2, 0.0)
-            link = k * contact + np.where((gap == 0) | (contact != 0), d * (v - w), 0.0)
-            z = np.clip(z + h * v, -c / np.maximum(bristle, 1e-9), c / np.maximum(bristle, 1e-9))
+            link = k * contact + np.where(free | (contact != 0), d * (v - w), 0.0)
+            z = np.minimum(np.maximum(z + h * v, -reach), reach)
             dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / stribeck) ** 2))))
             wound = wound + h * (v - wound / relax)  # [m] of the Maxwell element's spring
             total = (
                 felt
                 + outside
                 - link
-                - b * v / (1 + np.abs(v) / thin)
-                - memory / relax * wound
-                - drag * v * np.abs(v)
+                - b * v / (1 + speed / thin)
+                - remembered * wound
+                - drag * v * speed
                 - dry
                 - cable * x
             )
-            total = total + cogging * np.sin(2 * np.pi * x / period + phase[1])
+            total = total + cogging * np.sin(turns * x + phase[1])
             v = v + h * total / m1
             w = w + h * (link - hand[:, 1] * w - hand[:, 2] * y + shake) / m2
             x, y = x + h * v, y + h * w
