@@ -244,7 +244,7 @@ _MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a sea
 
 def _require_few(loop: Loop, most: int, what: str) -> None:
     if loop.channels > most:
-        raise DesignFailed(None, (), f"{loop.channels} devices, allowed are {most} for a spring-damper by {what}")
+        raise DesignFailed(None, (), f"{loop.channels} channels, allowed are {most} for a spring-damper by {what}")
 
 
 class _NoLinearDesign(DesignFailed):
@@ -255,7 +255,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
 
     `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if so many
-    devices would make the search take minutes.
+    channels would make the search take minutes.
     """
     if not named(condition).extensible:  # Limited forces are covered with rho = 0.
         if limiter and named(condition) is KNOWN_DEVICE:

@@ -31,7 +31,7 @@ from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
-from haptic_loop.sim.view.drawn_object import SPRING, DrawnObject, Shape, object_of
+from haptic_loop.sim.view.drawn_object import SPRING, DrawnObject, object_of
 from haptic_loop.sim.view.session import HISTORY, KEYS, Frame, Grip, LiveLoop, PreparedLoop, keys_help
 from haptic_loop.sim.world import WorldFigures
 
@@ -220,7 +220,8 @@ class _ShownScene:
             if shape.kind == "spring":
                 _connect(drawn, _BAR, SPRING, shape.at, shape.to, shape.rgba)
             else:
-                _solid(drawn, _BOX if shape.kind in ("mass", "wall") else _SPHERE, shape)
+                kind = _BOX if shape.kind in ("mass", "wall") else _SPHERE
+                _solid(drawn, kind, shape.size, shape.at, shape.quat, shape.rgba)
         for device in range(_devices(self.scene)):
             channels, own = _own(self.scene, device), _colour(device)
             handles = np.array(self.scene.handles)[channels]
@@ -400,19 +401,17 @@ def _arrow(drawn: mujoco.MjvScene, at: Array, way: Array, rgba: tuple[float, ...
         _connect(drawn, _ARROW, 0.005, at, at + way, rgba)
 
 
-def _solid(drawn: mujoco.MjvScene, kind: mujoco.mjtGeom, shape: Shape) -> None:
-    if drawn.ngeom < drawn.maxgeom:
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, shape.quat)
-        colour = np.array(shape.rgba, dtype=np.float32)
-        mujoco.mjv_initGeom(drawn.geoms[drawn.ngeom], kind, np.array(shape.size), np.array(shape.at), turn, colour)
-        drawn.ngeom += 1
-
-
 def _sphere(drawn: mujoco.MjvScene, at: Array, radius: float, rgba: tuple[float, ...]) -> None:
+    _solid(drawn, _SPHERE, np.full(3, radius), at, np.array([1.0, 0, 0, 0]), rgba)
+
+
+def _solid(
+    drawn: mujoco.MjvScene, kind: mujoco.mjtGeom, size: Any, at: Any, quat: Any, rgba: tuple[float, ...]
+) -> None:
     if drawn.ngeom < drawn.maxgeom:
-        geom, colour = drawn.geoms[drawn.ngeom], np.array(rgba, dtype=np.float32)
-        mujoco.mjv_initGeom(geom, _SPHERE, np.full(3, radius), np.asarray(at, float), np.eye(3).ravel(), colour)
+        turn, geom = np.zeros(9), drawn.geoms[drawn.ngeom]
+        mujoco.mju_quat2Mat(turn, quat)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), np.array(at, float), turn, np.array(rgba, dtype=np.float32))
         drawn.ngeom += 1
 
 

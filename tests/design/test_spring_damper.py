@@ -312,9 +312,9 @@ def test_what_would_take_minutes_is_refused_at_once():
     names = tuple(f"c{i}" for i in range(49))
     springs = tuple(Spring((name, "ground"), 300.0) for name in names)
     many = Loop(T, *[(0,) * 49] * 3, (1.0,) * 49, Network(names, springs))
-    with pytest.raises(DesignFailed, match="49 devices, allowed are 48"):
+    with pytest.raises(DesignFailed, match="49 channels, allowed are 48"):
         spring_damper.design_with(many, "any-environment")
-    with pytest.raises(DesignFailed, match="49 devices, allowed are 32 for a spring-damper by the limiter"):
+    with pytest.raises(DesignFailed, match="49 channels, allowed are 32 for a spring-damper by the limiter"):
         spring_damper.design_with(many, "this-environment", limiter=True)
     four = Network(names[:4], springs[:4])
     late = Loop(T, (0,) * 4, (100,) * 4, (0,) * 4, (1.0,) * 4, four)
