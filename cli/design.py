@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
     if args.decay is not None and (is_world(scenario) or scenario.switches or args.varying_delay):
-        raise InputError("--decay: a damping ratio is of a linear loop with constant delays, and this is none")
+        raise InputError("--decay: only a linear loop with constant delays has damping ratios; leave it out")
     if is_world(scenario):
         from haptic_loop.cli import world
 
@@ -295,7 +295,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
 
 
 def _assessment_rows(assessment: Assessment) -> render.Rows:
-    gains, end = assessment.gains, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
+    gains, end = assessment.gains, f"the search ends at {STIFFEST:g} N/m, which is a limit and no optimum"
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None

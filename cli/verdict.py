@@ -177,7 +177,7 @@ def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
     exact = ranges.certificate is not None
     ratio = f"{requirement.ratio:.4f} of the damping" if math.isfinite(requirement.ratio) else _NEVER
     proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {ranges.reason}"
-    every = f", of all {ranges.vertices}: any three parameters have all their ends among them"
+    every = f" (of {ranges.vertices}; these have every combination of ends of any three parameters)"
     of = every if ranges.vertices > count + 1 else ""
     yield "ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"
     yield "ranges, worst vertex", f"{ratio}, at {member.name}"

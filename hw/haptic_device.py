@@ -14,7 +14,7 @@ from typing import Protocol
 from haptic_loop.hw import protocol as wire
 
 _RESEND = 0.1  # [s] after which an unanswered question is sent again
-_STOPPING = 0.05  # [s] in which a device that was told to stop must rest
+_STOPPING = 0.05  # [s] longest time from STOP until the device is at rest
 _LONGEST_WAIT = 5e-4  # [s] longest wait of one call
 
 

@@ -12,8 +12,8 @@ speed v is b + q v.
 Frequency: a model is fitted to the motion under the force less dry friction. It has a transmission, an amplifier's lag
 and, for each of several tau, a Maxwell element (c, tau) beside b. The element's damping c/(1 + (w tau)^2) acts in the
 record's slow strokes and vanishes at high frequency, where only b is left. A certificate uses the damping at every
-frequency, so only b counts. The bound is the least lower end of b over all tau. So a memory that the record cannot
-exclude, for example because the encoder is coarse, lowers the bound.
+frequency, so only b counts. The bound is the least lower end of b over all tau. A memory that the record cannot
+exclude, for example because of a coarse encoder, therefore lowers the bound.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _VAGUE = 3.0  # prior standard deviation of a logarithm
 _B, _C = 4, 7  # places of b and c among the parameters
 _MUCH = 0.15  # largest share of a memory in the damping for which the linear fit suffices
 _QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
-_SURE = 100.0  # log likelihood ratio that neither chance nor a poor model of friction explains, but only a memory
+_SURE = 100.0  # log likelihood ratio above which a memory is proved; chance and poor friction models stay below
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Spectra:
     def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
 
-        `end` [N] is the force in one tick that would stop the motion that is left when the record ends.
+        The motion at the end of the record counts as stopped by a force `end` [N] in one more tick.
         """
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
         link = k + d * s

@@ -115,8 +115,8 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
 
 
 _PAGE = 7.16  # [inch] both columns of an IEEE page, and nearly those of other two-column papers
-_LEGEND = 0.8  # columns of a legend in a paper, as a share of its entries if the figure does not shrink
-_LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a figure of a paper
+_LEGEND = 0.8  # columns of a legend per entry, in a figure that is printed at its own width
+_LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
 def _fit_paper(figure: Figure) -> None:
@@ -136,7 +136,7 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Show texts literally: dollars start no mathematics, and characters that the font lacks become a mark."""
+    """Show texts literally: a dollar sign is no formula, and a character that the font lacks becomes a mark."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
     texts = list(figure.texts)  # findobj would create all ticks, which the layout creates again
     for axis in figure.axes:
@@ -263,6 +263,7 @@ def _two_points(result: Run) -> bool:
 
 
 def _calmest_last(values: Array) -> list[int]:
+    """Return the channels in the order of drawing: those that change fastest first."""
     return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
 
 
@@ -378,9 +379,9 @@ def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
 
 
 def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
-    """Draw the ideal forces, broad and pale in each device's colour; the axis ends at three times the other forces."""
+    """Draw the ideal forces, broad and pale, and cut them at three times the largest other force."""
     forces, percent = ideal
-    label = "pale: what the object itself gives for this motion"
+    label = "pale: the force of the object itself for this motion"
     if percent is not None:  # The report compares forces before the motors' limits.
         label += " (the motors were asked for the same)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
@@ -454,7 +455,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
         axis.set_ylabel("force [N]")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    pale = "pale: what the object itself gives for this motion, as late"
+    pale = "pale: the force of the object itself for this motion, with the same delay"
     axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label=pale)
     _legend(figure, _ordered(_entries(axes[0, 0]), around), 6)
     return save(figure, path)

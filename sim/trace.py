@@ -225,7 +225,7 @@ class Trace(ReadOnly):
 
 # ---- octaves, and lasting oscillations
 
-_PERIODS = 4  # periods of the slowest octave in a window; with fewer the window function mixes octaves
+_PERIODS = 4  # least periods of an octave in a window; with fewer the window function mixes neighbouring octaves
 _TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of a motion of 15 mm at 0.6 Hz
 SUSTAINED = 0.95
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged

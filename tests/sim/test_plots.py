@@ -76,7 +76,7 @@ def test_pictures_contain_every_sample(drawn):
         "device 1",
         "device 2",
         "device 3",
-        "pale: what the object itself gives for this motion (force error 12 %)",
+        "pale: the force of the object itself for this motion (force error 12 %)",
     ]
 
 
