@@ -249,7 +249,7 @@ class EnergyBudget(_Net):
     def tell(self, tick: int, acted: ArrayLike) -> None:
         """Report the forces (m, nsim) that acted in a tick, counted from 0, whose force was unknown."""
         if tick not in self._untold:
-            raise ValueError(f"tick {tick} is not one whose force is unknown")
+            raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
 
     def _book(self, dx: Array, acted: Array | None) -> None:
