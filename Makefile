@@ -58,7 +58,7 @@ build/typed: Makefile
 lint: .venv/ready build/typed
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pyright
+	$(PY) -m pyright --threads 2
 
 coverage: .venv/ready
 	$(PY) -m pytest $(PARALLEL) --cov --cov-report=term:skip-covered

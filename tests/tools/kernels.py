@@ -109,6 +109,8 @@ def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int
 
 
 def main() -> int:
+    for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"):
+        os.environ.pop(name, None)  # the native setting is what the processor chooses, whatever the caller has set
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="SETTING")
     parser.add_argument("--one", action="store_true", help="one foreign kernel")
