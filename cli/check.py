@@ -25,7 +25,7 @@ from haptic_loop.design.certificate import (
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import HERE, RANGES
+from haptic_loop.design.guarantees import RANGES
 from haptic_loop.design.known_device import described
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search_ranges
@@ -148,7 +148,7 @@ def _checked(
     loop, claim, proved = stored.loop, stored.certificate, verdict.proved
     span, switching = loop.varying_delay, None
     if span and claim and "switching" in claim.facts:
-        guarantee = f"{switching_guarantee(span)}, in {HERE}" if proved else None
+        guarantee = f"{switching_guarantee(span)}, in {claim.guarantee}" if proved else None
         shown = span.lo, span.hi, guarantee, "rational" if proved else None
         switching = _Switching(*shown, claim.required, claim.margin)
     return _Checked(

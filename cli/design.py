@@ -79,7 +79,8 @@ def _parser() -> options.Parser:
     parser.add_condition("what to certify")
     ratio = "softer, until every mode of the loop with the scenario's hands has at least this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
-    varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
+    varying = "safe under any switching of the forces' delays in this range too [samples]; with --condition "
+    varying += "this-environment or known-device"
     parser.add_varying_delay(varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
     one_of = parser.add_mutually_exclusive_group()
@@ -127,8 +128,6 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     if args.varying_delay is not None:
         if not _for_switching(args):
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
-        if loop.ranges:
-            raise InputError("--varying-delay and [ranges]: switching delays are judged in one environment; give one")
         span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
         with options.refused("--varying-delay: "):
             loop = loop.switching(span)
@@ -164,8 +163,6 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
     from haptic_loop.design.api import proved
 
     further = _options_of(args, args.coupling)
-    if loop.varying_delay and _for_switching(args):
-        further["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
         make = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **further)
         if args.decay is None:

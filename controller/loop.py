@@ -171,8 +171,6 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
                 )
 
     def _check_varying_delay(self, span: DelayRange) -> None:
-        if self.ranges:
-            raise ValueError("varying_delay and ranges: switching delays are judged in one environment")
         if len(span.lo) != len(self.theta):
             raise ValueError(f"varying_delay has {len(span.lo)} ranges for {len(self.theta)} channels")
         if not span.contains(DelayRange(self.theta, self.theta)):

@@ -20,7 +20,7 @@ from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT, LimitedForces
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, HERE, RANGES
+from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
 from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
@@ -57,8 +57,7 @@ def design_coupling(
         condition: The name of a condition, or your own Condition (design.conditions). The coupling satisfies your own
             condition and the kind's usual one. None selects the usual condition (design.designs.usual_condition), as
             the commands do.
-        options: Options of the kind (DesignOptions). The range of switching delays must be given here; it is not taken
-            from loop.varying_delay.
+        options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
     Returns:
         A Design. Its `coupling` has K (m,) [N/m] and B (m,) [N s/m] if it is a spring-damper. `requirement` is the
@@ -149,15 +148,21 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=own_condition or own))
     over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
     for each in over if loop.ranges else ():
-        ranges = check_ranges(loop, alone, samples=0, condition=each)
-        assert ranges  # the loop has ranges
-        _, worst = ranges.worst if ranges.proved else ranges.worst_found
-        here = requirements[worst.condition].guarantee
-        proof, held = ("rational", RANGES) if ranges.proved else ("sampled", here)
-        requirements[worst.condition] = replace(worst, proof=proof, guarantee=held)
+        requirements[each.name] = _over_ranges(loop.switching(None), alone, each, requirements[each.name])
     if loop.varying_delay:
-        requirements["switching"] = judged(loop, alone, SWITCHING)
+        switched = judged(loop.at(loop.environment), alone, SWITCHING)
+        needs = _over_ranges(loop, alone, THIS_ENVIRONMENT, switched) if loop.ranges else switched
+        requirements["switching"] = replace(needs, condition=SWITCHING.name)
     return requirements
+
+
+def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement[str]:
+    """Return the requirement of the worst member of the ranges; `here` is that of the nominal environment."""
+    ranges = check_ranges(loop, coupling, samples=0, condition=condition)
+    assert ranges  # the loop has ranges
+    _, worst = ranges.worst if ranges.proved else ranges.worst_found
+    proof, held = ("rational", RANGES) if ranges.proved else ("sampled", here.guarantee)
+    return replace(worst, proof=proof, guarantee=held)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
@@ -226,7 +231,7 @@ def store(
     switching = None
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
-        words = f"{switching_guarantee(loop.varying_delay)}, in {HERE}"
+        words = f"{switching_guarantee(loop.varying_delay)}, in {named(design.asked).guarantee(loop)}"
         switching = _SwitchingFiled(words, proof, reason)
         if certificate is None:
             loop = loop.switching(None)

@@ -666,24 +666,32 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
         here = [name for name in (SWITCHING.name, KNOWN_DEVICE.name) if name in requirements]
         for name in (*anywhere, *here):
             if name in requirements and requirements[name].certified:
-                environments = ANY if name in anywhere else loop.environment.here
-                return _stated(assessment, requirements[name], environments), None
+                if name in anywhere:
+                    return _stated(assessment, requirements[name], ANY), None
+                if ranges := _over_ranges(assessment):
+                    return ranges, None
+                return _stated(assessment, requirements[name], loop.environment.here), None
         shortfall = requirements[here[-1]].shortfall
         return None, f"delays that switch within {loop.varying_delay} are not covered: {shortfall}"
     held = [need for need in requirements.values() if need.certified and need.guarantee]
     if anywhere := [need for need in held if need.guarantee == ANY]:
         return _stated(assessment, anywhere[0], ANY), None
-    if assessment.ranges and assessment.ranges.proved and _within(assessment):
-        by = requirements[assessment.ranges.worst[1].condition]
-        return _stated(assessment, replace(by, proof="rational"), RANGES), None
+    if ranges := _over_ranges(assessment):
+        return ranges, None
     if held:
         return _stated(assessment, held[0], str(held[0].guarantee)), None
     return None, f"{own.shortfall} ({own.condition})"
 
 
-def _within(assessment: Assessment) -> bool:
-    """Return whether the environment that runs is the nominal one of the ranges or one of their vertices."""
-    return any(assessment.environment == member.network for member in assessment.loop.members())
+def _over_ranges(assessment: Assessment) -> Guarantee | None:
+    """Return the guarantee for the ranges, or None without a proof, or if no member of the ranges runs."""
+    ranges = assessment.ranges
+    if not (ranges and ranges.proved) or all(assessment.environment != each.network for each in ranges.members):
+        return None
+    name = ranges.worst[1].condition
+    if assessment.loop.varying_delay and name == THIS_ENVIRONMENT.name:
+        name = SWITCHING.name
+    return _stated(assessment, replace(assessment.requirements[name], proof="rational"), RANGES)
 
 
 def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:

@@ -48,7 +48,8 @@ class Switching:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> Switching:
-        """Evaluate a coupling; `known` is its requirement from an assessment in this loop, if there is one."""
+        """Evaluate a coupling in the nominal environment; `known` is its requirement there, if it was evaluated."""
+        loop = loop.at(loop.environment)
         requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays
         if requirement.reason:
             return cls(requirement, span.lo, span.hi)

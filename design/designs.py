@@ -85,9 +85,10 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     without a latency, and known-device-any is chosen with walls if it covers the loop. Apart from these two, every
     other kind has one condition.
     """
-    less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
+    less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
+    more = ANY_ENVIRONMENT not in conditions and not (loop.environment.walls or loop.environment.world)
+    if loop.known_devices and KNOWN_DEVICE in conditions and not loop.latency and (more or not less):
         return KNOWN_DEVICE.name  # never worse than this-environment
     walls = loop.environment.walls and not loop.environment.world
     if walls and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
@@ -120,7 +121,7 @@ def design_by_kind(
             the kind's usual condition, for the largest share of the damping with which both conditions hold.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper covers limited forces if such a
-            coupling exists; `limiter` True requires it.
+            coupling exists; `limiter` True requires it. `switching` replaces loop.varying_delay.
 
     Raises:
         ValueError: The kind or condition does not exist, or does not suit the loop.
@@ -149,6 +150,8 @@ def design_by_kind(
     if condition_name not in able:
         raise ValueError(f"condition is {condition_name!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[condition_name]
+    if span := options.pop("switching", None):
+        loop = loop.switching(DelayRange(*(tuple(map(int, end)) for end in span)))
     if loop.levels and (reason := made_for.beyond(loop)):
         raise ValueError(reason)
     if loop.levels and (kind != "moving-average" or made_for is KNOWN_DEVICE_ANY):
@@ -159,8 +162,6 @@ def design_by_kind(
     if chosen.model and options.get("limiter") and (reason := LIMITER.not_designed(loop)):
         with_less = {**options, "limiter": False, "bases": ((4, 3),)}
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
-    if made_for is KNOWN_DEVICE and not chosen.model and (span := options.pop("switching", None)):
-        loop = loop.switching(DelayRange(*(tuple(map(int, end)) for end in span)))
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
     make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
@@ -170,12 +171,12 @@ def design_by_kind(
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:
-        return replace(_with_less_damping(loop, make, own), condition=own.name, own=own, phi=None)
+        return replace(_with_less_damping(loop, make, own, made_for), condition=own.name, own=own, phi=None)
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
     switched = loop.varying_delay and made_for is KNOWN_DEVICE  # The search for gains takes constant delays.
-    if chosen.model or anywhere or not (loop.latency or loop.environment.walls or switched):
+    if chosen.model or anywhere or not (loop.latency or loop.environment.walls or loop.ranges or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)
 
@@ -277,21 +278,24 @@ def own_coupling(name: str, loop: Loop) -> Any:
 _UNUSED = 0.005  # largest unused share of the damping at which `_with_less_damping` ends
 
 
-def _with_less_damping(loop: Loop, make: Callable[[Loop], Design], condition: Condition) -> Design:
+def _with_less_damping(
+    loop: Loop, make: Callable[[Loop], Design], condition: Condition, made_for: Condition | None = None
+) -> Design:
     """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
 
-    The designs neglect the latency and assume that all walls touch. Designs for any environment or for known devices
-    are made for the longest delays.
+    The designs are made for the condition `made_for` (default: the same) in the nominal environment, with all walls
+    touching and without the latency. Those that take no account of switching delays are made for the longest ones.
     """
     share, best, shortfall = 1.0, None, ""
+    walls = loop.environment.walls
+    constant = (made_for or condition) is not THIS_ENVIRONMENT or loop.latency or walls
+    where = loop.delayed(loop.delays.hi) if constant else loop
+    if condition is KNOWN_DEVICE and walls:
+        where = where.at(held(loop.network))  # The search judges gains by beta alone.
+    judged = loop if condition in (THIS_ENVIRONMENT, KNOWN_DEVICE) else loop.at(loop.environment)
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
-        switched = condition.guarantee(loop) == ANY or condition is KNOWN_DEVICE
-        constant = loop.delayed(loop.delays.hi) if switched else loop
-        if condition is KNOWN_DEVICE and loop.environment.walls:
-            constant = constant.at(held(loop.network))  # The search judges gains by beta alone.
-        part = msgspec.structs.replace(constant, latency=None, **_scaled(loop, share))
-        design = make(part)
-        needs = condition.judge(loop.at(loop.environment), design.coupling)
+        design = make(msgspec.structs.replace(where, latency=None, ranges=None, **_scaled(loop, share)))
+        needs = condition.judge(judged, design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
             best = replace(design, requirement=needs, notes=())  # The notes describe `part`.

@@ -399,7 +399,8 @@ class ThisEnvironment(Multiplied):
         return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        return f"{switching_guarantee(loop.delays)}: " if loop.varying_delay else super().place(loop, matrix)
+        member = super().place(loop, matrix)
+        return f"{switching_guarantee(loop.delays)}: {member}" if loop.varying_delay else member
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls and not loop.ranges else super().words(loop)
@@ -434,7 +435,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 class SwitchingDelays(ThisEnvironment):
     """this-environment of a loop whose delays switch, reported as a separate requirement "switching"."""
 
-    name, covers = "switching", ("psi", "T_max", "latency", "varying_delay", "walls")
+    name, covers = "switching", BEYOND
 
     @property
     def base(self) -> str:

@@ -21,7 +21,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.certificate import Verdict, lag
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.guarantees import HERE, RANGES
+from haptic_loop.design.guarantees import RANGES
 from haptic_loop.design.result import listed, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
@@ -880,7 +880,7 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
+    delays = f"; {switching_guarantee(stored.loop.varying_delay)}" if stored.loop.varying_delay else ""
     how = f"{claim.condition}, proof: {claim.proof}"
     if claim.guarantee == RANGES:
         how += "; at the vertices, between them nothing is proved: design.check searches there"

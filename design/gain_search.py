@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Sampled
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
@@ -296,13 +296,13 @@ class SwitchingLoop(SampledLoop):
     bounds = (np.log(1e-4), np.log(10.0))
     _first = 0.5  # first value of alpha T/delta
 
-    def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
+    def __init__(self, loop: Loop) -> None:
         if loop.environment.walls or loop.latency:
             raise ValueError("gains for delays that switch are designed in linear environments and without a latency")
-        self.active = np.flatnonzero(np.subtract(hi, lo))
+        self.active = np.flatnonzero(np.subtract(loop.delays.hi, loop.delays.lo))
         self.lead, self.shared = _shared(loop)
         self.unit = np.array(loop.per_channel(loop.per_device(even_damping(loop)).tolist())) / loop.T
-        super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
+        super().__init__(loop)
 
     def point(self, coupling: SpringDamper) -> Array:
         """Return x of the gains with their best multiplier."""

@@ -10,13 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from haptic_loop.controller.arithmetic import TooLong, spent, units_since, within
 from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import budgets, program
 from haptic_loop.design.certificate import prove, required_damping
@@ -87,13 +88,9 @@ def design_with(
     loop: Loop,
     condition: str = THIS_ENVIRONMENT.name,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
-    switching: tuple[Sequence[int], Sequence[int]] | None = None,
     **options: Any,
 ) -> Optimal:
-    """Design the optimal coupling for Options(**options); it is also safe while delays vary within `switching`.
-
-    `switching` is (lo, hi) [samples]. `progress` is called after each basis.
-    """
+    """Design the optimal coupling for Options(**options); `progress` is called after each basis."""
     chosen, done = program.Options(**options), 0
 
     def reached(result: _BasisResult) -> None:
@@ -101,9 +98,8 @@ def design_with(
         done += 1
         progress(f"{result.mismatch_db:z.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
 
-    span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
     made = _for_known_devices if condition == KNOWN_DEVICE.name else design
-    return made(loop.switching(span), chosen, progress=reached)
+    return made(loop, chosen, progress=reached)
 
 
 def design(
@@ -192,8 +188,6 @@ def _for_known_devices(
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise ValueError(f"{KNOWN_DEVICE.name}: {reason}")
-    if loop.ranges:
-        raise ValueError(f"ranges: an optimal coupling for {KNOWN_DEVICE.name} is designed in one environment")
     search = replace(_Search.of(loop, options), condition=KNOWN_DEVICE)
     if exactly := search.nothing():
         return exactly
@@ -225,6 +219,9 @@ def _for_known_devices(
             best, multipliers = candidate, search.multipliers(candidate.coupling)
         if gained < _SETTLED_DB or search.over():
             break
+    if loop.ranges and best.condition == KNOWN_DEVICE.name:
+        between = search.between(best)
+        best = between if between.proved and search.gained(plain, between) > 0 else plain
     figures = f"{best.condition}, {search.decibels(best):.2f} dB"
     note = f"{figures}; this-environment, for devices of which less is known: {search.decibels(plain):.2f} dB"
     return replace(
@@ -411,16 +408,19 @@ class _Search:
                 break
         return candidate
 
-    def kept_in_all(self, problem: program.Problem) -> tuple[ForceFilter, list[float]]:
+    def kept_in_all(
+        self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
+    ) -> tuple[ForceFilter, list[float]]:
         """Find the optimum for the nominal environment, and add environments whose requirement is exceeded.
 
+        `need` returns required over available damping in an environment.
         Returns (coupling, share of the damping that each environment needs).
         """
         active = [0]
         while True:
             some = replace(problem, cases=tuple(problem.cases[i] for i in active))
             coupling = problem.span.filter(some.solve(self._start(some)))
-            needs = [ratio_in(case.loop, coupling) for case in self.cases]
+            needs = [need(case.loop, coupling) for case in self.cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
             if not missed:
                 return coupling, needs
@@ -434,7 +434,10 @@ class _Search:
         unscaled = candidate.coupling
         assert isinstance(unscaled, ForceFilter)
         begun = self.elapsed / self.options.seconds if self.options.seconds else 0.0
-        searched = search_ranges(self.loop, unscaled, over=lambda: self.over(max(1.0, begun + _SEARCHED)))
+        over = partial(self.over, max(1.0, begun + _SEARCHED))
+        if self.condition is KNOWN_DEVICE or self.loop.varying_delay:
+            return self._between_with_multipliers(candidate, unscaled, over)
+        searched = search_ranges(self.loop, unscaled, over=over)
         ratio, last = searched.worst[0].ratio, candidate
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
@@ -445,6 +448,26 @@ class _Search:
             if last.proved:
                 break
         return last
+
+    def _between_with_multipliers(self, candidate: Optimal, coupling: ForceFilter, over: Callable[[], bool]) -> Optimal:
+        """Return `between` for a condition whose multipliers serve all environments."""
+        last = candidate
+        for _ in range(_SCALINGS):
+            needs = required_damping(self.loop, coupling, self.condition)
+            if needs.certified:
+                last = self._proved(self._assessed(coupling, coupling.g), None)
+                values = needs.multiplier
+
+                def ratio(there: Loop, coupling: Coupling = coupling, values: Any = values) -> float:
+                    return required_damping(there, coupling, self.condition, values).ratio
+
+                searched = search_ranges(self.loop, coupling, over=over, ratio=ratio)
+                last = replace(last, searched=searched)
+                needs = replace(needs, required=tuple(searched.worst[0].ratio * d for d in needs.available))
+                if last.proved and needs.certified:
+                    return last
+            coupling = _scaled(coupling, (1 - program.MARGIN) * min(1.0, 1 / needs.ratio))
+        return replace(last, certificate=None, reason=last.reason or "no scaling of its forces is proved in the ranges")
 
     def scaled(self) -> Optimal:
         """Return the coupling R = kappa I, with kappa reduced until the coupling is proved."""
@@ -487,16 +510,23 @@ class _Search:
 
     def over_known(self, eta: float, multipliers: Sequence[float], error: float, taps: int, poles: int) -> Optimal:
         """Return the optimum over a basis for beta = `eta` times the largest beta and these facts' multipliers."""
-        loop, (case, *_) = self.loop, self.cases
+        loop = self.loop
         largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # Axes of a device have one beta.
         beta = np.array(loop.per_channel((eta * largest).tolist()))
-        here = program.known_device(self.loop, self.known, beta, multipliers)
-        beside = [each for each in case.constraints if each.name in ("high-frequency gain", "mismatch")]
-        span, soft = self.span(taps, poles), program.SOFT[0] * min(error, program.SOFT[1])
-        problem = program.Problem(span, (replace(case, constraints=(here, *beside)),), self.options, soft)
-        coupling = span.filter(problem.solve(self._start(problem)))
-        own = multipliers[: sum(len(each.units) for each in KNOWN_DEVICE.unknowns(self.loop))]
-        return self._assessed(coupling, coupling.g, (*beta.tolist(), *(0.0,) * 2 * beta.size, *own))
+        own = multipliers[: sum(len(each.units) for each in KNOWN_DEVICE.unknowns(loop))]
+        whole = (*beta.tolist(), *(0.0,) * 2 * beta.size, *own)
+
+        def constrained(case: program.Case) -> program.Case:
+            beside = [each for each in case.constraints if each.name in ("high-frequency gain", "mismatch")]
+            return replace(case, constraints=(program.known_device(case.loop, self.known, beta, multipliers), *beside))
+
+        def need(there: Loop, coupling: Coupling) -> float:
+            return KNOWN_DEVICE.judge(there, coupling, whole).ratio if loop.ranges else 0.0
+
+        soft = program.SOFT[0] * min(error, program.SOFT[1])
+        problem = program.Problem(self.span(taps, poles), tuple(map(constrained, self.cases)), self.options, soft)
+        coupling, _ = self.kept_in_all(problem, need)
+        return self._assessed(coupling, coupling.g, whole)
 
     def scaled_and_proved(self, candidate: Optimal) -> Optimal:
         """Return the coupling with its forces scaled down until known-device proves it, with the best beta."""
@@ -565,7 +595,8 @@ class _Search:
                 )
         except NotProved as error:
             return replace(candidate, wall_s=self.elapsed, reason=str(error))
-        requirement = replace(candidate.requirement, proof="rational")
+        needs = certificate.required if loop.varying_delay else candidate.requirement.required
+        requirement = replace(candidate.requirement, required=needs, proof="rational")
         return replace(candidate, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
 
 

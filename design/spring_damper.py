@@ -198,7 +198,6 @@ def design(
     loop: Loop,
     condition: str = "any-environment",
     starts: Sequence[SpringDamper] = (),
-    switching: tuple[Sequence[int], Sequence[int]] | None = None,
     limiter: bool = False,
     band_hz: tuple[float, float] | None = None,
     W1: Lti | None = None,
@@ -210,10 +209,9 @@ def design(
     start. this-environment takes the lowest of the local minima of the rms mismatch that are reached from the starts.
 
     Args:
-        loop: The devices, their delays and the environment.
+        loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
-        switching: The least and largest delays (lo, hi) [samples] of the forces, if the delays switch.
         limiter: Whether the proof covers limited forces too; that of any-environment always does.
         band_hz: The band of the rms mismatch [Hz].
         W1: The output weight of (23).
@@ -225,14 +223,14 @@ def design(
         ValueError: The condition does not cover an argument.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
-        if switching or limiter:
+        if loop.varying_delay or limiter:
             raise ValueError(f"{condition}: neither limited forces nor delays that vary are covered")
         return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
     if named(condition).extensible:
-        if switching and limiter:
+        if loop.varying_delay and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
-        return _for_this_environment(loop, starts, switching, limiter, band_hz)
-    if switching:
+        return _for_this_environment(loop, starts, limiter, band_hz)
+    if loop.varying_delay:
         raise ValueError("delays that vary are designed for by the this-environment condition only")
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
@@ -271,7 +269,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     refusal = LIMITER.not_designed(loop)
     if limiter and refusal:
         raise ValueError(refusal)
-    if refusal or options.get("switching"):
+    if refusal:
         return design(loop, condition, **options)
     try:
         return design(loop, condition, limiter=True, **options)
@@ -314,7 +312,6 @@ def _short(coupling: SpringDamper) -> SpringDamper:
 def _for_this_environment(
     loop: Loop,
     starts: Sequence[SpringDamper],
-    switching: tuple[Sequence[int], Sequence[int]] | None,
     limiter: bool,
     band_hz: tuple[float, float] | None,
 ) -> Design:
@@ -323,9 +320,10 @@ def _for_this_environment(
         raise DesignFailed(None, (), reason)
     started, starts = time.perf_counter(), starts or _default_starts(loop)
     band = band_hz or BAND_HZ
-    if band_hz and switching:
+    span = loop.varying_delay
+    if band_hz and span:
         raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
-    sampled = partial(SwitchingLoop, loop, *switching) if switching else partial(SampledLoop, loop, band)
+    sampled = partial(SwitchingLoop, loop) if span else partial(SampledLoop, loop, band)
     many = loop.channels > FEW
     if many:
         starts = likeliest_first(sampled(), starts)
@@ -340,8 +338,8 @@ def _for_this_environment(
         searches += before
     if coupling is None:
         certifies = "the this-environment condition certifies"
-        if switching:
-            certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
+        if span:
+            certifies += f" under any switching from {span.lo} to {span.hi} samples"
         if limiter and not nothing:
             certifies += " while forces are limited"
         line = (

@@ -229,8 +229,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def _check_varying_delay(self, varying: VaryingDelay) -> None:
         if varying.channels != self.channels:
             raise ValueError(f"varying_delay has {varying.channels} ranges for {self.channels} channels")
-        if self.ranges:
-            raise ValueError("varying_delay and ranges: switching delays are judged in one environment; give one")
         if self.environment.walls:
             raise ValueError("varying_delay and environment.walls: switching delays are judged in linear loops only")
         for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True), start=1):

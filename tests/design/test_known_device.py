@@ -18,6 +18,7 @@ from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spri
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design import budgets
 from haptic_loop.design.api import design_coupling
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import audit
@@ -671,22 +672,26 @@ def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     assert prove(loop, found.coupling, "known-device-any").proof == "rational"
 
 
-def test_an_optimal_coupling_uses_known_devices():
+@pytest.mark.parametrize("ranges", [None, Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))])
+def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
+    monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
     network = Network(("tip",), (Spring(("tip", GROUND), 1200.0, 2.0),), {"tip": 0.2})
-    loop = change(one(1e-3, 1.0, 1, environment=network), lam=(1,))
+    loop = change(one(1e-3, 1.0, 1, environment=network), lam=(1,), ranges=ranges)
     found = design_by_kind(loop, "optimal", bases=((4, 3),))
     plain = design_by_kind(loop, "optimal", "this-environment", bases=((4, 3),))
     assert found.condition == "known-device"
     assert found.objective < 0.8 * plain.objective
     assert f"{20 * np.log10(plain.objective):.2f} dB" in found.notes[0]
     z = np.exp(1j * np.concatenate([np.geomspace(1e-4, 0.05, 500), np.linspace(0.05, np.pi, 5000)]))
-    beta, F = found.certificate.multipliers["beta"][0], loop.F(found.coupling).at(z)
-    block = cost_by_hand(z, loop, beta).astype(complex)
-    block[:, 0, 0] += (F[:, 0, 0] / (z - 1)).real
-    block[:, 1, 0] -= beta * F[:, 0, 0] / z / 2
-    block[:, 0, 1] = np.conj(block[:, 1, 0])
-    assert np.linalg.eigvalsh(block).min() > 0
+    beta = found.certificate.multipliers["beta"][0]
+    for k in (1200.0, 1000.0, 1400.0) if ranges else (1200.0,):
+        stiffer = Network(("tip",), (Spring(("tip", GROUND), k, 2.0),), {"tip": 0.2})
+        block, F = cost_by_hand(z, loop, beta).astype(complex), loop.at(stiffer).F(found.coupling).at(z)
+        block[:, 0, 0] += (F[:, 0, 0] / (z - 1)).real
+        block[:, 1, 0] -= beta * F[:, 0, 0] / z / 2
+        block[:, 0, 1] = np.conj(block[:, 1, 0])
+        assert np.linalg.eigvalsh(block).min() > 0
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
@@ -708,9 +713,6 @@ def test_a_spring_damper_before_a_wall_uses_the_device():
 
 
 def test_designs_refuse_what_known_devices_exclude():
-    ranged = change(KNOWN, ranges=Ranges(masses={"mass": (0.9, 1.1)}))
-    with pytest.raises(ValueError, match="ranges"):
-        design_coupling(ranged, "optimal", "known-device")
     with pytest.raises(ValueError, match="not covered"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):

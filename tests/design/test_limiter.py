@@ -10,6 +10,7 @@ from worlds import DELTA, PAIR, STIFF, T
 
 from haptic_loop.cli.design import main as design_main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, Sampled, taps
 from haptic_loop.design import budgets, environments
 from haptic_loop.design.certificate import lag, prove, required_damping, verify
@@ -277,7 +278,7 @@ def test_a_spring_damper_designed_with_the_block():
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
     assert rms_db(made.coupling) < -10.5  # found; the linear design has -11.19 and is not proved with limited forces
     with pytest.raises(ValueError, match="constant delays"):
-        design(PAIR, "this-environment", switching=((1, 1), (2, 2)), limiter=True)
+        design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 
 
 def test_the_command_stores_proofs_of_limited_forces(tmp_path):

@@ -41,6 +41,7 @@ stiffness = [640.0, 840.0]
 absent = true
 """
 change = msgspec.structs.replace
+Z = np.exp(1j * np.geomspace(1e-3, np.pi, 3000))
 SMALLEST = Options(bases=((4, 3),))
 
 
@@ -361,14 +362,29 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     assert validated["worst"]["environment"] in validated["environments"]["names"]
 
 
-def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, capsys):
-    stiff = ["--condition", "this-environment", "--scenario", str(scenario_file)]
-    assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
+def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, capsys):
+    """The gains of least mismatch in the nominal environment alone."""
+    stiff = ["--K", "7806,3137", "--B", "0.105,1.68"]
+    assert audit_main(["--scenario", str(scenario_file), *stiff, "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
     assert safe_with(outcome) == "this environment"
     assert decisive(outcome)["certified"]
-    assert load(tmp_path / "s.json").loop.ranges is None
-    assert verify(load(tmp_path / "s.json")).proved
+
+
+def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp_path, capsys):
+    asked = ["--condition", "this-environment", "--scenario", str(scenario_file)]
+    assert design_main([*asked, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 0
+    assert safe_with(json.loads(capsys.readouterr().out)) == "these ranges"
+    made = load(tmp_path / "s.json")
+    assert verify(made).proved
+    V = 1 / (np.array(made.coupling.K) + np.array(made.coupling.B) * (1 - 1 / Z)[:, None] / T)
+    shares = []
+    for member in made.loop.members():
+        E = environment_by_hand(member.network, Z)
+        F = Z[:, None, None] ** -np.array(THETA)[:, None] * np.linalg.solve(np.eye(2) + E * V[:, None, :], E)
+        free = F / (Z - 1)[:, None, None]
+        shares.append(-np.linalg.eigvalsh(free + np.conj(free).swapaxes(1, 2))[:, 0].min() / 2 / (1.37 / T))
+    assert 0.99 < max(shares) < 1
 
 
 @pytest.mark.parametrize(

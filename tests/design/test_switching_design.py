@@ -9,6 +9,7 @@ from asked import switching_sweep
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.controller.loop import DelayRange
 from haptic_loop.design.coupling_file import load as load_stored
 from haptic_loop.design.optimal import design_with
 from haptic_loop.design.result import DesignFailed
@@ -63,7 +64,7 @@ def test_a_range_that_is_too_wide_says_so():
     loop = load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I")
     starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
-        design(loop, "this-environment", starts, switching=((0, 0), (9, 9)))
+        design(loop.switching(DelayRange((0, 0), (9, 9))), "this-environment", starts)
 
 
 @pytest.mark.parametrize(
@@ -81,13 +82,13 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
 
 def test_any_environment_designs_refuse_varying_delays():
     with pytest.raises(ValueError, match="this-environment condition only"):
-        design(load().loop("I"), "any-environment", switching=RANGE)
+        design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
 
 
 def test_an_optimal_coupling_for_switching_delays():
     """Swept, proved, and met by lossless hands under the worst switching."""
     asked = load().loop("I")
-    made = design_with(asked, switching=RANGE, bases=((14, 10),))
+    made = design_with(asked.switching(DelayRange(*RANGE)), bases=((14, 10),))
     assert made.proved
     swept = switching_sweep(asked.sent(made.coupling), *RANGE, asked.delta)
     assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # the margin, nearly all else is spent

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from asked import switching_demand, switching_sweep, this_environment
-from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
+from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, environment_by_hand, force_map
 
 from haptic_loop import certify
 from haptic_loop.cli.audit import main as audit_main
@@ -21,17 +21,21 @@ from haptic_loop.controller.delay import LOST, VaryingDelay, ages
 from haptic_loop.controller.environment import environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
-from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside
 from haptic_loop.design import budgets
-from haptic_loop.design.certificate import prove, verify
-from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.assessment import assess
+from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.exact import Matrix
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import NotProved
 from haptic_loop.hw.control import certified_couplings
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import load as scenario_of
+from haptic_loop.sim.switching import switched_crowd
 
 RANGE = DelayRange((1, 1), (2, 2))
 LOOP = PAIR.switching(RANGE)
@@ -192,10 +196,67 @@ def test_impossible_ranges_make_no_file(file, tmp_path, fields, message):
     assert message in str(error.value)
 
 
-def test_delay_ranges_and_ranges_exclude_each_other():
-    ranges = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0)),))
-    with pytest.raises(ValueError, match="varying_delay and ranges: switching delays are judged in one environment"):
-        change(LOOP, ranges=ranges)
+# ranges of environments, whose members share one alpha
+
+RANGES = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
+RANGED = change(LOOP, ranges=RANGES)
+
+
+@pytest.fixture(scope="module")
+def ranged() -> Certificate:
+    return prove(RANGED, SOFT, "this-environment")
+
+
+def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
+    """The condition by hand at 4000 frequencies: positive with the damping on file, and zero for the worst vertex."""
+    assert (ranged.facts, ranged.guarantee, len(ranged.matrices)) == (("switching", "ranges"), "these ranges", 4)
+    save(Stored.of(RANGED, SOFT, ranged), tmp_path / "ranges.json")
+    assert verify(load(tmp_path / "ranges.json")).proved
+    forged = sealed(change(ranged, facts=("switching",)))
+    assert "facts are" in verify(Stored.of(RANGED, SOFT, forged)).reason
+    z = np.exp(1j * np.geomspace(1e-3, np.pi, 4000))
+    alpha, s, one = np.diag(ranged.multipliers["alpha"]), (1 - 1 / z) / T, np.eye(2)
+    V = np.array([1 / (K + B * s) for K, B in zip(SOFT.K, SOFT.B, strict=True)]).T[:, :, None] * one
+    least = []
+    for member in RANGED.members():
+        E = environment_by_hand(member.network, z)
+        G = np.linalg.solve(one + E @ V, E)
+        nominal = ((1 / z + 1 / z**2) / 2 / (z - 1))[:, None, None] * G
+        error = np.conj(G).swapaxes(1, 2) @ np.linalg.inv(8 * alpha) @ G  # half a tick squared over 2 alpha
+        free = (nominal + np.conj(nominal).swapaxes(1, 2)) / 2 - alpha / 2 - error
+        least.append(np.linalg.eigvalsh(free + np.diag(ranged.required) / T)[:, 0].min())
+    assert min(least) == pytest.approx(0, abs=1e-4 * 1.37 / T)
+    assert sorted(least)[1] > 0
+
+
+def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
+    found = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
+    assert found.holds
+    assert (found.guarantee.environments, found.guarantee.facts) == ("these ranges", ("switching", "ranges", "limiter"))
+    assert found.requirements["switching"].ratio < ranged.required[0] / 1.37  # in the nominal environment
+    less = change(RANGED, delta=(1.09, 1.09))
+    assert required_damping(less, SOFT, "this-environment").ratio > 1
+
+
+def test_random_members_switch_without_growing_hands(ranged):
+    """Lossless hands, members drawn from the ranges, greedy switching. With half of the damping some grow."""
+    rng = np.random.default_rng(1)
+    links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(12, 2, 1, 3)))
+    links[..., 1] = 0.0
+    growing = {1.0: 0, 0.5: 0}
+    for member in inside(FIGURE_4, RANGES, 1, seed=4):
+        for share in growing:
+            scenario = scenario_of().replace(
+                theta=(1, 1),
+                environment=member.network,
+                varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"),
+                delta=tuple(share * d for d in ranged.required),
+            )
+            loop = assemble(scenario, SOFT)
+            held_by = variants(scenario.device, Crowd(links))
+            growing[share] += int((switched_crowd(loop, held_by, np.arange(12), 0, 2.0, None).exact > 0).sum())
+    assert growing[1.0] == 0
+    assert growing[0.5] > 0
 
 
 # the commands
