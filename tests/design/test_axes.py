@@ -649,7 +649,7 @@ def test_switching_search_shares_a_multiplier() -> None:
     loop = msgspec.structs.replace(LOOP, levels=None)
     span = delay_range(((0, 1), (2, 2)), loop, 9)
     assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))
-    search = SwitchingLoop(loop, span.lo, span.hi)
+    search = SwitchingLoop(loop.switching(span))
     x = search.point(SpringDamper([900.0, 800.0, 700.0, 600.0], [0.3] * 4))
     x[8:] += [0.1, -0.2]
     steps = 1e-6 * np.eye(x.size)
