@@ -3,7 +3,8 @@
 With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
 
 This state machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
-There are two implementations because a rehearsal must not need a compiler, and because each tests the other.
+There are two implementations because rehearsals and Force Dimension devices, which it also drives, must not need a
+compiler, and because each tests the other.
 docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
 """
 

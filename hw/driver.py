@@ -68,7 +68,7 @@ class Operator:
     def _arm_once(self, session: Session, now: int) -> Said:
         if self._asked:  # a softer coupling is ready, and nobody is there to arm it
             softer = session.program.name if session.program else "none"
-            return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
+            return session.end(Stage.REFUSED, f"nobody to arm the softer coupling, {softer}", now)
         self._asked = True
         return session.arm(now)
 
@@ -107,7 +107,7 @@ class Driver:
             if session.stage == Stage.MEASURED:
                 self.load()
         except PortLost as lost:
-            session.lost(str(lost), self.clock())
+            session.end(Stage.LOST, str(lost), self.clock())
 
     def _call(self, session: Session) -> None:
         answer: Any
@@ -124,7 +124,7 @@ class Driver:
                 if (answer := self.device.exchange(force)) is not None:
                     self.do(session.take(answer, self.clock()))
         except wire.SafetyStop as fault:
-            self.do(session.fail(str(fault), self.clock()))
+            self.do(session.end(Stage.STOPPED, str(fault), self.clock()))
 
     def load(self) -> None:
         """Load couplings for the measured delay while the device rests at zero force."""
@@ -132,5 +132,5 @@ class Driver:
         try:
             programs = self.plan(session.measurement.result)
         except wire.SafetyStop as fault:
-            return self.do(session.refuse(str(fault), self.clock()))
+            return self.do(session.end(Stage.REFUSED, str(fault), self.clock()))
         return self.do(session.load(programs, self.clock()))

@@ -31,6 +31,7 @@ from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Phase
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Said, Session, session_for
+from haptic_loop.hw.session_report import outcome
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.trace import Trace
 
@@ -38,6 +39,7 @@ _MEASURE = 200  # answers that are timed; few suffice, because virtual time does
 _QUANTILE, _GUARD_US = 0.99, 100.0  # part of the ages that the delay covers, and its guard [us]; as in hw.bridge
 _BEGIN_US = 500  # time from the device's first tick to the start of the session
 _GRACE_US = 20_000  # time after the end of a session in which its device comes to rest
+_LONGEST = 60.0  # [s] of virtual time in which a session connects, is armed and ends, beside its run
 _LATENCY_US = 60  # of one direction, so that the median age is about the 130 us measured
 
 Plan = Callable[[Ages], Sequence[Armable]]
@@ -333,10 +335,8 @@ def rehearse(
     session = session_for(scenario, LinkSettings(measure=_MEASURE))
     session.record = recorder = Recorder(scenario.channels)
     programs: list[CertifiedCoupling] = []
-    delays: list[float] = []  # [s]
 
     def plan(ages: Ages) -> list[CertifiedCoupling]:
-        delays.append(1e-6 * ages.median)
         met, link = timed(scenario, ages, _QUANTILE, _GUARD_US, latch_on_arrival)
         if coupling is None:
             programs.extend(certified_couplings(met, case, None, None, link))
@@ -344,29 +344,24 @@ def rehearse(
             programs.append(certified_coupling(met, case, None, None, link, coupling))
         return programs
 
-    stopped: list[float] = []  # [s] after arming
-
-    def stop(session: Session, now: int) -> Said:
-        stopped.append(seconds)
-        return session.stop("asked to", now)
-
+    stop = seconds, lambda session, now: session.stop("asked to", now)
     try:
         emulator = Emulator(scenario)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
-    rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[(seconds, stop)])
-    rehearsal.run_until_armed(seconds + 0.5)
-    first, ran = programs[0] if programs else None, rehearsal.armed_us is not None
-    meta = {"scenario": scenario.name, "scenario_digest": scenario.digest, "stage": str(session.stage)}
-    ticks = ran and len(recorder)
+    rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[stop])
+    rehearsal.run_to_the_end(seconds + _LONGEST)
+    first, report = programs[0] if programs else None, outcome(case, session, recorder, 0)
+    meta = {"scenario": scenario.name, "scenario_digest": scenario.digest, "stage": report.session.stage}
+    ages = session.measurement.result
     return Rehearsed(
-        stage=str(session.stage),
-        cause=session.cause,
-        delay=delays[0] if delays else None,
+        stage=report.session.stage,
+        cause=report.session.cause,
+        delay=1e-6 * ages.median if ages.values else None,
         theta=first and first.scenario.theta,
         latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
         assessment=first and first.assessment,
-        result=recorder.trace(session.units, scenario.T, meta, scenario.channel_names) if ticks else None,
-        zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
+        result=recorder.trace(session.units, scenario.T, meta, scenario.channel_names) if len(recorder) else None,
+        zero_after=None if rehearsal.armed_us is None else rehearsal.zero_after(seconds),
     )

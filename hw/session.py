@@ -120,14 +120,9 @@ class Session:
         if self.stage != Stage.MEASURED:
             return ()
         if not programs or not all(program.certified for program in programs):
-            return self.refuse("the coupling is not certified", now)
+            return self.end(Stage.REFUSED, "the coupling is not certified", now)
         self.programs = tuple(programs)
         return self._take(0, "certified")
-
-    def refuse(self, cause: str, now: int) -> Said:
-        """End the session as refused, while no force acts."""
-        self.now = now
-        return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> Said:
         """Arm at a person's request. Do nothing unless the session is disarmed and `hindrance` is None."""
@@ -176,10 +171,10 @@ class Session:
             return ()
         return self._end(after, cause, wire.Reason.DONE)
 
-    def fail(self, cause: str, now: int) -> Said:
-        """End the session as stopped, without a ramp by the host, because of a fault."""
+    def end(self, stage: Stage, cause: str, now: int) -> Said:
+        """End the session in this stage at once, without a ramp by the host, unless it has ended."""
         self.now = now
-        return () if self.stage in ENDED else self._end(Stage.STOPPED, cause)
+        return () if self.stage in ENDED else self._end(stage, cause)
 
     def estop(self, cause: str, now: int) -> Said:
         """Latch zero force on both sides at once, also where the session has ended."""
@@ -187,11 +182,6 @@ class Session:
         if self.stage == Stage.ESTOP:
             return ()
         return self._end(Stage.ESTOP, cause, wire.Reason.ESTOP)
-
-    def lost(self, cause: str, now: int) -> Said:
-        """End the session because the port is gone."""
-        self.now = now
-        return () if self.stage in ENDED else self._end(Stage.LOST, cause)
 
     # calls when the device answers
 
@@ -212,9 +202,9 @@ class Session:
         try:
             return understand(heard)
         except wire.SafetyStop as fault:
-            return self.fail(str(fault), now)
+            return self.end(Stage.STOPPED, str(fault), now)
         except Exception as error:  # after any error, stop the device first
-            return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
+            return self.end(Stage.STOPPED, f"{type(error).__name__} in the bridge: {error}", now)
 
     def poll(self, now: int) -> Said:
         """Act on time-outs and on a STOP that must be repeated."""

@@ -180,7 +180,8 @@ class Live(Driver):
                     super().turn()
             except BaseException as error:
                 with suppress(PortLost):
-                    self.do(session.fail(f"{type(error).__name__} in the bridge: {error}", self.clock()))
+                    cause = f"{type(error).__name__} in the bridge: {error}"
+                    self.do(session.end(Stage.STOPPED, cause, self.clock()))
                 raise
         return session
 
@@ -190,7 +191,7 @@ class Live(Driver):
         try:
             self._steer(self.clock())
         except PortLost as lost:
-            self.session.lost(str(lost), self.clock())
+            self.session.end(Stage.LOST, str(lost), self.clock())
 
     def _steer(self, now: int) -> None:
         session = self.session
@@ -202,7 +203,8 @@ class Live(Driver):
             self.do(session.estop("SIGUSR1", now))
         elif self.signals:
             name = signal.Signals(self.signals[0]).name
-            self.do(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
+            again = len(self.signals) > 1
+            self.do(session.end(Stage.STOPPED, f"{name} again", now) if again else session.stop(name, now))
         if now - self._watched > 100_000:
             self._watched = now
             self._watch(session)

@@ -144,7 +144,7 @@ def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
     session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
     last = session.link.last
     assert last
-    session.fail("a test", session.now)
+    session.end(Stage.STOPPED, "a test", session.now)
     for ahead in (1, 2):
         answer = session.take(last._replace(tick=(last.tick + ahead) & 0xFFFF), session.now)
         assert [type(m) for m in answer] == [Stop]

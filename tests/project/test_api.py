@@ -118,6 +118,14 @@ def test_a_session_that_is_refused_says_why():
     assert session.result is session.zero_after is session.coupling is None
 
 
+def test_a_rehearsal_at_its_force_limit_is_stopped():
+    """As the command says it: forces that were cut for most of a second are not the forces that were asked for."""
+    weak = tuple(replace(device, force_limit=0.03) for device in load().device)
+    session = rehearse(load().replace(T=1e-3, theta=(1, 1), device=weak), seconds=1.5)
+    assert session.stage == "stopped"
+    assert re.search(r"asked to, but \d+ % of its forces were cut in a second", session.cause)
+
+
 def test_simulate_is_the_commands_run(tmp_path):
     result = simulate(SHORT)
     assert isinstance(result, Trace)
