@@ -82,7 +82,7 @@ def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
     W0, given, theta = 0.05, hands.energy(), (1, 2)
     force, budget = controller(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=40)
     line, x, most = np.zeros((3, 2, 40)), hands.x, 0.0
-    for _ in range(1500):
+    for _ in range(1000):
         line = np.concatenate([budget.limit(force(), hands.x - x)[None], line[:-1]])
         x = hands.x
         assert (budget.energy - budget.reserved > -1e-9).all()
@@ -264,7 +264,7 @@ def test_delayed_springs_within_bounds_are_never_limited(theta):
 
 def test_a_cap_below_stored_energy_limits_most_ticks():
     """1000 N/m over 2 cm store 0.2 J."""
-    x = 0.02 * np.sin(2 * np.pi * 1.0 * T * np.arange(8000))[:, None, None]
+    x = 0.02 * np.sin(2 * np.pi * 1.0 * T * np.arange(2500))[:, None, None]
     spring = Lti.constant([[1000.0]], T)
     share = {cap: acted_on(spring, x, (0,), [1.37], cap=cap)[0] / len(x) for cap in (0.05, 0.25)}
     assert share[0.25] == 0

@@ -19,7 +19,8 @@ from haptic_loop.controller.environment import GROUND, Network, Wall, environmen
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.tick import Process
-from haptic_loop.design.audit import audit, requirement
+from haptic_loop.design.assessment import assess
+from haptic_loop.design.audit import requirement
 from haptic_loop.design.certificate import prove, requirements_of
 from haptic_loop.design.result import MAKING
 from haptic_loop.models.device import CompliantDevice
@@ -274,7 +275,7 @@ def test_stiffer_couplings_are_certified_for_switching_walls():
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
-    assert audit(loop, coupling).assessment.guarantee.environments == MAKING
+    assert assess(loop, coupling).guarantee.environments == MAKING
     stiff = SpringDamper([1772.0], [0.453])
     assert not requirement(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())

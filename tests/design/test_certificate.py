@@ -163,11 +163,12 @@ def test_only_this_environment_proves_environment_delay():
         prove(loop, damped, "any-environment")
 
 
-def test_proof_and_sweep_agree_on_both_sides():
-    """60 random loops; between 1 - 1e-4 and 1 either outcome is fair."""
+@pytest.mark.parametrize("count", [20, pytest.param(60, marks=pytest.mark.validate)])
+def test_proof_and_sweep_agree_on_both_sides(count):
+    """Random loops; between 1 - 1e-4 and 1 either outcome is fair."""
     rng = np.random.default_rng(7)
     outcomes = []
-    for _ in range(60):
+    for _ in range(count):
         loop, coupling = random_case(rng)
         ratio = required_damping(loop, coupling, "this-environment").ratio
         try:
@@ -176,7 +177,7 @@ def test_proof_and_sweep_agree_on_both_sides():
             proved = False
         outcomes.append(proved)
         assert proved == (ratio < 1) or 1 - 1e-4 <= ratio <= 1
-    assert 15 < sum(outcomes) < 45
+    assert count / 4 < sum(outcomes) < 3 * count / 4
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
@@ -468,9 +469,9 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
 
 def test_proof_and_sweep_agree_on_any_network():
     """`make validate` does so for 500."""
-    found = list(proofs(11, 60))
+    found = list(proofs(11, 20))
     assert [row for row in found if not row.holds] == []
-    assert 18 < sum(row.proved for row in found) < 42
+    assert 6 < sum(row.proved for row in found) < 14
 
 
 def test_every_block_is_measured_before_it_is_proved(monkeypatch):

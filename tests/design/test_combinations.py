@@ -86,13 +86,21 @@ EVERY = {
 SETS = [names for count in (2, 3, 4) for names in itertools.combinations(EVERY, count)]
 
 
+#: the sets of three facts are left to `make validate`: they lie between those of two and that of all
+MOST_SETS = pytest.mark.parametrize(
+    "names",
+    [pytest.param(names, marks=[pytest.mark.validate] if len(names) == 3 else []) for names in SETS],
+    ids="-".join,
+)
+
+
 def combined(names, delta=10.0):
     fields = {key: value for name in names for key, value in EVERY[name].items()}
     rho, network = fields.pop("rho", None), held(*fields.pop("walls", ()))
     return loop_of(network, 1e-3, 1, delta, **fields), rho
 
 
-@pytest.mark.parametrize("names", SETS, ids="-".join)
+@MOST_SETS
 def test_every_combination_is_proved_stored_and_verified(names):
     """At 1.001 of the damping that the sweep finds, and not at 0.999; a file without a multiplier is refused."""
     loop, rho = combined(names)
@@ -155,14 +163,11 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     return int((energy[1] > 1.02 * energy[0]).sum())
 
 
-@pytest.mark.parametrize(
-    "names",
-    [pytest.param(names, marks=[pytest.mark.validate] if len(names) == 3 else []) for names in SETS],
-    ids="-".join,
-)
-def test_no_hand_gains_energy_at_the_requirement(names):
+@pytest.mark.parametrize("ticks", [TICKS // 4, pytest.param(TICKS // 2, marks=pytest.mark.validate)])
+@MOST_SETS
+def test_no_hand_gains_energy_at_the_requirement(names, ticks):
     loop, rho = combined(names)
-    assert growing(loop, COUPLING, 1.01 * need(loop, COUPLING, rho), rho, ticks=TICKS // 2) == 0
+    assert growing(loop, COUPLING, 1.01 * need(loop, COUPLING, rho), rho, ticks=ticks) == 0
 
 
 @pytest.mark.parametrize("names", [("latency", "walls"), ("latency", "switching")], ids="-".join)
@@ -171,7 +176,7 @@ def test_some_hands_gain_energy_far_below_the_requirement(names):
     assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
 
 
-@pytest.mark.parametrize("names", [("walls",), ("limiter",), ("walls", "limiter"), ("latency", "walls")], ids="-".join)
+@pytest.mark.parametrize("names", [("walls", "limiter"), ("latency", "walls")], ids="-".join)
 def test_facts_are_proved_at_every_vertex(names):
     """One set of multipliers serves all environments, each of which asks for at most as much by its own."""
     loop, rho = combined(names)
@@ -264,13 +269,14 @@ def lossless(rng):
     return Network(("tip",), springs, {node: 10 ** rng.uniform(-4, 0) for node in nodes[:-1] if rng.random() < 0.7})
 
 
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.validate)])
 @pytest.mark.parametrize("limited", [False, True])
 @pytest.mark.parametrize("further", [LATE, SWITCHED, LATE | SWITCHED], ids=["latency", "switching", "both"])
-def test_no_hand_gains_energy_before_lossless_environments(further, limited):
+def test_no_hand_gains_energy_before_lossless_environments(further, limited, count):
     """At worst ages and latencies, before walls with the limiter of no lag, too."""
     rng = np.random.default_rng(11)
     _, least = anywhere(further)
-    for seed in range(2):
+    for seed in range(count):
         network = change(lossless(rng), walls=(wall(3000.0, 2.0),) if limited else ())
         loop = change(anywhere(further)[0], environment=network)
         assert growing(loop, ANYWHERE, 1.01 * least, 0.0 if limited else None, 0.5, seed, 4000) == 0
