@@ -88,11 +88,12 @@ def test_drawn_devices_are_within_their_bounds(engine):
     assert 0.3 < (masses == 0.06).mean() < 0.7  # the worst device is at its bounds
 
 
-def test_hundreds_of_hands_pass_on_known_devices(tmp_path):
-    """At 1.001 of what known-device asks none of 400 grows, on no device of the bounds; the worst one replays."""
+@pytest.mark.parametrize("humans", [150, pytest.param(400, marks=pytest.mark.validate)])
+def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
+    """At 1.001 of what known-device asks none grows, on no device of the bounds; the worst one replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
-    base += ["--duration", "0", "--engine", "exact", "--humans", "400", "--links", "mixed"]
+    base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed"]
     assert main([*base, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
     assert report["certified"]
@@ -212,8 +213,8 @@ def test_a_human_depends_on_seed_and_index_only():
 
 def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
-    monkeypatch.setattr(examine_module, "_BATCH", 60)
-    question = Validation(SCENARIO, PUBLISHED["I"], 0, 130, MIXED, "both", 0.3)
+    monkeypatch.setattr(examine_module, "_BATCH", 20)
+    question = Validation(SCENARIO, PUBLISHED["I"], 0, 50, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
