@@ -215,7 +215,7 @@ class _EmulatedPlant:
 
     def counts(self) -> tuple[int, ...]:
         """Return the counts of the encoders."""
-        return tuple(int(n) for n in np.round(self.s[: self.channels] / self.encoder_step))
+        return tuple(map(int, (self.s[: self.channels] / self.encoder_step).round().tolist()))
 
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
         """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
@@ -224,11 +224,11 @@ class _EmulatedPlant:
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
-        f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
+        f, m, n = np.minimum(np.maximum(f, -self._limit), self._limit), self.channels, self.scene.model.nq
         for _ in range(self._substeps):
             friction = self.coulomb * np.tanh(self.s[n : n + m] * self.scenario.lever / _SLIP) if self.coulomb else 0.0
             self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])
-            self.fastest = max(self.fastest, float(np.abs(self.s[n : n + m]).max()))
+            self.fastest = max(self.fastest, *map(abs, self.s[n : n + m].tolist()))
 
     def _hold(self, share: float) -> Array:
         held = hold(self._plant, share * self.scenario.T / self._substeps)

@@ -31,7 +31,7 @@ def around(scenario, coupling):
 @pytest.fixture(scope="module")
 def optimal():
     """Of three channels one over a small basis."""
-    small = design(STAR.loop("I"), Options(bases=((8, 6),)))
+    small = design(STAR.loop("I"), Options(bases=((6, 4),)))
     return {PAIR.name: choose(PAIR, "I", "optimal").coupling, STAR.name: small.coupling}
 
 
