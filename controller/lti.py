@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
@@ -228,7 +229,10 @@ class Lti(ReadOnly):
             first = max(end - _ROWS, 0)
             for i in reversed(range(first, end)):
                 X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
-            X[:first] += S[:first, first:end] @ X[first:end]
+            rows: Any = np.flatnonzero(S[:first, first:end].any(axis=1))
+            if rows.size > first // 2:
+                rows = slice(first)
+            X[rows] += S[rows, first:end] @ X[first:end]
         read = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
         return (read @ U @ X).reshape(len(read), self.inputs, points.size)
 
@@ -324,16 +328,23 @@ class Lti(ReadOnly):
     def _schur(self) -> tuple[Complex, Complex]:
         """The Schur form A = U S U* of the core states, with S upper triangular.
 
-        A lower triangular A, as that of delay lines, only needs its states in reverse order.
+        If A is block lower triangular, as that of delay lines and of chains of sections, each diagonal block has a
+        Schur form of its own, and S keeps the zeros of A. Its blocks are in reverse order.
         """
-        core = self._lines[0]
-        A = self.A[np.ix_(core, core)]
-        if _is_lower(A):
-            return A[::-1, ::-1].astype(np.complex128), np.eye(core.size)[::-1].astype(np.complex128)
         import scipy
 
-        S, U, *_ = scipy.linalg.schur(A, output="complex")
-        return S, U
+        core = self._lines[0]
+        A, n = self.A[np.ix_(core, core)], core.size
+        last = np.maximum.accumulate(np.where((A != 0) | np.eye(n, dtype=bool), np.arange(n), 0).max(axis=1))
+        ends = 1 + np.flatnonzero(last == np.arange(n))
+        if ends.size == 1:
+            S, U, *_ = scipy.linalg.schur(A, output="complex")
+            return S, U
+        U = np.zeros((n, n), dtype=np.complex128)
+        for first, end in pairwise([0, *ends.tolist()]):
+            own = A[first:end, first:end]
+            U[first:end, n - end : n - first] = 1 if end - first == 1 else scipy.linalg.schur(own, output="complex")[1]
+        return np.triu(U.conj().T @ A @ U), U
 
     def dc(self) -> Array:
         """Return G(1), shape (..., p, m)."""
