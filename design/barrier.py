@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of 
 _KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
 _LONGEST = 1e3  # largest step, in Newton steps
 _RIDGE = 1e-9  # relative ridge, for directions on which neither objective nor inequalities depend
+_upper = cache(np.triu_indices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ class EntryInequality:
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """The pairs (first, second) of functions t, u: [Re tu, Im tu, Re tu*], (n (n + 1)/2, 3 k), and Im tu*."""
-        first, second = np.triu_indices(self.functions.shape[1])
+        first, second = _upper(self.functions.shape[1])
         t, u = self.functions.T[first], self.functions.T[second]
         along, against = t * u, t * np.conj(u)
         return first, second, np.hstack([along.real, along.imag, against.real]), np.ascontiguousarray(against.imag)
@@ -129,7 +130,7 @@ class EntryInequality:
         L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
         P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
         row, column = (v.ravel() for v in np.indices((r, r)))
-        one, two = np.triu_indices(r * r)
+        one, two = _upper(r * r)
         (i, j), (g, h) = (row[one], column[one]), (row[two], column[two])
         across, of_left, of_right = V @ P @ L, adjoint(L) @ P @ L, V @ P @ adjoint(V)
         along, against = across[:, h, i] * across[:, j, g] / 2, of_left[:, g, i] * of_right[:, j, h] / 2
@@ -254,14 +255,13 @@ def _solved(hessian: Array, right: Array) -> Array:
 
     scale = 1 / np.sqrt(np.diag(hessian))
     unit = scale[:, None] * hessian * scale
-    ridge = 0.0
+    diagonal, ridge = unit.diagonal().copy(), 0.0
     while True:
         try:
-            return scale * scipy.linalg.cho_solve(
-                scipy.linalg.cho_factor(unit + ridge * np.eye(len(unit))), scale * right
-            )
+            return scale * scipy.linalg.cho_solve(scipy.linalg.cho_factor(unit), scale * right)
         except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
+            np.fill_diagonal(unit, diagonal + ridge)
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
@@ -294,7 +294,7 @@ def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Arra
 def _turned(W: Complex) -> Array:
     """Return the map H -> W H W* on `packed` matrices, (k, r^2, r^2), from (W H W*)_ab = sum W_ac conj(W_bd) H_cd."""
     r = W.shape[-1]
-    c, d = np.triu_indices(r, 1)
+    c, d = _upper(r, 1)
     a, b = np.append(np.arange(r), c), np.append(np.arange(r), d)
     left, right = W[:, a, :], np.conj(W[:, b, :])
     one, other = left[..., c] * right[..., d], left[..., d] * right[..., c]
@@ -305,7 +305,7 @@ def _turned(W: Complex) -> Array:
 
 def packed(H: Complex) -> Array:
     """Return Hermitian matrices (.., r, r) as real vectors (.., r^2) with the same inner product."""
-    upper = np.triu_indices(H.shape[-1], 1)
+    upper = _upper(H.shape[-1], 1)
     off = np.sqrt(2) * H[..., upper[0], upper[1]]
     return np.concatenate([np.real(np.diagonal(H, axis1=-2, axis2=-1)), np.real(off), np.imag(off)], axis=-1)
 
@@ -313,7 +313,7 @@ def packed(H: Complex) -> Array:
 def _unpacked(v: Array) -> Complex:
     """Return the Hermitian matrices of `packed` vectors."""
     r = math.isqrt(v.shape[-1])
-    upper, count = np.triu_indices(r, 1), r * (r - 1) // 2
+    upper, count = _upper(r, 1), r * (r - 1) // 2
     H = np.zeros((*v.shape[:-1], r, r), dtype=complex)
     H[..., upper[0], upper[1]] = (v[..., r : r + count] + 1j * v[..., r + count :]) / np.sqrt(2)
     H = H + np.conj(np.swapaxes(H, -2, -1))

@@ -20,7 +20,7 @@ from typing import Any, Generic
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.arithmetic import Number, numbers, times
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, Sampled, as_like, vstack
 from haptic_loop.controller.lti import Block as AnyBlock
@@ -314,7 +314,7 @@ class Collected(Generic[AnyBlock]):
             place = follows + w + late.index(column)
             steps[row, place] = steps[row, place] + weight
         free = np.hstack([sums, steps]) @ vstack(regular, signals) + self._matrix(self._terms)
-        return sums @ static, free, self.gain()
+        return times(sums, static), free, self.gain()
 
 
 def _taps(rows: Sequence[Weights], T: Number) -> Lti:
