@@ -22,7 +22,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 if TYPE_CHECKING:
     from haptic_loop.design.audit import Audit, Help, Margins
     from haptic_loop.design.coverage import Switching
-    from haptic_loop.design.guarantees import EncoderSteps
+    from haptic_loop.sim.report import EncoderSteps
 
 _EXAMPLES = (
     "python -m design.audit --K 2870,2320 --B 5.47,5.55",

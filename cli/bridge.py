@@ -20,8 +20,7 @@ from haptic_loop.cli.verdict import verdict
 from haptic_loop.cli.world import world_start
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import plain, write_json
-from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import listed
+from haptic_loop.design.result import CAVEATS, listed
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings, timed
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages

@@ -25,9 +25,8 @@ from haptic_loop.design.certificate import (
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import RANGES
 from haptic_loop.design.known_device import described
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, suffices, switching_guarantee
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, RANGES, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search_ranges
 from haptic_loop.sim.couplings import read_coupling
 

@@ -19,11 +19,9 @@ from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.guarantees import held_torques
-from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite
+from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite, held_torques
 from haptic_loop.design.robustness import Robustness
-from haptic_loop.sim.alternatives import Alternative, alternatives
-from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
+from haptic_loop.sim.comparison import Alternative, ComparedCoupling, Comparison, ConditionCurve, alternatives
 from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
 from haptic_loop.sim.stability import MARGINAL

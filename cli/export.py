@@ -30,8 +30,7 @@ from haptic_loop.design.export import (
     with_origin,
 )
 from haptic_loop.design.files import off_table, out_file, write
-from haptic_loop.design.guarantees import held_torques
-from haptic_loop.design.result import listed
+from haptic_loop.design.result import held_torques, listed
 from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.scenario import InputError
 

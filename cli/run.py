@@ -15,8 +15,7 @@ from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import write
-from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import Chosen, finite
+from haptic_loop.design.result import CAVEATS, Chosen, finite
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.accuracy import MOST
 from haptic_loop.sim.couplings import NAMES

@@ -18,9 +18,8 @@ from haptic_loop.controller.ranges import Member
 from haptic_loop.design.conditions import this_environment
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.result import KNOWN_CONDITIONS, PLAIN_CONDITIONS, Chosen
+from haptic_loop.design.result import ANY, KNOWN_CONDITIONS, PLAIN_CONDITIONS, RANGES, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts

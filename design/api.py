@@ -20,9 +20,16 @@ from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT, LimitedForces
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
+from haptic_loop.design.result import (
+    ANY,
+    RANGES,
+    ConditionName,
+    Design,
+    NotProved,
+    Requirement,
+    switching_guarantee,
+)
 from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]

@@ -40,10 +40,20 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
-from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES, held_torques
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
+from haptic_loop.design.result import (
+    ANY,
+    AT_VERTICES,
+    CONDITIONS,
+    KNOWN_CONDITIONS,
+    RANGES,
+    Design,
+    NotProved,
+    Requirement,
+    held_torques,
+    suffices,
+)
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 

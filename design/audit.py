@@ -29,11 +29,10 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coverage import Switching
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
-from haptic_loop.design.guarantees import CAVEATS
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.necessary import LeftOver, left_over
 from haptic_loop.design.own import place_of
-from haptic_loop.design.result import GUARD, ConditionName, Requirement, listed, refusal, suffices
+from haptic_loop.design.result import CAVEATS, GUARD, ConditionName, Requirement, listed, refusal, suffices
 from haptic_loop.design.worst_member import Progress
 
 # ----------------------------------------------------------------------------------------------------

@@ -19,11 +19,10 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
-from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
-from haptic_loop.design.result import Design, DesignFailed
+from haptic_loop.design.result import ANY, Design, DesignFailed
 from haptic_loop.design.transparency import NO_FORCE, silent
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.certificate import Verdict, lag
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.guarantees import RANGES
-from haptic_loop.design.result import listed, switching_guarantee
+from haptic_loop.design.result import RANGES, listed, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
 # An export is one state-space block with a fixed order of its sums, and a test vector in that order.

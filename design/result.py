@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.coupling import Coupling
-from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
@@ -28,6 +28,16 @@ PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDIT
 
 #: the environments for which this-environment holds in a loop with walls, in words
 MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
+
+ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
+AT_VERTICES = "these ranges: proved at the vertices, searched between them"  # RANGES in words
+#: limits of every certificate
+CAVEATS = (
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
+    "or leave through the limiter that a report names, "
+    "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "friction pays for, velocity filters or friction compensation."
+)
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
@@ -252,3 +262,8 @@ class Design(Chosen):
 
     def __repr__(self) -> str:
         return f"Design({self.coupling!r} for {self.requirement!r})"
+
+
+def held_torques(loop: Loop) -> str | None:
+    """Return the remark that conditions ignore the change of pose while torques are held; None without `loop.axes`."""
+    return "not charged: forces count as held in space while the pose moves on" if loop.axes else None

@@ -15,8 +15,7 @@ from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import suffices
+from haptic_loop.design.result import ANY, suffices
 
 #: More than _FEW environments are first compared at every _THIN-th frequency. Only those within _NEAR of the worst one
 #: are then swept at all frequencies.

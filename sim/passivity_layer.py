@@ -28,8 +28,7 @@ from haptic_loop.controller.delay import LOST, Ticks, ages
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import Net, Process
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import Requirement
+from haptic_loop.design.result import ANY, Requirement
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import InputError
 

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
-from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import ANY
 
-Row = Comparison = Any  # sim.accuracy.Row and sim.compare_report.Comparison, which would be circular imports
+Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison, which would be circular imports
 
 
 class Run(Protocol):

@@ -36,8 +36,7 @@ from haptic_loop.design.audit import check_loop, edge
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import CONDITIONS, PLAIN_CONDITIONS, Requirement, refusal, suffices
+from haptic_loop.design.result import ANY, CONDITIONS, PLAIN_CONDITIONS, Requirement, refusal, suffices
 from haptic_loop.models.device import Device
 from haptic_loop.models.human import Population
 from haptic_loop.sim import limit_cycles

@@ -15,8 +15,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.controller.units import in_unit
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write
-from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import Chosen, Requirement, suffices
+from haptic_loop.design.result import CAVEATS, Chosen, Requirement, suffices
 from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL

@@ -6,7 +6,7 @@ import pytest
 
 from haptic_loop.cli.compare import _nearest, main
 from haptic_loop.cli.run import main as run_once
-from haptic_loop.sim.alternatives import Alternative
+from haptic_loop.sim.comparison import Alternative
 from haptic_loop.sim.scenario import InputError
 
 

@@ -19,7 +19,7 @@ from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
-from haptic_loop.design.guarantees import HERE
+from haptic_loop.design.result import HERE
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.scenario import load

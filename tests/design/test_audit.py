@@ -22,7 +22,7 @@ from haptic_loop.design.api import certify
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _remedies, audit, edge, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
-from haptic_loop.design.guarantees import ANY, CAVEATS
+from haptic_loop.design.result import ANY, CAVEATS
 from tests.asked import needs, safe_with
 
 CONDITIONS = ("this-environment", "any-environment")

@@ -26,7 +26,7 @@ HOMES = {
     "cvxpy": {"design/lmi.py"},  # the lemmas, for who gives expressions
     "clarabel": {"design/cone.py"},
     "serial": {"hw/transport.py"},
-    "matplotlib": {"sim/map_plot.py", "sim/plots.py"},
+    "matplotlib": {"sim/map_plot.py", "sim/plots.py", "cli/render.py"},  # the latter only shortens its import
     "PIL": {"sim/view/"},
 }
 
