@@ -659,9 +659,10 @@ def _block_diagonal(parts: Sequence[Array]) -> Array:
 
 def _block(rows: Sequence[Sequence[Array]]) -> Array:
     """Return numpy.block over the last two axes; the leading axes are broadcast."""
-    lead = np.broadcast_shapes(*(b.shape[:-2] for row in rows for b in row))
-    table = [[np.broadcast_to(b, (*lead, *b.shape[-2:])) for b in row] for row in rows]
-    return np.concatenate([np.concatenate(row, axis=-1) for row in table], axis=-2)
+    if any(b.ndim > 2 for row in rows for b in row):
+        lead = np.broadcast_shapes(*(b.shape[:-2] for row in rows for b in row))
+        rows = [[np.broadcast_to(b, (*lead, *b.shape[-2:])) for b in row] for row in rows]
+    return np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
 
 
 def _floats(value: ArrayLike, name: str) -> Array:

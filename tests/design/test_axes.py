@@ -133,6 +133,7 @@ CORNER = Plane(
     np.diag([0.5] * 4) - 0.5 * np.eye(4, k=2) - 0.5 * np.eye(4, k=-2) + np.diag([0, 0, 0.2, 0.2]),
     np.kron([[1, -1], [-1, 1.2]], np.diag([900.0, 300.0])),
 )
+ONE_DEVICE = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), CORNER, axes=(2,), levels=LEVELS[:1])
 TURN = np.array([[0.8, 0.6], [-0.6, 0.8]])
 BUILT = _MatrixSpringDamper(
     [[1500, 300, 0, 0], [300, 800, 0, 0], [0, 0, 1000, -200], [0, 0, -200, 700]], 0.2 * np.eye(4)
@@ -430,10 +431,11 @@ def test_known_devices_take_full_levels() -> None:
 
 
 def test_known_devices_permit_a_stiffer_coupling_with_full_levels() -> None:
-    known, every = (design_by_kind(KNOWN, "moving-average", name) for name in ("known-device-any", "any-environment"))
+    loop = msgspec.structs.replace(ONE_DEVICE, known_devices=(BOUNDS,) * 2)
+    known, every = (design_by_kind(loop, "moving-average", name) for name in ("known-device-any", "any-environment"))
     assert 0.999 < known.requirement.ratio < 1
-    assert prove(KNOWN, known.coupling, "known-device-any").proof == "rational"
-    softer, stiffer = (design.coupling.compliance(KNOWN.T).dc() for design in (every, known))
+    assert prove(loop, known.coupling, "known-device-any").proof == "rational"
+    softer, stiffer = (design.coupling.compliance(loop.T).dc() for design in (every, known))
     assert np.linalg.eigvalsh(softer - stiffer).min() > 0
 
 
@@ -657,9 +659,6 @@ def test_switching_search_shares_a_multiplier() -> None:
 def test_reports_show_matrix_gains_on_their_diagonal() -> None:
     rows = dict(verdict.gain_rows(assess(PAIR, BUILT)))
     assert rows == {"coupling, static": "1500, 800, 1000, 700 N/m"}
-
-
-ONE_DEVICE = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), CORNER, axes=(2,), levels=LEVELS[:1])
 
 
 @pytest.mark.parametrize("loop", [ONE_DEVICE, pytest.param(LOOP, marks=pytest.mark.validate)])

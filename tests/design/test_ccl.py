@@ -134,7 +134,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     assert t.value == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize(("order", "diagonal"), [(1, False), (2, True), (3, True)])
+@pytest.mark.parametrize(("order", "diagonal"), [(1, False), (3, True)])
 def test_three_steps_beat_the_structured_design(order, diagonal, structured):
     """The start is designed for a thousandth less damping, so it is a thousandth worse; each step gains 1 to 3 %."""
     design = ccl.design(asked(), order, diagonal, most_sdps=3)

@@ -141,7 +141,7 @@ def gains_of_least(cost, theta, sigma):
 
 
 @pytest.mark.parametrize("most_stored", [1000, 0])
-@pytest.mark.parametrize(("theta", "sigma"), [(0, np.inf), (1, np.inf), (12, np.inf), (0, 3.0), (2, 5.0), (7, 3.0)])
+@pytest.mark.parametrize(("theta", "sigma"), [(0, np.inf), (12, np.inf), (0, 3.0), (7, 3.0)])
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """Its furthest points, by one matrix inequality and by many, against cvxpy: 5e-6, since the many miss 2e-6."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
