@@ -74,7 +74,7 @@ def test_our_own_tags_are_colours():
     assert text.getvalue() == "\x1b[31mnot guaranteed\x1b[0m: [m]\n"
 
 
-def test_a_pipe_is_told_what_a_command_waits_for(capsys, monkeypatch):
+def test_pipes_are_told_what_a_command_awaits(capsys, monkeypatch):
     monkeypatch.setattr(render, "_SILENCE", 0.0)
     with render.progress("designing the coupling"):
         for _ in range(2000):

@@ -430,7 +430,7 @@ def test_known_devices_take_full_levels() -> None:
     assert least(needs.ratio * (1 - 1e-3)) < 0
 
 
-def test_known_devices_permit_a_stiffer_coupling_with_full_levels() -> None:
+def test_known_devices_with_full_levels_permit_more_stiffness() -> None:
     loop = msgspec.structs.replace(ONE_DEVICE, known_devices=(BOUNDS,) * 2)
     known, every = (design_by_kind(loop, "moving-average", name) for name in ("known-device-any", "any-environment"))
     assert 0.999 < known.requirement.ratio < 1

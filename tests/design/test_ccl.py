@@ -180,7 +180,7 @@ def test_a_free_mass_is_called_useless(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("condition", "searched"), [("this-environment", True), ("any-environment", False)])
-def test_only_a_searched_spring_is_called_the_softest_tried(condition, searched, tmp_path, capsys):
+def test_only_searched_springs_are_called_the_softest(condition, searched, tmp_path, capsys):
     scenario = tmp_path / "free.toml"
     text = 'name = "free"\nT = 1e-3\ntheta = [1]\n[[device]]\nkind = "compliant"\ndamping = 1.37\n'
     scenario.write_text(text + '[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')

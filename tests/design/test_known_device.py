@@ -699,14 +699,14 @@ def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
-def test_an_exact_loop_on_known_devices_needs_no_coupling():
+def test_exact_loops_on_known_devices_need_no_coupling():
     found = design_coupling(KNOWN, "optimal")
     assert isinstance(found.coupling, NoCoupling)
     assert found.objective == 0
     assert found.requirement.required[0] == pytest.approx(1.3120, rel=1e-4)
 
 
-def test_a_spring_damper_before_a_wall_uses_the_device():
+def test_spring_dampers_before_walls_use_the_device():
     loop = on_a_wall(3000.0, 2.0, 1, 2.0)
     assert design_coupling(loop).condition == "known-device-any"
     plain = design_coupling(loop, "spring-damper", "this-environment")

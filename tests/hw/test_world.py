@@ -137,7 +137,7 @@ def in_the_ball_world(*faults):
     return session, -(f * dx + scenario.delta / np.array(scenario.T) * dx**2).sum(axis=1).cumsum()
 
 
-def test_motors_in_a_world_are_tested_at_the_end():
+def test_motors_in_worlds_are_tested_at_last():
     """Within W0; the account is that of the devices, by their motion and the applied forces."""
     session, given = in_the_ball_world()
     assert session.stage == Stage.FINISHED, session.cause

@@ -145,7 +145,7 @@ def test_hands_have_the_axes_of_their_devices(link: str, more: str, words: str) 
         parse(text)
 
 
-def test_a_person_holds_devices_with_the_same_free_axes() -> None:
+def test_persons_hold_devices_with_the_same_axes() -> None:
     person = "person = [{ holds = [1, 2], mass = 30.0, damping = 80.0, stiffness = 900.0 }]\n"
     text = TEXT.replace("FIRST", "").replace("SECOND", 'clamped = ["z"]').replace("MORE", "")
     with pytest.raises(InputError, match=r"person #1.holds is \[1, 2\].* which are x, y, z; x, y"):
