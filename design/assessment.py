@@ -64,7 +64,7 @@ PluggedEnvironment = Callable[[Array], Array]  # positions of the port without a
 # The environments of ranges.
 
 
-SAMPLES = 64  # default number of environments that are drawn evenly from inside the ranges
+_SAMPLES = 64  # default number of environments that are drawn evenly from inside the ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def check_ranges(
     loop: Loop,
     coupling: Coupling,
     seed: int = 0,
-    samples: int = SAMPLES,
+    samples: int = _SAMPLES,
     progress: Progress = lambda done, total: None,
     searched: Searched | None = None,
     certificate: Certificate | None = None,
@@ -515,7 +515,7 @@ def assess(
     certificate: Certificate | None = None,
     condition: str | Condition | None = None,
     ranges_seed: int = 0,
-    ranges_samples: int = SAMPLES,
+    ranges_samples: int = _SAMPLES,
     searched: Searched | None = None,
     limiter: bool | None = None,
     limiter_proof: Certificate | None = None,

@@ -38,7 +38,7 @@ _COLOUR: dict[str, tuple[float, float, float, float]] = {
 }
 
 
-class Shape(NamedTuple):
+class _Shape(NamedTuple):
     """One shape of the object."""
 
     kind: Literal["contact", "node", "mass", "spring", "wall"]
@@ -101,7 +101,7 @@ class DrawnObject:
         """Return the displacements of the nodes, tick by tick."""
         return _Motion(self.network, coupling, psi, T)
 
-    def shapes(self, displacements: Array | None = None) -> Iterator[Shape]:
+    def shapes(self, displacements: Array | None = None) -> Iterator[_Shape]:
         """Yield the shapes for displacements (nodes,) [m] of the nodes; None is at rest."""
         moved = {name: np.zeros(3) for name in self.rest}
         if displacements is not None:
@@ -114,16 +114,16 @@ class DrawnObject:
             a, b = (GROUND if end == GROUND else self.rest[end] + moved[end] for end in spring.between)
             if isinstance(a, str):
                 a, b = b, a
-            yield Shape("spring", np.asarray(a), np.array([-self.reach, a[1], a[2]]) if isinstance(b, str) else b)
+            yield _Shape("spring", np.asarray(a), np.array([-self.reach, a[1], a[2]]) if isinstance(b, str) else b)
         for wall in self.network.walls:
             first, second = wall.between
             sign = -1.0 if first == GROUND else 1.0
             near, other = (second, first) if first == GROUND else (first, second)
             normal = sign * np.pad(np.array(wall.normal or (1.0,)), (0, 3 - len(wall.normal or (1.0,))))
             away = (wall.gap + _RADIUS[self._kind(near)]) * normal
-            yield Shape("wall", self.rest[near] + away + moved.get(other, np.zeros(3)), normal)
+            yield _Shape("wall", self.rest[near] + away + moved.get(other, np.zeros(3)), normal)
         for name, at in self.rest.items():
-            yield Shape(self._kind(name), at + moved[name], at)
+            yield _Shape(self._kind(name), at + moved[name], at)
 
     def _kind(self, name: str) -> Literal["contact", "node", "mass"]:
         return "contact" if name in self.contacts else "mass" if self.network.masses.get(name) else "node"
