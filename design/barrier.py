@@ -139,8 +139,8 @@ class EntryInequality:
         odd = odd @ against.imag
         between = np.empty((one.size, n, n))
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
-        entries = np.zeros((r * r, n, r * r, n))
-        entries[one, :, two] = between
+        hessian, size = np.zeros((x.size, x.size)), r * r * n
+        hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] = between
         # Inner products with S^-1 and S^-1 slope_a S^-1.
         turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
         through = V[:, None] @ _unpacked(np.swapaxes(turned, 1, 2)) @ L[:, None]
@@ -149,9 +149,7 @@ class EntryInequality:
         beside = beside.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
         own = self.slope.reshape(k * r * r, -1).T @ turned.reshape(k * r * r, -1)
         gradient = -np.concatenate([beside[:, 0], own[:, 0]])
-        hessian = np.zeros((x.size, x.size))
-        hessian[: r * r * n] = np.hstack([entries.reshape(r * r * n, -1), beside[:, 1:]])
-        hessian[r * r * n :, r * r * n :] = own[:, 1:]
+        hessian[:size, size:], hessian[size:, size:] = beside[:, 1:], own[:, 1:]
         return gradient, hessian
 
 

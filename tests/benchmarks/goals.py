@@ -48,12 +48,14 @@ COMMANDS = {
     "sim.run --case I --no-plot --out {} --json {}/r.json": 2.5,
     "sim.run --case I --out {} --json {}/r.json": 4.0,
 }
+MANY = "design --coupling optimal --out {}/many.json --json {}/r.json --scenario"  # four and eight devices
 #: commands of many seconds, once -> goal in floors
 LONG = {
     "sim.validate --humans 1000 --no-plot --out {} --json {}/r.json": 7.3,
     "sim.validate --humans 1000 --no-plot --traces all --out {} --json {}/r.json": None,
     "sim.validate --humans 10000 --duration 0 --no-plot --out {} --json {}/r.json": 7.3,
     "design --coupling optimal --out {}/optimal.json --json {}/r.json": None,
+    **dict.fromkeys((f"{MANY} {ROOT}/benchmarks/loops/{name}.toml" for name in ("n6-star4-II", "n7-eight-I")), 29.0),
 }
 #: commands whose first line comes before their end -> goal in floors, of wall time
 FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/optimal.json": 6.4}
@@ -150,6 +152,7 @@ def interleaved(
             goal = commands.get(words)
             figures = f"{np.median(spent_on):.2f}", f"{np.median(spent_on / floor):.2f}", f"{goal:g}" if goal else ""
             name = words.replace(" --json {}/r.json", "").replace(" --out {}/", " --out ").replace(" --out {}", "")
+            name = name.replace(f"{ROOT}/", "")
             yield f"`{name.replace('{}/', '')}`", *figures, beside.get(words, "")
 
 
