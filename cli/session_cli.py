@@ -234,7 +234,6 @@ def hold_session(
     """
     with ExitStack() as stack:
         incidents = IncidentLog(out / "incidents.jsonl")
-        stack.callback(incidents.close)
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, incidents, alone, coulomb)

@@ -176,6 +176,10 @@ class Session:
         self.now = now
         return () if self.stage in ENDED else self._end(stage, cause)
 
+    def retract(self, doubt: str) -> None:
+        """Count a session that ended as planned as stopped, because of `doubt` about its forces."""
+        self._enter(Stage.STOPPED, f"{self.cause}, but {doubt}")
+
     def estop(self, cause: str, now: int) -> Said:
         """Latch zero force on both sides at once, also where the session has ended."""
         self.now = now

@@ -40,10 +40,10 @@ class IncidentLog:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file to append. Raises InputError where it cannot be written."""
+        """Append to the file. Raises InputError where it cannot be written."""
         self.path = path
         try:
-            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            path.open("ab").close()
         except OSError as error:
             raise InputError(f"cannot write {path}: {error.strerror}") from None
         self._written = 0  # [us]
@@ -63,11 +63,8 @@ class IncidentLog:
         self._write(standing | {"counters": asdict(session.counters)})
 
     def _write(self, line: dict[str, Any]) -> None:
-        with suppress(OSError):  # a full disk must not stop the session
-            os.write(self._file, (json.dumps(keys_in_unit(line)) + "\n").encode())
-
-    def close(self) -> None:
-        os.close(self._file)
+        with suppress(OSError), self.path.open("ab") as file:  # a full disk must not stop the session
+            file.write((json.dumps(keys_in_unit(line)) + "\n").encode())
 
 
 @dataclass(frozen=True)
@@ -183,9 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """Return the report of a session that has ended."""
-    begin = session.log[0].t_us if session.log else 0
-    log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
+    """Return the report of a session that has ended. One that ended as planned, but in doubt, becomes stopped."""
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
     steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []
@@ -194,10 +189,10 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
     worlds = _WorldSession.all_of(session, trace, recorder.link()["arming"]) if trace and session.worlds else None
     grown = growths(trace) if trace and not worlds else []  # the motion of a scene is no oscillation of the loop
-    stage, cause = str(session.stage), session.cause
     if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, recorder)):
-        stage, cause = str(Stage.STOPPED), f"{cause}, but {doubt}"
-        log.append(_Event(log[-1].t_s, stage, cause))
+        session.retract(doubt)
+    begin = session.log[0].t_us if session.log else 0
+    log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
     return SessionReport(
         case,
         session.scenario.name,
@@ -205,7 +200,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         coupled and coupled.capped(session.limits.cap),
         coupled and coupled.link,
         coupled and coupled.remarks(),
-        _Ended(stage, cause, ticks > 0, log),
+        _Ended(str(session.stage), session.cause, ticks > 0, log),
         _Link.of(session, recorder, dropped),
         ran,
         grown,

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -163,9 +164,9 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     rehearsal.run_until_armed(2.5)
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.5)
-    report = outcome("I", session, recorder, 0)
     assert session.stage == Stage.FINISHED
-    assert report.session.stage == "stopped"
+    report = outcome("I", session, recorder, 0)
+    assert report.session.stage == session.stage == "stopped"
     assert "% of its forces were cut" in report.session.cause
 
 
@@ -230,7 +231,6 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     steer = rehearsal.operator.decide
     rehearsal.operator.decide = lambda session, now: (log.update(session), steer(session, now))[1]
     session = rehearsal.run_until_armed(3.0)
-    log.close()
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     assert [line["stage"] for line in lines if "cause" in line] == [str(event.stage) for event in session.log]
     standing = [line for line in lines if "gain" in line]
@@ -241,6 +241,16 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):
         IncidentLog(tmp_path)
+
+
+def test_doubts_reach_log_and_picture(tmp_path, capsys):
+    """Forces of 0.05 N at most are cut for most of a second: report, incidents and title say stopped."""
+    words = "--rehearse --force-cap 0.05 --duration 1.5 --measure 60 --out"
+    assert bridge.main([*words.split(), str(tmp_path)]) == 1
+    report = json.loads((tmp_path / "report.json").read_text())["session"]
+    last = json.loads((tmp_path / "incidents.jsonl").read_text().splitlines()[-1])
+    assert (last["stage"], last["cause"]) == (report["stage"], report["cause"])
+    assert re.search(r"^the time is over, but \d+ % of its forces were cut in a second", last["cause"])
 
 
 # the machine
