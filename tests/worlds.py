@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
+import pytest
 
 from haptic_loop.controller.coupling import ForceFilter, SpringDamper, _InternalModel
 from haptic_loop.controller.delay import delay
@@ -18,6 +21,17 @@ FIGURE_4 = Network(
     ),
     masses={"mass": 1.0},
 )
+
+
+def checkered(*sides):
+    """Return all combinations of the sides' values as parameters; every second one is left to `make validate`.
+
+    Each value of each side stays with half of the values of every other side, like the fields of one colour.
+    """
+    marks = ((), pytest.mark.validate)
+    places = product(*(enumerate(side) for side in sides))
+    return [pytest.param(*(v for _, v in place), marks=marks[sum(i for i, _ in place) % 2]) for place in places]
+
 
 T = 1.2e-3  # [s]
 DELTA = (1.37, 1.37)  # [N s/m]

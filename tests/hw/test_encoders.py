@@ -6,6 +6,7 @@ from runpy import run_path
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from worlds import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
@@ -38,8 +39,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
 # at arming
 
 
-@pytest.mark.parametrize("axis", [1, 2])
-@pytest.mark.parametrize("kind", ["freeze", "toggle"])
+@pytest.mark.parametrize(("axis", "kind"), checkered([1, 2], ["freeze", "toggle"]))
 def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
     """Before the gain has risen at all: nobody has felt more than the test force."""
     session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
@@ -190,8 +190,7 @@ def test_a_moving_hand_is_no_motor(hand, alive):
         played(arming_test(alive=alive), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
 
 
-@pytest.mark.parametrize("at", [0.7, 0.9])
-@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize(("axis", "at"), checkered([1, 2], [0.7, 0.9]))
 def test_motors_that_died_never_finish(scenario, rungs, axis, at):
     """Under hands that move at full amplitude; the same session without the fault finishes."""
     for faults, stage in ((("motor=1",), Stage.FINISHED), ((f"axis{axis}:motor=0@0.6",), Stage.STOPPED)):
@@ -201,8 +200,7 @@ def test_motors_that_died_never_finish(scenario, rungs, axis, at):
     assert session.cause.startswith(f"motor or encoder of axis {axis} did not answer a test force of up to 1 N")
 
 
-@pytest.mark.parametrize("scale", [0.4, 2.5])
-@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize(("axis", "scale"), checkered([1, 2], [0.4, 2.5]))
 def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
     session, _ = session_with(scenario, rungs, f"axis{axis}:scale={scale}")
     assert session.stage == Stage.STOPPED
@@ -292,9 +290,7 @@ def test_still_encoders_under_force_are_dead(newton, found):
     assert (monitor.dead == "encoder or motor of axis 1 is dead: nothing moves for 0.5 s under a force") == found
 
 
-@pytest.mark.parametrize("axis", [1, 2])
-@pytest.mark.parametrize("kind", ["freeze", "toggle"])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
 def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
     """People who begin in either direction; the axis with the dead encoder is named, within 0.5 s."""
     turned = tuple(
@@ -306,8 +302,7 @@ def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, s
     assert 1e-6 * (session.log[-1].t_us - session.log[-2].t_us) < 0.7
 
 
-@pytest.mark.parametrize("axis", [1, 2])
-@pytest.mark.parametrize("most", [4.0, -4.0])
+@pytest.mark.parametrize(("axis", "most"), checkered([1, 2], [4.0, -4.0]))
 def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
     session, _ = session_with(scenario, rungs, f"axis{axis}:saturate={most}@0.3", seconds=2.0)
     assert session.stage == Stage.STOPPED

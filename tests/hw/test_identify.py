@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+from worlds import checkered
 
 from haptic_loop.cli.identify import _sitting, _table
 from haptic_loop.cli.identify import main as identify_command
@@ -341,8 +342,7 @@ def test_a_device_of_three_axes_is_one_table():
         assert read.credible_speed == pytest.approx(0.6 - 0.1 * (len(axes) - 1), abs=1e-3)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("axis", "sign"), checkered([0, 1], [1, -1]))
 def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
     monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 200_000)

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from worlds import checkered
 
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.models.scene import Crowd, Variants, draw, variants
@@ -52,8 +53,7 @@ def test_the_same_coupling_is_designed_for_both():
     assert one == other
 
 
-@pytest.mark.parametrize("scenario", DEVICES)
-@pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
+@pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_hundreds_of_hands_are_stable(scenario, lossless):
     """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
     growth = exact_growth(scenario, lossless)
@@ -77,8 +77,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
     assert upset[True] > (0.9 if compliant else 0.02) * HUMANS
 
 
-@pytest.mark.parametrize("scenario", DEVICES)
-@pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
+@pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's own one-period map, for all of them."""
     simulation = assemble(load(scenario), optimal())

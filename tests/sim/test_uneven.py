@@ -148,7 +148,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
 def test_hands_that_meet_uneven_ticks(tmp_path):
     """With a coupling nobody grows; without one most do, and both engines agree about whom."""
     file = tmp_path / "r.json"
-    ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "5", "--duration", "0.5"]
+    ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "3", "--duration", "0.3"]
     options = [*ticks, "--no-plot", "--out", str(tmp_path), "--json", str(file)]
     assert validate(["--case", "I", "--condition", "this-environment", *options]) == 0
     part = json.loads(file.read_text())["timing"]
@@ -188,7 +188,7 @@ def test_periods_vary_beside_delays():
 
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
-    rows = list(uneven.uneven_ticks(0, 3))
+    rows = list(uneven.uneven_ticks(0, 3, 2500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
     assert sum(row.grow > 0 for row in rows) >= 4

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hands import Hands
 from msgspec.structs import replace
+from worlds import checkered
 
 from haptic_loop import design_coupling, simulate
 from haptic_loop.controller.budget import Shell
@@ -78,8 +79,7 @@ class Touch:
 # ---- the packaged worlds
 
 
-@pytest.mark.parametrize("lossless", [False, True])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
     """Hands thrown at each scene, delays 0 to 3; the shell acts on no tick with random hands."""
     rng, acted, ticks = np.random.default_rng(3), 0, 0
