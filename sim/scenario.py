@@ -230,7 +230,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if varying.channels != self.channels:
             raise ValueError(f"varying_delay has {varying.channels} ranges for {self.channels} channels")
         if self.environment.walls:
-            raise ValueError("varying_delay and environment.walls: switching delays are judged in linear loops only")
+            instead = "design and design.audit prove both with --varying-delay"
+            raise ValueError(f"varying_delay and environment.walls: only linear loops are run with both; {instead}")
         for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True), start=1):
             if varying.playout and n != hi:
                 raise ValueError(f"theta #{i} is {n}, but varying_delay.playout makes it the largest delay, {hi}")
