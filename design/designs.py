@@ -86,13 +86,13 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     conditions = kind_of(kind).conditions
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
-    more = ANY_ENVIRONMENT not in conditions and not (loop.environment.walls or loop.environment.world)
+    plain = [each for each in conditions if not isinstance(each, KnownDevice)]
+    more = len(plain) == 1 and not (loop.environment.walls or loop.environment.world)
     if loop.known_devices and KNOWN_DEVICE in conditions and not loop.latency and (more or not less):
         return KNOWN_DEVICE.name  # never worse than this-environment
     walls = loop.environment.walls and not loop.environment.world
     if walls and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
         return KNOWN_DEVICE_ANY.name
-    plain = [each for each in conditions if not isinstance(each, KnownDevice)]
     return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
 
 
@@ -287,11 +287,11 @@ def _with_less_damping(
     """
     share, best, shortfall = 1.0, None, ""
     walls = loop.environment.walls
-    constant = (made_for or condition) is not THIS_ENVIRONMENT or loop.latency or walls
+    constant = not (made_for or condition).extensible or loop.latency or walls
     where = loop.delayed(loop.delays.hi) if constant else loop
     if condition is KNOWN_DEVICE and walls:
         where = where.at(held(loop.network))  # The search judges gains by beta alone.
-    judged = loop if condition in (THIS_ENVIRONMENT, KNOWN_DEVICE) else loop.at(loop.environment)
+    judged = loop if condition.extensible or condition is KNOWN_DEVICE else loop.at(loop.environment)
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         design = make(msgspec.structs.replace(where, latency=None, ranges=None, **_scaled(loop, share)))
         needs = condition.judge(judged, design.coupling)

@@ -265,17 +265,30 @@ class SampledLoop:
 
 
 @cache
-def _slsqp() -> Any:
-    """Return the SLSQP of scipy.optimize without its other solvers, whose import takes half as long as a design."""
+def _slsqp() -> Callable[..., Any]:
+    """Return the SLSQP of scipy.optimize, without its other solvers, whose import takes half as long as a design.
+
+    The module that has it is private: where a release of SciPy names it differently, the public function is used.
+    """
     name = "scipy.optimize"
-    spec = find_spec(name)
-    if spec and name not in sys.modules:
+    spec = None if name in sys.modules else find_spec(name)
+    if spec:
         sys.modules[name] = module_from_spec(spec)  # an empty package, so that its __init__ is not run
-        try:
-            return import_module(f"{name}._slsqp_py")._minimize_slsqp
-        finally:
-            del sys.modules[name]
-    return import_module(f"{name}._slsqp_py")._minimize_slsqp
+    try:
+        return import_module(f"{name}._slsqp_py")._minimize_slsqp
+    except (ImportError, AttributeError):
+        sys.modules.pop(name, None)
+        return _public_slsqp
+    finally:
+        if spec:
+            sys.modules.pop(name, None)
+
+
+def _public_slsqp(f: Any, x: Array, *, maxiter: int, ftol: float, **problem: Any) -> Any:
+    """Return the result of `scipy.optimize.minimize` for the arguments of its private function."""
+    from scipy.optimize import minimize
+
+    return minimize(f, x, method="SLSQP", options={"maxiter": maxiter, "ftol": ftol}, **problem)
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from functools import partial
 
 import cvxpy as cp
 import msgspec
@@ -17,7 +16,7 @@ from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Environment, Network, Spring
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import conditions, gain_search, spring_damper
 from haptic_loop.design.api import instead, transparency_of
@@ -297,7 +296,11 @@ def test_long_delay_designs_pass_a_dense_sweep():
         assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
 
 
-@pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop, partial(SwitchingLoop, lo=(0, 2), hi=(1, 2))])
+def switching_loop(loop):
+    return SwitchingLoop(loop.switching(DelayRange((0, 2), (1, 2))))
+
+
+@pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop, switching_loop])
 @pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
 def test_slopes_match_finite_differences(sampled, psi):
     """Derivatives by hand against central differences, whose own error is 1e-8 of rounding."""
@@ -360,4 +363,18 @@ found = minimize(rosen, [-1.0, 1.0], method="SLSQP", **problem)
 assert found.success
 assert list(alone(rosen, [-1.0, 1.0], **problem).x) == list(found.x)
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    renamed = """
+import sys
+sys.modules["scipy.optimize._slsqp_py"] = None
+from haptic_loop.design.gain_search import _slsqp
+
+own = _slsqp()
+del sys.modules["scipy.optimize._slsqp_py"]
+from scipy.optimize import minimize, rosen, rosen_der
+
+public = own(rosen, [-1.0, 1.0], jac=rosen_der, maxiter=7, ftol=1e-7).x
+options = {"maxiter": 7, "ftol": 1e-7}
+assert list(public) == list(minimize(rosen, [-1.0, 1.0], jac=rosen_der, method="SLSQP", options=options).x)
+"""
+    for each in (code, renamed):
+        subprocess.run([sys.executable, "-c", each], check=True)
