@@ -698,7 +698,7 @@ def _over_ranges(assessment: Assessment) -> Guarantee | None:
     ranges = assessment.ranges
     if not (ranges and ranges.proved) or all(assessment.environment != each.network for each in ranges.members):
         return None
-    name = ranges.worst[1].condition
+    name = str(ranges.worst[1].condition)
     if assessment.loop.varying_delay:
         name = {THIS_ENVIRONMENT.name: SWITCHING.name}.get(name, name)
     return _stated(assessment, replace(assessment.requirements[name], proof="rational"), RANGES)
