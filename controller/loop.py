@@ -120,8 +120,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             self._check_varying_delay(self.varying_delay)
         if self.T_max is not None and not self.T <= self.T_max < float("inf"):
             raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
-        if self.T_min is not None and not self.T_min <= self.T:
-            raise ValueError(f"T_min is {self.T_min:g} s, expected at most T = {self.T:g} s")
+        if self.T_min is not None and not 0 < self.T_min <= self.T:
+            raise ValueError(f"T_min is {self.T_min:g} s, expected above 0 and at most T = {self.T:g} s")
         if self.known_devices is not None and len(self.known_devices) != m:
             raise ValueError(f"known_devices has {len(self.known_devices)} entries for {m} channels")
         if self.latency is not None:

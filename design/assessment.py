@@ -564,6 +564,8 @@ def assess(
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
     requirements = requirements_of(here, coupling, known, own=own)
+    if wanted_condition.name not in requirements:
+        requirements[wanted_condition.name] = judged(here, coupling, wanted_condition)
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
     if loop.varying_delay:

@@ -55,10 +55,8 @@ from haptic_loop.design.result import (
 
 
 def shortest_period(loop: Loop) -> float | None:
-    """Return the shortest period [s] of the loop; None if periods vary and no shortest one is declared."""
-    if loop.T_min is not None:
-        return loop.T_min
-    return loop.T if loop.T_max in (None, loop.T) else None
+    """Return the shortest period [s] of the loop; None if T_max declares that periods vary, without a T_min."""
+    return loop.T if loop.T_min is None and loop.T_max is None else loop.T_min
 
 
 class _Known(NamedTuple):

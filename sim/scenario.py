@@ -217,6 +217,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
     def _check_timing(self) -> None:
+        if self.T_min is not None and not 0 < self.T_min <= self.T:
+            raise ValueError(f"T_min is {self.T_min:g} s, expected above 0 and at most T = {self.T:g} s")
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
         if self.period and self.T_min is not None and self.period.shortest < self.T_min:

@@ -1,7 +1,7 @@
 """Devices whose motor mass and transmission are known: the agreed figures, each step of the proof, and attacks."""
 
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 
 import msgspec
 import numpy as np
@@ -1124,3 +1124,21 @@ def test_an_assessment_guarantees_switching_on_known_devices():
     assert found.guarantee.condition == "known-device"
     assert found.guarantee.delays == loop.varying_delay
     assert "at least 60 g" in found.guarantee.hands
+
+
+def test_longest_period_alone_proves_no_known_device():
+    """A declared T_max means that periods vary, even where it equals T: between ticks of 1 ms and 10 us hands grow."""
+    loop = msgspec.structs.replace(KNOWN, T_max=KNOWN.T)
+    refused = assess(loop, PUBLISHED["I"])
+    assert "need a shortest one, T_min" in refused.requirements["known-device"].shortfall
+    assert refused.guarantee is None
+    assert not assess(
+        msgspec.structs.replace(loop, known_devices=None), PUBLISHED["I"], condition="known-device"
+    ).guarantee
+
+
+@pytest.mark.parametrize("T_min", [0.0, -1.0, float("nan")])
+def test_shortest_periods_are_positive(T_min):
+    for make in (partial(msgspec.structs.replace, KNOWN), load().replace):
+        with pytest.raises(ValueError, match=r"T_min is .*, expected above 0"):
+            make(T_min=T_min)
