@@ -342,44 +342,31 @@ class Sweep:
         """Return whether the block is positive at each frequency, (k,)."""
         return positive(_with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
-    def shares(
-        self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS, near: float = 0.0
-    ) -> Array:
-        """Return the least share (k,) up to `high` at each frequency; inf if `high` is not enough.
-
-        For a share below `near` times the largest, an upper bound is returned that also lies below this limit.
-        """
-        low = self.floor(beta)
-        shares = np.full(z.size, np.inf)
+    def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
+        """Return the least share (k,) up to `high` at each frequency; inf if `high` is not enough."""
+        k, low = z.size, self.floor(beta)
         if not low < high:
-            return shares
-        shares[self.holds(idle, z, high, beta)] = high
-        shares[self.holds(idle, z, low, beta)] = low
-        at = np.flatnonzero(shares == high)
-        least, most = np.full(at.size, low), shares[at]
-        while steps > 0 and at.size:
-            bits = int(np.clip(np.log2(_TOGETHER / at.size + 1), 1, 5))
-            inner = np.arange(1, 2**bits) / 2**bits
+            return np.full(k, np.inf)
+        least, most = np.full(k, low), np.full(k, high)
+        enough, plenty = (self.holds(idle, z, share, beta) for share in (least, most))
+        bits = int(np.clip(np.log2(_TOGETHER / k + 1), 1, 5))
+        inner = np.arange(1, 2**bits) / 2**bits
+        many, points = np.repeat(idle, inner.size, axis=0), np.repeat(z, inner.size)
+        for _ in range(-(-steps // bits)):
             tried = least[:, None] + (most - least)[:, None] * inner
-            many, points = np.repeat(idle[at], inner.size, axis=0), np.repeat(z[at], inner.size)
             served = self.holds(many, points, tried.ravel(), beta).reshape(tried.shape)
             first = np.where(served.any(axis=1), served.argmax(axis=1), inner.size)
             ends = np.column_stack([least, tried, most])
-            least, most = ends[np.arange(at.size), first], ends[np.arange(at.size), first + 1]
-            shares[at], steps = most, steps - bits
-            needed = most > near * least.max()
-            at, least, most = at[needed], least[needed], most[needed]
-        return shares
+            least, most = ends[np.arange(k), first], ends[np.arange(k), first + 1]
+        return np.where(enough, low, np.where(plenty, most, np.inf))
 
-    def response(
-        self, environment: int, beta: Array, values: Sequence[float] | None, high: float, near: float = 0.0
-    ) -> Response:
-        """Return the function w (k,) [rad/sample] -> least share (k,); `near` is that of `shares`."""
+    def response(self, environment: int, beta: Array, values: Sequence[float] | None, high: float) -> Response:
+        """Return the function w (k,) [rad/sample] -> least share (k,)."""
         free = self.idle(environment, beta, values).free
 
         def shares(w: Array) -> Array:
             z = on_circle(w)
-            return self.shares(hermitian(free.at(z)), z, beta, high, near=near)
+            return self.shares(hermitian(free.at(z)), z, beta, high)
 
         return shares
 
@@ -387,8 +374,7 @@ class Sweep:
         """Return the least share up to `high` (inf if there is none) by a refined sweep, and its frequency."""
         if not self.floor(beta) < high:
             return np.inf, 0.0
-        responses = [self.response(i, beta, values, high, near=0.5) for i in range(len(self.maps))]
-        return max(supremum(one, grid) for one, grid in zip(responses, self.grids, strict=True))
+        return max(supremum(self.response(i, beta, values, high), grid) for i, grid in enumerate(self.grids))
 
     def best(self, high: float) -> _Best:
         """Return the least share below `high` over all beta and multipliers."""
@@ -504,7 +490,7 @@ class _Search:
                 low = low[room[low] <= 0]
                 if not low.size:
                     break
-                each = self.sweep.shares(idle[low], z[low], beta, most, _IN_A_CUT, near=1.0)
+                each = self.sweep.shares(idle[low], z[low], beta, most, _IN_A_CUT)
                 if each.max() > share:
                     share, binding = float(each.max()), (e, int(low[np.argmax(each)]))
         return share, binding
@@ -599,9 +585,7 @@ class _Search:
         blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
         # The point with the share `least` satisfies all tangents.
-        # Where Clarabel stops without progress, its other settings mostly do, too.
-        settings = SETTINGS[0], INTERIOR, *SETTINGS[1:]
-        x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, settings)
+        x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, (*SETTINGS, INTERIOR))
         slack = np.linalg.eigvalsh(blocks[0].at(x))[:, 0]
         self.tangents = [one for one, left in zip(self.tangents, slack, strict=True) if left < _SLACK]
         return unit * x
