@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
             raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # A world accounts for energy at its contacts.
+        args.energy_budget = None  # In a world, each contact has an energy budget of its own (`world_start`).
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:

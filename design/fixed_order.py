@@ -1,4 +1,6 @@
-"""State-space couplings of fixed order under Theorem 4 (Remark 5), by inner convex approximation.
+"""Design of state-space couplings whose order is given, so that they satisfy Theorem 4 (Remark 5 of the paper).
+
+Each step solves a convex problem whose solutions all satisfy the condition.
 
 The descent starts from the structured spring-damper design and minimises ||W1 L W2||_inf (23). The returned coupling
 satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone. The cone complementarity that

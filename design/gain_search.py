@@ -424,7 +424,7 @@ class KnownDeviceLoop(SampledLoop):
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """Return the gradient of `room`, with finite differences for beta and the poles."""
+        """Return the gradient of `room`. The parts for beta and for the poles are finite differences."""
         room, v, below = self._complement(x)
         around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
         left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]

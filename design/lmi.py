@@ -184,7 +184,7 @@ def reachability_scaled(G: Lti) -> Array:
         warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
         try:
             W = scipy.linalg.solve_discrete_lyapunov(A, W)
-        except scipy.linalg.LinAlgWarning:  # for a stiff block: sum A^k B B' A'^k by doubling the number of terms
+        except scipy.linalg.LinAlgWarning:  # Stiff blocks: sum A^k B B' A'^k; each step doubles the number of terms.
             while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
@@ -264,7 +264,8 @@ def least_multiplier(loop: Loop) -> Array:
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
         return max(each, 0.0) * delta
-    # Phi is bounded halfway between its least value and Delta_D, because the least trace alone could reach Delta_D.
+    # The matrix of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
+    # halfway between its least possible value and Delta_D.
     return np.maximum(_of_least_trace(_balanced(regular), (1 + least) / 2 * level), 0.0) * delta
 
 

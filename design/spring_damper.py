@@ -235,7 +235,9 @@ def design(
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-_DIGITS = 5  # digits of the gains of more than FEW channels, finer than RESERVE; with all digits proofs take minutes
+#: significant digits of the gains in loops of more than FEW channels: exact proofs with all digits take minutes. What
+#: rounding changes is less than RESERVE.
+_DIGITS = 5
 _SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
 _MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a search ends within half a minute
 
@@ -302,7 +304,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
-    """Return the coupling, with _DIGITS digits of the gains for more than FEW channels, so that a proof stays short."""
+    """Return the coupling, with gains rounded to _DIGITS digits if it has more than FEW channels (faster proofs)."""
     if coupling.K.size <= FEW:
         return coupling
     K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))

@@ -71,7 +71,7 @@ class ForceDimension:
         Raises InputError.
         """
         self._where = _axes(axes, scenario)
-        #: channels of a vector that share the cap of its first channel
+        #: channels whose force limit is that of another channel: all but the first of each limited force vector
         self._shared = {i for ball in scenario.limiter_limits[1] for i in range(ball.start + 1, ball.stop)}
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()

@@ -48,7 +48,7 @@ _CROSS = 0.25  # largest share of the expected motion on another axis; less may 
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
 _STRONG = 2  # first block of the test at the end of a session
-_REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
+_REST = 0.1  # [s] The noise of an encoder at rest is measured for this time.
 _PRESSING, _PRESSED = 0.3, 0.5  # force [N], and the longest time [s] for which an encoder may stand still under it
 _FORGETTING = 8  # right ticks that cancel a wrong one; with fewer in between, scattered wrong ticks stop a session, too
 

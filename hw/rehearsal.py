@@ -36,7 +36,8 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_constant_dela
 from haptic_loop.sim.trace import Trace
 
 _MEASURE = 200  # answers that are timed; few suffice, because virtual time does not scatter
-_QUANTILE, _GUARD_US = 0.99, 100.0  # part of the ages that the delay covers, and its guard [us]; as in hw.bridge
+#: The delay is chosen as in hw.bridge: it covers this share of the ages of measured answers, plus a guard [us].
+_QUANTILE, _GUARD_US = 0.99, 100.0
 _BEGIN_US = 500  # time from the device's first tick to the start of the session
 _GRACE_US = 20_000  # time after the end of a session in which its device comes to rest
 _LONGEST = 60.0  # [s] of virtual time in which a session connects, is armed and ends, beside its run

@@ -93,7 +93,7 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
     """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m]."""
     import scipy
 
-    n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms errs by far less than a count in strokes of 3 Hz
+    n = max(3, round(6e-3 / T) | 1)  # At 3 Hz, cubics over 6 ms fit to far below a count.
     smooth = scipy.signal.savgol_filter(x, n + 2, 3)
     v = scipy.signal.savgol_filter(x, n + 2, 3, deriv=1, delta=T)
     top = float(np.percentile(np.abs(v), 99.5))

@@ -66,8 +66,9 @@ DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
 _FORCE = "/force"  # part of the names of the motors' actuators
-_IMPEDANCE = "impedance_"  # start of names of custom numbers: joint of the handle, joint of the base or -1, then
-# [[A, B], [C, D]] by rows
+#: Custom numbers whose names start so describe an impedance: the joint of the handle, the joint of the base (-1: none),
+#: then the rows of [[A, B], [C, D]].
+_IMPEDANCE = "impedance_"
 
 
 @dataclass(frozen=True, eq=False)

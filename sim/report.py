@@ -37,7 +37,7 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class EncoderSteps:
-    """Comparison of declared Coulomb friction with the friction that dissipates the work of encoder steps."""
+    """Whether declared Coulomb friction is enough: the work that encoder steps can do must be dissipated."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound
