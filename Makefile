@@ -1,7 +1,8 @@
 # make run    the paper's case I, from a fresh clone to a picture
-# make test   the whole test suite
+# make test   the test suite without its slow tests
+# make suite  the whole test suite, as .ci/run does
 # make check  lint and the tests of what your change touches, under a minute
-# make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
+# make lint   ruff and pyright, without a finding: to be run, with make suite, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on, and the slow pages: half an hour
 # make firmware  the sketches, compiled and run on a simulated ATmega328P and Cortex-M7; the packages that it needs: .ci/run
@@ -17,12 +18,15 @@ PY := .venv/bin/python
 # than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
 PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test check validate firmware lint coverage bench mutate kernels oldest installed figures clean
+.PHONY: run test suite check validate firmware lint coverage bench mutate kernels oldest installed figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
+	$(PY) -m pytest $(PARALLEL) --ignore=tests/benchmarks -m 'not slow and not validate and not firmware'
+
+suite: .venv/ready
 	$(PY) -m pytest $(PARALLEL) --ignore=tests/benchmarks
 
 check: .venv/ready build/typed
