@@ -183,7 +183,7 @@ def _list_devices(args: argparse.Namespace) -> int:
 def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
     """Audit a coupling, by default the stiffest certified one, in a MuJoCo world."""
     from haptic_loop.cli import world
-    from haptic_loop.design.lmi import ANY_ENVIRONMENT
+    from haptic_loop.design.environments import ANY_ENVIRONMENT
     from haptic_loop.design.result import Chosen
     from haptic_loop.sim.couplings import choose
 

@@ -15,8 +15,8 @@ from haptic_loop.cli import options, render
 from haptic_loop.design.api import proved, store
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.files import write
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import Chosen, listed
 from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose

@@ -38,10 +38,18 @@ from haptic_loop.design.certificate import (
 )
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate
-from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
+from haptic_loop.design.environments import (
+    ANY_ENVIRONMENT,
+    LIMITER,
+    SWITCHING,
+    THIS_ENVIRONMENT,
+    LimitedForces,
+    beta_of,
+    in_each,
+    worst,
+)
 from haptic_loop.design.frequency import too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import (
     ANY,
     AT_VERTICES,

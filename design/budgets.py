@@ -9,6 +9,8 @@ Measured on 23 loops, of which 22 are in benchmarks/loops, on one core of an AMD
 
 from __future__ import annotations
 
+from haptic_loop.controller.arithmetic import TooLong
+
 # Work that is counted [units] -----------------------------------------------------------------------------------------
 
 #: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and one over 800, the largest, takes 30.
@@ -82,3 +84,9 @@ INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
 #: Blocks of 256 ticks over which an impulse response is summed to a relative 1e-9; a bound covers the rest.
 #: Only a mode that takes 250,000 ticks to fall to 1/e spends them.
 GAIN_CHUNKS = 20_000
+
+
+def require_size(states: int) -> None:
+    """Raise TooLong if exact arithmetic over this number of states would take minutes."""
+    if states > PROOF_STATES:
+        raise TooLong(f"a proof over {states} states takes long: up to {PROOF_STATES} are tried")

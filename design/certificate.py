@@ -27,6 +27,7 @@ from haptic_loop.design.coupling_file import (
     sealed,
 )
 from haptic_loop.design.environments import (
+    ANY_ENVIRONMENT,
     THIS_ENVIRONMENT,
     LimitedForces,
     SwitchingDelays,
@@ -38,12 +39,10 @@ from haptic_loop.design.exact import (
     definiteness,
     find_storage,
     refuted_rows,
-    require_size,
     rows_of,
 )
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
 
 _CLAIM_TOLERANCE = 1e-6  # allowed error of the required damping on file; repeated sweeps agree to 1e-9
@@ -152,7 +151,10 @@ def _proof(
         raise NotProved(reason, requirement)
     proof: dict[str, Rows] = {}
     for name, real in _blocks(loop, coupling, condition, requirement.multiplier).items():
-        require_size(real.order, requirement)
+        try:
+            budgets.require_size(real.order)
+        except TooLong as error:
+            raise NotProved(str(error), requirement) from None
         P, reason = find_storage(real)
         if P is None:
             share = f"the sweep requires {requirement.ratio:.9f} of the available damping"
@@ -203,7 +205,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     if reason := condition.beyond(loop):
         raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
-    require_size(late)
+    budgets.require_size(late)
     for value in _coefficients(msgspec.to_builtins((loop, coupling.form()), enc_hook=own_fields)):
         if rational(value).denominator.bit_length() > _MOST_BITS:
             raise NotProved(f"the coefficient {value:g} has too many digits for exact arithmetic")
@@ -213,7 +215,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
         return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
     states += sum(loop.theta) if members else 0  # The block of any-environment has the states of V only.
-    require_size(states)
+    budgets.require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 

@@ -1,13 +1,13 @@
 """Conditions under which no passive human can make a loop oscillate.
 
-A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.frame) holds it
+A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.facts) holds it
 as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
 `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
 (an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
 A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
 states whether periods vary and forces have a latency. A `Fact` is a wall, delays that switch, or the limiter. `compose`
-stacks their inputs and adds their forms, as design.frame describes. design.environments searches the multipliers of all
+stacks their inputs and adds their forms, as design.facts describes. design.environments searches the multipliers of all
 conditions, and design.certificate has one exact proof and one file format.
 
 To add a hands' side, derive a class from `HandsSide` and state
@@ -45,9 +45,8 @@ from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
 from haptic_loop.design.arguments import shown
-from haptic_loop.design.facts import compose
+from haptic_loop.design.facts import Demand, compose, even_damping, even_level
 from haptic_loop.design.files import InputError
-from haptic_loop.design.frame import Demand, even_damping, even_level
 from haptic_loop.design.frequency import (
     Response,
     frequencies,

@@ -18,9 +18,8 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import ANY, Design, DesignFailed
 from haptic_loop.design.transparency import NO_FORCE, silent

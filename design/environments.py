@@ -1,4 +1,4 @@
-"""Conditions with multipliers: this-environment with walls, ranges, switching delays and limited forces.
+"""Conditions with multipliers: this-environment with its facts, and any-environment.
 
 The blocks for walls, switching delays and limited forces are affine in a multiplier, which weighs an error term;
 `Multiplied` searches the best multiplier. The members of ranges are proved one by one.
@@ -17,29 +17,60 @@ import numpy as np
 
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Block, Lti
+from haptic_loop.controller.lti import Array, Block, Lti, Sampled
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import (
     BEYOND,
     Condition,
-    Demand,
+    any_environment,
+    any_environment_demand,
+    any_environment_per_channel,
+    any_environment_ratios,
+    asymmetric,
+    covers,
+    delayed_environment_demand,
     least_scale,
     ratio_in,
     this_environment,
     this_environment_demand,
     this_environment_ratios,
+    uncovered,
     unsound,
     unsound_static,
 )
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.coupling_file import Certificate
-from haptic_loop.design.exact import require_size
-from haptic_loop.design.facts import Fact, HandsSide, Limiter, Switching, Unknowns, Walls, compose, hands_side
+from haptic_loop.design.facts import (
+    Demand,
+    Fact,
+    HandsSide,
+    Limiter,
+    Switching,
+    Unknowns,
+    Walls,
+    compose,
+    compose_any,
+    even_damping,
+    even_level,
+    hands_side,
+)
 from haptic_loop.design.files import InputError
-from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
-from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
+from haptic_loop.design.frequency import Response, frequencies, hermitian, on_circle, peaks, supremum, sweeping
+from haptic_loop.design.lmi import RESERVE, Ports, balanced, lemma1, packed, symmetric_from, unit_environment
+from haptic_loop.design.result import (
+    MAKING,
+    DesignFailed,
+    Environments,
+    Infeasible,
+    NotProved,
+    Requirement,
+    from_ratio,
+    refusal,
+    switching_guarantee,
+)
 
 # ----------------------------------------------------------------------------------------------------
 # The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers, at finitely many
@@ -48,11 +79,11 @@ from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ra
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers. A subclass defines `unknowns`, `map` and `block`."""
+    """A condition whose block is affine in its multipliers. A subclass defines `map` and `block`."""
 
-    @abstractmethod
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""
+        return tuple(each for part in (hands_side(loop), *self.facts(loop)) for each in part.unknowns(loop))
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
@@ -79,7 +110,8 @@ class Multiplied(Condition):
 
     def hands(self, loop: Loop) -> HandsSide | None:
         """Return the hands' side whose multipliers are among the unknowns, or None."""
-        return None
+        hands = hands_side(loop)
+        return hands if hands.unknowns(loop) else None
 
     def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
         """Return the multipliers by name. Raises ValueError for a wrong number of values."""
@@ -293,13 +325,6 @@ class ThisEnvironment(Multiplied):
         walls = (Walls(),) if loop.environment.walls else ()
         return (*walls, Switching()) if loop.varying_delay else walls
 
-    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        return tuple(each for part in (hands_side(loop), *self.facts(loop)) for each in part.unknowns(loop))
-
-    def hands(self, loop: Loop) -> HandsSide | None:
-        hands = hands_side(loop)
-        return hands if hands.unknowns(loop) else None
-
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the start of each multiplier.
 
@@ -324,7 +349,7 @@ class ThisEnvironment(Multiplied):
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         G = loop.walled_before_delay(coupling, exact) if loop.environment.walls else loop.sent(coupling, exact)
         if exact:
-            require_size(G.order + sum(loop.delays.hi))
+            budgets.require_size(G.order + sum(loop.delays.hi))
         return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -344,7 +369,7 @@ class ThisEnvironment(Multiplied):
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
         if exact:
-            require_size(F.order)
+            budgets.require_size(F.order)
         return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
@@ -519,3 +544,236 @@ def beta_of(loop: Loop, certificate: Certificate) -> float:
     rho, share = certificate.multipliers.get("rho", ()), loop.least_damping[0] / loop.delta[0]
     beta = float(f"{rho[0] * loop.T / (certificate.available[0] * share):.6g}") if rho else BETA
     return beta if 0 < beta <= 1 else BETA
+
+
+# ----------------------------------------------------------------------------------------------------
+# Theorem 4, and the least multiplier Phi of an environment with delay inside (psi >= 1), by (17).
+
+
+_ROOM = 1e-6  # relative increase of Phi that covers the solver's tolerance
+
+
+def least_phi(loop: Loop) -> Array | None:
+    """Return Phi (N,) of `least_multiplier`, verified at every frequency, or None for psi = 0, which needs no Phi."""
+    if not any(loop.psi):
+        return None
+    phi = least_multiplier(loop) + _ROOM * even_damping(loop)
+    if not covers(loop, phi):
+        raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} may leave some frequency uncovered")
+    return phi
+
+
+_MOST_STATES = 30  # The least trace is computed up to so many states of E-hat: 42 take ten seconds, 400 take 20 GB.
+
+
+def least_multiplier(loop: Loop) -> Array:
+    """Return a diagonal Phi < Delta_D (N,) [N s/m] with E-hat + Phi passive; with few states, that of least trace.
+
+    Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
+    """
+    delta = even_damping(loop)
+    unit = unit_environment(loop.E(), delta)
+    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
+    least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
+    each, root = least, np.linalg.inv(np.linalg.cholesky(level))
+    if loop.levels:
+        least, _ = uncovered(root @ unit @ root.T, loop.psi, none)
+    if least >= 1:
+        raise Infeasible(None, (), _needs(loop.psi, delta, least))
+    regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
+    if regular.order > _MOST_STATES:
+        return max(each, 0.0) * delta
+    # The matrix of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
+    # halfway between its least possible value and Delta_D.
+    return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
+
+
+def _of_least_trace(regular: Lti, most: Array) -> Array:
+    """Return the entries of the diagonal Phi <= most (m, m) with least trace that makes `regular` passive."""
+    m, n = regular.inputs, regular.order
+    ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
+
+    def passive(x: Array) -> Array:
+        return lemma1(ports, symmetric_from(x[m:], n), zero, -np.diag(x[:m]))
+
+    size = range(m + packed(n))
+    storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: most - np.diag(x[:m])
+    problem = ConeProgram(
+        np.repeat([1.0, 0.0], [m, packed(n)]), [Inequality.of(passive, size), storage, Inequality.of(room, size)]
+    )
+    return problem.solve("the multiplier Phi of the environment")[:m]
+
+
+def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
+    required = ", ".join(f"{least * d:.4g}" for d in delta)
+    return (
+        f"Theorem 4 admits no coupling: with psi = {psi} the environment alone uses up {required} N s/m of device "
+        f"damping and delta is {tuple(delta.tolist())}"
+    )
+
+
+class _AnyEnvironment(Multiplied):
+    """Theorem 4 of the paper: stability in every passive environment, or for psi >= 1 in the loop's environment only.
+
+    For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only.
+    A latency and switching delays use the block of design.facts.compose_any.
+    """
+
+    name, source, separable = "any-environment", "the paper's Theorem 4", True
+    covers = BEYOND
+
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        """Return the facts of the environment's side that the block needs."""
+        return (Switching(),) if loop.varying_delay else ()
+
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        V = coupling.compliance(loop.period(exact))
+        assert V is not None  # `required` refuses None
+        if exact:
+            budgets.require_size(V.order + sum(loop.delays.hi))
+        return V
+
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        return self._composed(G, loop, multiplier)
+
+    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
+        return self._composed(G, loop, multiplier, scaled=True)
+
+    def _composed(self, V: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
+        if not _in_frame(loop):
+            return any_environment_demand(V, loop)
+        values = self.named(loop, () if multiplier is None else multiplier)
+        return compose_any(V, loop, self.facts(loop), values, scaled)
+
+    def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
+        """Return (the least Phi or None if none is needed, the reason why the loop is not covered)."""
+        if (reason := self.beyond(loop)) or not any(loop.psi):
+            return None, reason
+        try:
+            return least_phi(loop), None
+        except ValueError as error:
+            return None, " ".join(str(error).split())
+
+    def beyond(self, loop: Loop) -> str | None:
+        if loop.environment.walls and any(loop.psi):
+            return "with delay in the environment its multiplier is of a linear one: no walls"
+        if _in_frame(loop) and any(loop.psi):
+            obstacle = "a latency" if loop.latency else "delays that switch"
+            return f"with delay in the environment its multiplier is of whole, constant samples: no {obstacle}"
+        return None if any(loop.psi) else loop.environment.active(loop.T)
+
+    def not_varied(self, loop: Loop) -> str | None:
+        return (
+            "with psi >= 1 every K, T and delay needs a multiplier of its own: not searched" if any(loop.psi) else None
+        )
+
+    def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
+        V = coupling.compliance(loop.T)
+        if V is not None and _in_frame(loop):
+            return partial(least_scale, self.block(V, loop, multiplier or self.usual(None, loop)))
+        phi = multiplier if any(loop.psi) else None
+        if V is None or (phi is None and any(loop.psi)):
+            return None
+        return partial(least_scale, any_environment_demand(V, loop, phi))
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
+
+        def demand(V: Sampled) -> Demand[Sampled]:
+            """Return the block, with default multipliers for a latency that varies and for switching delays."""
+            if _in_frame(loop):
+                return self.block(V, loop, self.usual(None, loop))
+            return any_environment_demand(V, loop, multiplier)
+
+        return any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, demand)
+
+    def _without(self, coupling: Coupling) -> str:
+        """Return the reason why a coupling without V(z) is refused."""
+        if coupling.holds_model:
+            return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
+        return "without a coupling there is nothing that Theorem 4 could use"
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """Return the requirement with `multiplier`, or with the least multiplier if one is needed."""
+        reason, V = self.beyond(loop), coupling.compliance(loop.T)
+        if reason or V is None:
+            return refusal(self.name, loop.delta, reason or self._without(coupling))
+        if _in_frame(loop):
+            return self._in_frame(V, loop, multiplier)
+        if not any(loop.psi):
+            channels = None if loop.levels else coupling.channels(loop.T)
+            if channels:
+                return any_environment_per_channel(channels, loop)
+            return any_environment(V, loop)
+        if multiplier is None:
+            multiplier, reason = self.least_multiplier(loop)
+        if multiplier is None:
+            return refusal(self.name, loop.delta, str(reason))
+        if len(multiplier) != loop.channels:
+            raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
+        requirement = any_environment(V, loop, np.array([float(p) for p in multiplier]))
+        return replace(requirement, multiplier=tuple(multiplier))
+
+    def _in_frame(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
+        if self.unknowns(loop):
+            needs = self.required_of(V, loop, multiplier)
+            if multiplier or loop.latency or needs.certified:
+                return needs
+            spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
+            mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
+            alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
+            closed = self.required_of(V, loop, alpha)  # The search may miss this alpha near the stiffest coupling.
+            return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
+        demand = self.block(V, loop)
+        if not V.is_stable():
+            return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
+        if reason := unsound(demand.free, loop.delta) or self.unsound_static(V, loop, demand):
+            return refusal(self.name, loop.delta, reason)
+        ratio, w = supremum(partial(least_scale, demand), np.concatenate([[0.0], frequencies(V)]))
+        return from_ratio(self.name, ratio, loop.delta, w / (2 * np.pi * loop.T))
+
+    def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
+        return asymmetric(demand.static["V(1)"])
+
+    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
+        if not any(loop.psi):
+            return super().exact_demands(loop, coupling, multiplier)
+        T = loop.period(exact=True)
+        V = coupling.compliance(T)
+        assert V is not None
+        budgets.require_size(V.order + sum(loop.theta))
+        delayed = delay(loop.psi, T) @ loop.E(exact=True)
+        return {
+            "P": any_environment_demand(V, loop, multiplier),
+            "P_E": delayed_environment_demand(delayed, multiplier),
+        }
+
+    def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
+        return {"Phi": loop.channels} if any(loop.psi) else super().multiplier_sizes(loop)
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        return ()
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return None if any(loop.psi) else (0.0,) * loop.channels
+
+    def guarantee(self, loop: Loop) -> Environments:
+        return "this environment" if any(loop.psi) else "any passive environment"
+
+
+ANY_ENVIRONMENT = _AnyEnvironment()
+
+
+def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
+    """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling for any environment.
+
+    This alpha minimises the mean over frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), where vt is the mean
+    window and h = (hi - lo)/2 (docs/theory.md).
+    """
+    half = (hi - lo) / 2
+    return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)
+
+
+def _in_frame(loop: Loop) -> bool:
+    """Return whether the block comes from design.facts, because of a latency or switching delays."""
+    return bool(loop.latency or loop.varying_delay)

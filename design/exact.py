@@ -15,7 +15,6 @@ from haptic_loop.controller.arithmetic import rational, spend
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
-from haptic_loop.design.result import NotProved, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.
@@ -323,19 +322,6 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     )
     e = 0.5 * math.sqrt(n * (n + m))
     return W >> bits + finer, 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
-
-
-def _too_large(states: int) -> str | None:
-    """Return the reason why no proof is tried for this number of states, or None."""
-    if states <= budgets.PROOF_STATES:
-        return None
-    return f"a proof over {states} states takes long: up to {budgets.PROOF_STATES} are tried"
-
-
-def require_size(states: int, requirement: Requirement | None = None) -> None:
-    """Raise NotProved if exact arithmetic over this number of states would take minutes."""
-    if reason := _too_large(states):
-        raise NotProved(reason, requirement)
 
 
 def _prove_positive_real(G: Lti, P: Matrix) -> str | None:

@@ -24,6 +24,7 @@ from haptic_loop.design import budgets, lmi, spring_damper
 from haptic_loop.design.arguments import of_kind, whole
 from haptic_loop.design.conditions import any_environment_demand
 from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.environments import ANY_ENVIRONMENT, least_phi
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
 _MOST_STATES = 10  # per channel; each adds a row and a column to every cone
@@ -288,14 +289,14 @@ def design(
     """
     whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
-    started, shaping, phi = time.perf_counter(), lmi.Shaping(loop), lmi.least_phi(loop)
+    started, shaping, phi = time.perf_counter(), lmi.Shaping(loop), least_phi(loop)
     reserved = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
     first = spring_damper.design(reserved)
     gains = first.coupling
     assert isinstance(gains, SpringDamper)
 
     def judged(V: Lti) -> Requirement:
-        return lmi.ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
+        return ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
 
     family = _FixedOrder(shaping, phi, order, diagonal)
 

@@ -34,11 +34,16 @@ from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition, Demand, unsound
 from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
-from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, LimitedForces, Multiplied, named_parts
-from haptic_loop.design.exact import require_size
+from haptic_loop.design.environments import (
+    ANY_ENVIRONMENT,
+    LIMITER,
+    THIS_ENVIRONMENT,
+    LimitedForces,
+    Multiplied,
+    named_parts,
+)
 from haptic_loop.design.facts import Fact, KnownMotor, PeriodCost, Unknowns, Values, compose, compose_any
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import (
     MAKING,
     DesignFailed,
@@ -704,7 +709,7 @@ class KnownDevice(Condition):
             hands = KnownMotor(period_cost(straight, 1.0, np.array(beta, dtype=float)), beta)
         G = self.map(loop, coupling, exact)
         if exact:
-            require_size(G.order + sum(loop.delays.hi) + 2 * m)
+            budgets.require_size(G.order + sum(loop.delays.hi) + 2 * m)
         return self.form(G, loop, values, hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:

@@ -24,7 +24,7 @@ from haptic_loop.design import budgets
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import even_damping, even_level, theta_hat, this_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
-from haptic_loop.design.environments import LIMITER
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, least_phi, stiffest_alpha
 from haptic_loop.design.facts import Latency, PeriodCost
 from haptic_loop.design.frequency import on_circle, peaks, too_long
 from haptic_loop.design.gain_search import (
@@ -39,15 +39,11 @@ from haptic_loop.design.gain_search import (
 )
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import (
-    ANY_ENVIRONMENT,
     RESERVE,
     Ports,
     Shaping,
-    gain_block,
-    least_phi,
     lemma1,
     packed,
-    stiffest_alpha,
     symmetric_from,
     usable,
 )
@@ -159,6 +155,32 @@ class _GainSet:
 
 
 # ----------------------------------------------------------------------------------------------------
+# A bound on a gain that is affine in real variables, at sampled frequencies, with cutting planes.
+#
+# A problem over all frequencies has infinitely many constraints, of which few bind. The problem is solved at some
+# frequencies, a refined sweep checks the result, and the worst frequency is added.
+
+
+def _gain_block(
+    unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
+) -> Inequality:
+    """Return the inequality [[base, rows*], [rows, t I]] >= 0, where t is the last of the unknowns.
+
+    rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). For base >= 0 it means
+    rows* rows <= t base.
+    """
+    q, k, p, m = row_slopes.shape
+    constant = np.zeros((k, m + p, m + p), dtype=np.complex128)
+    slopes = np.zeros((q + 1, k, m + p, m + p), dtype=np.complex128)
+    for target, top, low in ((constant, base, rows), (slopes[:q], base_slopes, row_slopes)):
+        target[..., :m, :m] = top
+        target[..., m:, :m] = low
+        target[..., :m, m:] = np.conj(np.swapaxes(low, -1, -2))
+    slopes[q, :, m:, m:] = np.eye(p)
+    return Inequality(constant, slopes, unknowns)
+
+
+# ----------------------------------------------------------------------------------------------------
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
 #
 # Let g = k + b (1 - 1/z) per channel. The norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
@@ -187,7 +209,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     tangent = 2 * (np.conj(g0) * g).real * scale**2
     diagonal = np.eye(N)
     base = -np.broadcast_to(diagonal, (w.size, N, N)).astype(np.complex128)
-    return gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
+    return _gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
 _SETTLED = 1e-6  # The sequence stops when a step improves the norm by less than this share.

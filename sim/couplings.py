@@ -16,8 +16,7 @@ from haptic_loop.design.certificate import verify
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored, load
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
-from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
 from haptic_loop.design.result import (
     CONDITIONS,

@@ -15,10 +15,10 @@ from haptic_loop.controller.lti import Array, Lti, taps
 from haptic_loop.design.conditions import _dampings, _regular_part
 from haptic_loop.design.lmi import (
     Ports,
-    _balanced,
-    _unit_environment,
+    balanced,
     lemma1,
     symmetric,
+    unit_environment,
 )
 
 
@@ -83,7 +83,7 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return Analysis(-np.inf, reason="the static compliance V(1) is not symmetric")
-    shortage = _balanced(e_hat_regular(_unit_environment(environment, delta), psi))
+    shortage = balanced(e_hat_regular(unit_environment(environment, delta), psi))
     excess = balanced_ports(unit_coupling(V, delta), theta)
     return _solve(shortage, excess)
 
@@ -91,7 +91,7 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
 def balanced_ports(V: Lti, theta: Sequence[int]) -> Ports:
     """`v_hat_ports` with both outputs balanced together (V in unit coordinates)."""
     G, m = v_hat_ports(V, theta), V.outputs
-    both = _balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
+    both = balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
     return Ports(both.A, both.B, both.C[:m], both.D[:m], both.C[m:], both.D[m:])
 
 

@@ -23,14 +23,13 @@ from haptic_loop.controller.coupling import (
 from haptic_loop.controller.environment import Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
-from haptic_loop.design import budgets, environments, exact, spring_damper
+from haptic_loop.design import budgets, environments, spring_damper
 from haptic_loop.design import certificate as design_certificate
 from haptic_loop.design.certificate import Verdict, prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
-from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, from_ratio
 from haptic_loop.sim.scenario import load as scenario
 from tests.checks.random_loops import proofs
@@ -487,8 +486,8 @@ def test_every_block_is_measured_before_it_is_proved(monkeypatch):
         wall.walled(one).order + 2: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [1.0] * 4),
     }
     for states, make in blocks.items():
-        monkeypatch.setattr(exact, "_too_large", lambda n, most=states: "too many" if n >= most else None)
-        with pytest.raises(NotProved, match="too many"):
+        monkeypatch.setattr(budgets, "PROOF_STATES", states - 1)
+        with pytest.raises(NotProved, match=f"up to {states - 1} are tried"):
             make()
 
 

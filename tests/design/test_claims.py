@@ -21,9 +21,9 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.assessment import Guarantee, assess
 from haptic_loop.design.conditions import covers
-from haptic_loop.design.environments import LimitedForces
-from haptic_loop.design.lmi import Infeasible, Shaping, least_multiplier
-from haptic_loop.design.result import RANGES
+from haptic_loop.design.environments import LimitedForces, least_multiplier
+from haptic_loop.design.lmi import Shaping
+from haptic_loop.design.result import RANGES, Infeasible
 from haptic_loop.design.spring_damper import _GainSet, step
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link, Population

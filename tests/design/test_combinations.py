@@ -16,8 +16,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
-from haptic_loop.design.environments import THIS_ENVIRONMENT, LimitedForces
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT, LimitedForces
 
 change = msgspec.structs.replace
 BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from worlds import FIGURE_4, force_map
 
-from haptic_loop.controller.arithmetic import SingularLoop, inverse, numbers, rational
+from haptic_loop.controller.arithmetic import SingularLoop, TooLong, inverse, numbers, rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.environment import Network, Spring, environment
@@ -308,8 +308,9 @@ def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
 
 
 def test_models_with_too_many_states_are_reported():
-    assert exact._too_large(budgets.PROOF_STATES) is None
-    assert exact._too_large(budgets.PROOF_STATES + 1) == "a proof over 801 states takes long: up to 800 are tried"
+    budgets.require_size(budgets.PROOF_STATES)
+    with pytest.raises(TooLong, match=r"^a proof over 801 states takes long: up to 800 are tried$"):
+        budgets.require_size(budgets.PROOF_STATES + 1)
 
 
 @pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])

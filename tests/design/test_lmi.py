@@ -15,11 +15,11 @@ from haptic_loop.design.conditions import _v_hat
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.lmi import (
     Ports,
-    _balanced,
-    _unit_environment,
+    balanced,
     lemma1,
     lemma2,
     lemma3,
+    unit_environment,
 )
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
@@ -70,14 +70,14 @@ def strength(matrix, *storages):
 def test_balancing_leaves_the_response_alone(seed):
     G = random_stable(np.random.default_rng(seed), 5)
     padded = Lti.diag(G, Lti([[0.5]], [[0.0]], [[1.0]], [[2.0]], 1.0))
-    found = _balanced(padded)
+    found = balanced(padded)
     assert found.order == 5
     np.testing.assert_allclose(found.at(Z), padded.at(Z), atol=1e-8 * np.abs(padded.at(Z)).max())
 
 
 def test_units_preserve_the_loop():
     E, V = environment(FIGURE_4, T), SpringDamper([500, 900], [1, 2]).compliance(T)
-    scaled = _unit_environment(E, (2.0, 0.8)).at(Z) @ unit_coupling(V, (2.0, 0.8)).at(Z)
+    scaled = unit_environment(E, (2.0, 0.8)).at(Z) @ unit_coupling(V, (2.0, 0.8)).at(Z)
     np.testing.assert_allclose(np.linalg.eigvals(scaled), np.linalg.eigvals(E.at(Z) @ V.at(Z)), rtol=1e-9)
 
 
@@ -93,7 +93,7 @@ def test_the_realisation_16_and_its_quotient():
 
 
 def test_e_hats_regular_part_keeps_the_hermitian_part():
-    E = _unit_environment(environment(FIGURE_4, T), DELTA)
+    E = unit_environment(environment(FIGURE_4, T), DELTA)
     regular, printed = e_hat_regular(E, (0, 2)), e_hat_printed(E, (0, 2))
     np.testing.assert_allclose(hermitian(regular.at(Z)), hermitian(printed.at(Z)), atol=1e-9)
     assert regular.is_stable()
@@ -151,21 +151,21 @@ def test_lemma_3_is_the_norm(seed):
 
 
 def test_15_as_printed_is_strictly_infeasible():
-    E = _unit_environment(environment(FIGURE_4, T), DELTA)
+    E = unit_environment(environment(FIGURE_4, T), DELTA)
     printed = e_hat_printed(E, (0, 0))
     n = printed.order
     P = cp.Variable((n, n), symmetric=True)
     Phi = cp.Variable((2, 2), symmetric=True)
     assert strength(lemma1(Ports.same(printed), P, np.zeros((2, 2)), -Phi), P) < 1e-6
     # the reason, for every P: v'(A'PA - P)v = 0 where A v = v
-    regular = _balanced(e_hat_regular(E, (0, 0)))
+    regular = balanced(e_hat_regular(E, (0, 0)))
     P = cp.Variable((regular.order,) * 2, symmetric=True)
     assert strength(lemma1(Ports.same(regular), P, np.zeros((2, 2)), -np.eye(2)), P) > 1e-3
 
 
 def test_2_as_printed_is_infeasible_for_v_hat():
     V = unit_coupling(SpringDamper([300, 300], [0.3, 0.3]).compliance(T), DELTA)
-    printed = _balanced(v_hat_printed(V, (1, 2)))
+    printed = balanced(v_hat_printed(V, (1, 2)))
     P = cp.Variable((printed.order,) * 2, symmetric=True)
     assert strength(lemma1(Ports.same(printed), P, np.zeros((2, 2)), np.zeros((2, 2))), P) < 1e-6
     assert analysis(

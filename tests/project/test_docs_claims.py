@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
-from haptic_loop.design.lmi import ANY_ENVIRONMENT
 
 ROOT = Path(__file__).parents[2]
 MENTION = re.compile(r"(?:tests/(?:\w+/)*(test_\w+\.py))?::(\w+)")

@@ -45,7 +45,7 @@ def _tree(path: Path) -> ast.Module:
 
 #: conditions are asked what they say; only their homes know their names
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
-AT_HOME = ("design/conditions", "design/environments", "design/lmi", "design/result")
+AT_HOME = ("design/conditions", "design/environments", "design/result")
 
 
 def test_no_code_asks_for_a_conditions_name():
