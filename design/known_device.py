@@ -285,7 +285,7 @@ def _exact_cost(
 
 _LARGEST_ETA = 0.9999  # largest beta that is tried, relative to `largest_beta`, where c0 or c2 is 0
 _LEAST_ETA = 1e-5  # least such ratio, at which this-environment requires the same damping to five digits
-_BISECTIONS = 52  # bisections of an interval of shares, down to 2e-16 of its length
+_BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # So many matrices take hardly longer than one, so a step may try several shares per frequency.
 _WORST, _IN_A_CUT = 6, 28  # frequencies at which a cut locates the least share, and number of bisections there
 _VIOLATED = 3  # number of frequencies at which a round adds tangents
@@ -490,11 +490,11 @@ class _Search:
             for _ in range(budgets.BETA_CUTS):
                 if not share < most:
                     return np.inf, None
-                room = self.room(z, parts, idle, np.append(x[:-1], share))
-                low = np.argsort(room)[:_WORST]
-                low = low[room[low] <= 0]
+                low = np.flatnonzero(~self.sweep.holds(idle, z, share, beta))
                 if not low.size:
                     break
+                room = self.room(z[low], parts[:, low], idle[low], np.append(x[:-1], share))
+                low = low[np.argsort(room)[:_WORST]]
                 each = self.sweep.shares(idle[low], z[low], beta, most, _IN_A_CUT)
                 if each.max() > share:
                     share, binding = float(each.max()), (e, int(low[np.argmax(each)]))
@@ -590,7 +590,8 @@ class _Search:
         blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
         # The point with the share `least` satisfies all tangents.
-        x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, (*SETTINGS, INTERIOR))
+        settings = (SETTINGS[0], INTERIOR, *SETTINGS[1:])
+        x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, settings)
         slack = np.linalg.eigvalsh(blocks[0].at(x))[:, 0]
         self.tangents = [one for one, left in zip(self.tangents, slack, strict=True) if left < _SLACK]
         return unit * x
