@@ -182,6 +182,7 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
 # One wall: every command says what the condition for walls requires, none what a contact that is never left does.
 
 
+@pytest.mark.slow
 def test_one_wall_has_one_requirement(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     coupling = SpringDamper([1200.0], [0.5])

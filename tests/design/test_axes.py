@@ -249,7 +249,7 @@ def test_a_multiplier_stays_below_full_levels() -> None:
     assert left(needs.ratio * (1 - 1e-5)) < 0
 
 
-@pytest.mark.parametrize("loop", [LATE, SWITCHED])
+@pytest.mark.parametrize("loop", [LATE, pytest.param(SWITCHED, marks=pytest.mark.slow)])
 def test_the_stiffest_coupling_counts_levels(loop: Loop) -> None:
     design = design_by_kind(loop, "moving-average")
     assert 0.999 < design.requirement.ratio < 1
@@ -452,7 +452,12 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
 
 
 @pytest.mark.parametrize(
-    ("known", "condition"), [(False, "this-environment"), (False, "any-environment"), (True, "known-device")]
+    ("known", "condition"),
+    [
+        (False, "this-environment"),
+        (False, "any-environment"),
+        pytest.param(True, "known-device", marks=pytest.mark.slow),
+    ],
 )
 def test_full_levels_meet_walls(known: bool, condition: str) -> None:
     """A spring-damper of full levels before a wall is proved; it uses all of the damping, or is the stiffest."""

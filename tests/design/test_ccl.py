@@ -78,11 +78,13 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
 
 
+@pytest.mark.slow
 def test_the_inner_approximation_reaches_its_optimum(inner, structured):
     assert inner.objective <= 9.8
     assert inner.objective < structured.objective
 
 
+@pytest.mark.slow
 def test_results_are_certified_from_the_coupling_alone(inner):
     loop = asked()
     V = inner.coupling.V
@@ -107,6 +109,7 @@ def test_every_descent_step_is_feasible_and_better():
         assert norm < before
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # to 1e-4, which is enough
 def test_the_zeros_are_optimal_for_the_poles(inner):
     """With the poles of the design fixed, condition and norm are convex at each frequency: cvxpy finds the optimum."""

@@ -141,6 +141,7 @@ def test_certified_loops_rest_with_random_humans(coupling, links):
             assert dominant_mode(close(simulation.plant, simulation.F)).spectral_radius < 1
 
 
+@pytest.mark.slow
 def test_without_coupling_only_the_compliant_device_oscillates():
     """Figure 5 needs what a first-order device model leaves out."""
     base, unstable = load(), {}

@@ -175,7 +175,7 @@ def test_some_hands_gain_energy_far_below_the_requirement(names):
     assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
 
 
-@pytest.mark.parametrize("names", [("walls", "limiter"), ("latency", "walls")], ids="-".join)
+@pytest.mark.parametrize("names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.slow)])
 def test_facts_are_proved_at_every_vertex(names):
     """One set of multipliers serves all environments, each of which asks for at most as much by its own."""
     loop, rho = combined(names)
@@ -193,6 +193,7 @@ def test_facts_are_proved_at_every_vertex(names):
     assert not verify(Stored(stiffer, COUPLING.form(), certificate)).proved
 
 
+@pytest.mark.slow
 def test_walls_with_ranges_are_guaranteed_as_ranges():
     """Every vertex is proved, and the search between them takes the multipliers of the proof."""
     network = held(wall(3000.0, 2.0))

@@ -640,6 +640,7 @@ def test_the_slope_of_the_sampled_condition():
     assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # of one-sided differences in beta
 
 
+@pytest.mark.slow
 def test_a_spring_damper_on_known_devices_feels_stiffer():
     """The default loop is certified without a coupling, so the design makes its coupling next to rigid."""
     plain = design(KNOWN, "this-environment")
@@ -676,7 +677,10 @@ def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     assert prove(loop, found.coupling, "known-device-any").proof == "rational"
 
 
-@pytest.mark.parametrize("ranges", [None, Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))])
+STIFFER = Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))
+
+
+@pytest.mark.parametrize("ranges", [None, pytest.param(STIFFER, marks=pytest.mark.slow)])
 def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
     monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
@@ -706,6 +710,7 @@ def test_exact_loops_on_known_devices_need_no_coupling():
     assert found.requirement.required[0] == pytest.approx(1.3120, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_spring_dampers_before_walls_use_the_device():
     loop = on_a_wall(3000.0, 2.0, 1, 2.0)
     assert design_coupling(loop).condition == "known-device-any"
@@ -935,6 +940,7 @@ def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, p
     assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta)) == 0
 
 
+@pytest.mark.slow
 def test_the_audit_says_what_is_left_before_walls():
     """A hand that presses the wall for ever holds a spring-damper: some lossless one grows below the figure."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
@@ -984,7 +990,10 @@ def limited_needs(name):
     return required_damping(LIMITED_LOOPS[name], COUPLING, LIMITED).required[0]
 
 
-@pytest.mark.parametrize("name", LIMITED_LOOPS)
+LINEAR_OR_WALL = pytest.mark.parametrize("name", ["linear", pytest.param("wall", marks=pytest.mark.slow)])
+
+
+@LINEAR_OR_WALL
 def test_limited_forces_cost_little_on_known_devices(name):
     """More than unlimited ones, and less than on a device of which only the damping is known."""
     loop = LIMITED_LOOPS[name]
@@ -994,7 +1003,7 @@ def test_limited_forces_cost_little_on_known_devices(name):
     assert limited_needs(name) < plain
 
 
-@pytest.mark.parametrize("name", LIMITED_LOOPS)
+@LINEAR_OR_WALL
 def test_no_hand_gains_energy_from_limited_forces(name):
     """Of lossless hands behind the transmission, with limits that many ticks reach."""
     loop, bound = LIMITED_LOOPS[name], {"limit": [1.0], "rho": [RHO], "coupling": COUPLING}
@@ -1060,7 +1069,7 @@ def together_needs(name):
     return required_damping(loop, COUPLING, condition).required[0]
 
 
-@pytest.mark.parametrize("name", TOGETHER)
+@pytest.mark.parametrize("name", ["switching", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:])])
 def test_facts_on_known_devices_are_proved_from_files(name):
     """For less damping than devices of which less is known need; a file without a multiplier is refused."""
     loop, condition = TOGETHER[name]
@@ -1082,7 +1091,7 @@ def test_facts_on_known_devices_are_proved_from_files(name):
     assert not required_damping(short, COUPLING, condition, multiplier).certified
 
 
-@pytest.mark.parametrize("name", ["switching", "limiter-switching", "walls-switching"])
+@pytest.mark.parametrize("name", ["switching", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:3])])
 def test_no_hand_gains_energy_from_ages_of_forces(name):
     """Of lossless hands behind the transmission, each with the worst age of its force at every tick."""
     loop, condition = TOGETHER[name]

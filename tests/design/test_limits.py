@@ -31,6 +31,7 @@ def test_more_damping_is_never_worse():
         assert max(certify(loop, design)["this-environment"].required) < loop.delta[0]
 
 
+@pytest.mark.slow
 def test_more_bases_are_never_worse_than_the_bound():
     rms = [transparency_of(*optimum(1.37, bases)).rms_mismatch_db for bases in (1, 3)]
     assert rms == sorted(rms, reverse=True)

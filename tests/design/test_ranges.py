@@ -309,6 +309,7 @@ def test_files_without_ranges_keep_their_digest():
 # the commands
 
 
+@pytest.mark.slow
 def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     file, report = tmp_path / "c.json", tmp_path / "r.json"
@@ -371,6 +372,7 @@ def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, capsys):
     assert decisive(outcome)["certified"]
 
 
+@pytest.mark.slow
 def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp_path, capsys):
     asked = ["--condition", "this-environment", "--scenario", str(scenario_file)]
     assert design_main([*asked, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 0

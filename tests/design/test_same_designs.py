@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import pytest
 from tools.same_designs import LOOPS, ROOT
 
 #: a clock that runs ten thousand times as fast: a search that it ended would end at once
@@ -18,6 +19,7 @@ door("design")
 """
 
 
+@pytest.mark.slow
 def test_clock_and_cores_change_no_byte(tmp_path):
     """One design as it is, one on a single core by a clock that races. `make kernels` has six, under load."""
     words = ["--scenario", str(LOOPS / "o01-wall-light-device.toml"), "--coupling", "optimal"]

@@ -218,6 +218,7 @@ def test_this_environment_designs_use_the_objects_damping(case, rms_db):
     assert not any_environment(found.coupling.compliance(T), loop.theta, DELTA).certified
 
 
+@pytest.mark.slow
 def test_this_environment_designs_stabilise_delayed_environments():
     loop = asked((0, 0), psi=(1, 1), delta=(2.0, 2.0))
     found = design(loop, "this-environment")

@@ -85,6 +85,7 @@ def test_any_environment_designs_refuse_varying_delays():
         design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
 
 
+@pytest.mark.slow
 def test_an_optimal_coupling_for_switching_delays():
     """Swept, proved, and met by lossless hands under the worst switching."""
     asked = load().loop("I")
