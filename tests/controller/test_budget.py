@@ -162,7 +162,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
         assert worked.min() > 0
 
 
-@pytest.mark.parametrize("told", ["constant", "late"])
+@pytest.mark.parametrize("told", [pytest.param("constant", marks=pytest.mark.slow), "late"])
 def test_coarse_encoders_keep_the_guarantee(told):
     """Steps of 0.5 mm, and a controller that steals through them: not to know the steps costs more than the budget."""
     W0, q, most = 0.05, 5e-4, {}

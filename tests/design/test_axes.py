@@ -409,6 +409,7 @@ def period_forms(share: float, beta: np.ndarray) -> np.ndarray:
     return out
 
 
+@pytest.mark.slow
 def test_known_devices_take_full_levels() -> None:
     """He[[F/(z-1), 0], [-beta F/z, 0]] + L(dx, v, z v) is positive just above the requirement, not below."""
     needs = required_damping(KNOWN, BUILT, KNOWN_DEVICE)

@@ -175,7 +175,9 @@ def test_some_hands_gain_energy_far_below_the_requirement(names):
     assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
 
 
-@pytest.mark.parametrize("names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.slow)], ids="-".join
+)
 def test_facts_are_proved_at_every_vertex(names):
     """One set of multipliers serves all environments, each of which asks for at most as much by its own."""
     loop, rho = combined(names)

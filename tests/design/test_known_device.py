@@ -1038,6 +1038,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_limited_known_devices_are_proved_from_files():
     loop = change(KNOWN, delta=(1.0, 1.0))  # the published gains need 0.966 with the limiter
     certificate = prove(loop, PUBLISHED["I"], LimitedKnownDevice())

@@ -684,7 +684,9 @@ def test_late_walls_match_their_closed_form():
     assert found.g >= 0.49
 
 
-@pytest.mark.parametrize("name", ["n0", "n2", pytest.param("n4", marks=pytest.mark.validate)])
+@pytest.mark.parametrize(
+    "name", ["n0", pytest.param("n2", marks=pytest.mark.slow), pytest.param("n4", marks=pytest.mark.validate)]
+)
 def test_limited_forces_are_part_of_designs(name):
     """By matrices of our own: [[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] on a dense grid."""
     loop = loop_of(name)

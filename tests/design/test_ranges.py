@@ -236,6 +236,7 @@ def test_an_environment_that_no_device_feels_asks_nothing():
     assert nothing.ratio == 0
 
 
+@pytest.mark.slow
 def test_ranges_however_wide_have_an_answer():
     ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
     found = optimal.design(change(LOOP, ranges=ranges), SMALLEST)

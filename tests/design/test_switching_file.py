@@ -229,6 +229,7 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
     assert sorted(least)[1] > 0
 
 
+@pytest.mark.slow
 def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
     found = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
     assert found.holds

@@ -196,6 +196,7 @@ def audit(tmp_path, *options):
     return code, json.loads((tmp_path / "a.json").read_text())
 
 
+@pytest.mark.slow
 def test_audit_reports_switching_beside_the_constants(tmp_path):
     code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--varying-delay", "1,2")
     assert code == 1  # certified for the constant (1, 2), not for what was asked

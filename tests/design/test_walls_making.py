@@ -336,7 +336,7 @@ def swinging(loop, coupling, damping, seed=11):
     return fastest, made
 
 
-@pytest.mark.parametrize(("damping", "short"), [(0.0, 0.8), (2.0, 0.55)])
+@pytest.mark.parametrize(("damping", "short"), [pytest.param(0.0, 0.8, marks=pytest.mark.slow), (2.0, 0.55)])
 def test_hands_rest_at_the_requirement_not_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = required_damping(loop, coupling, "this-environment").required[0]
@@ -357,7 +357,7 @@ def test_damped_wall_designs_are_tight_and_proved():
     assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified
 
 
-@pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
+@pytest.mark.parametrize("loop", [PAIR, pytest.param(DAMPED, marks=pytest.mark.slow)], ids=["springs", "dampers"])
 def test_frozen_walls_fall_to_a_nonnegative_value(loop):
     """The step that bounds Z from below: x held, touched walls kept, also where they pull; from states of the loop."""
     rng = np.random.default_rng(5)
