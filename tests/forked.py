@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import fcntl
 import functools
+import gc
 import hashlib
 import inspect
 import json
@@ -22,6 +23,7 @@ import tempfile
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 
@@ -42,18 +44,20 @@ def load() -> None:
 def share_designs(folder: Path, patch=setattr) -> None:
     """What commands work out again and again, seconds each, once for all tests and processes that ask for the same.
 
-    That is: designs, bounds, what limited forces ask, and how the couplings beside a run's
+    That is: designs, bounds, requirements, proofs for limited forces, and how the couplings beside a run's
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import haptic_loop.cli.check
     import haptic_loop.cli.design
     from haptic_loop.design import api, assessment, bound, designs
+    from haptic_loop.hw import control
     from haptic_loop.sim import couplings
 
     for made, modules in (
         (designs.design_by_kind, (haptic_loop.cli.design, api, couplings)),
         (bound.bound, (bound,)),
-        (assessment.required_damping, (assessment,)),
+        (assessment.required_damping, (assessment, control)),
+        (assessment.prove, (assessment,)),
         (assessment.requirements_of, (assessment,)),
         (assessment.search_ranges, (assessment, haptic_loop.cli.check)),
         (api.instead, (api,)),
@@ -107,21 +111,34 @@ def _remembering(folder: Path, make):
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
     from haptic_loop.design.conditions import Condition
-    from haptic_loop.design.coupling_file import digest
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT
 
     call = inspect.signature(make).bind(loop, *asked, **options)
     call.apply_defaults()
     words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
-    if any(isinstance(x, Condition) for x in words.values()):
+    if any(isinstance(x, Condition) and not type(x).__module__.startswith("haptic_loop.") for x in words.values()):
         raise TypeError("a condition of a user's own")
     if make.__name__ == "design_by_kind":
         if ":" in words["kind"]:
             raise TypeError("a design of a user's own")
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
-    return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())
+    return sorted((name, _word(x)) for name, x in words.items())
+
+
+def _word(x: Any) -> str:
+    """Return a word for an argument, which equal arguments share. Raises TypeError for an object without one."""
+    from haptic_loop.design.conditions import Condition
+    from haptic_loop.design.coupling_file import digest
+
+    if hasattr(x, "form"):
+        return digest(x.form())
+    if isinstance(x, Condition):
+        return f"{type(x).__qualname__}({sorted((name, _word(part)) for name, part in vars(x).items())})"
+    if " at 0x" in repr(x):  # the address of an object tells nothing about its value
+        raise TypeError(f"{type(x).__name__} has no word")
+    return repr(x)
 
 
 @functools.cache
@@ -206,6 +223,7 @@ def _serve() -> None:
     if sys.argv[1]:
         share_designs(Path(sys.argv[1]))
         draw_once(Path(sys.argv[1]))
+    gc.freeze()  # a collection in a fork would write to, and so copy, every page of what is imported
     for line in sys.stdin:
         request = json.loads(line)
         if (child := os.fork()) == 0:

@@ -23,6 +23,8 @@ SLOW = regenerate.SLOW
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
 IN_ORDER = [command for command in IN_ORDER if not SLOW.search(command)]
+#: commands of seconds whose options quicker commands of these pages run as well, one at a time
+LENGTHY = re.compile(r"repeats\.py|--generations 20|--pattern adversarial|--script|zwidth --rigid")
 SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
@@ -54,7 +56,11 @@ def printed():
     return {}
 
 
-@pytest.mark.parametrize("command", IN_ORDER)
+def _marked(command):
+    return pytest.param(command, marks=pytest.mark.slow if LENGTHY.search(command) else (), id=command)
+
+
+@pytest.mark.parametrize("command", [_marked(command) for command in IN_ORDER])
 def test_every_command_runs(command, place, printed):
     """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
     done = run(command, place)

@@ -361,7 +361,7 @@ def names_in_pictures() -> Iterator[Case]:
         copied = lambda file=file: shutil.copy("t.npz", file)  # noqa: E731
         yield Case(f"picture of {name!r}", ("trace", file, "--plot", "a.png"), (0,), before=copied)
     for name in ("$a^$ \\U0001F600 \\u001b[31m", "[/b] [red]%s{}"):
-        run = ("run", "--case", "none", "--duration", "0.3", "--scenario", "s.toml", "--out", "new")
+        run = ("run", "--case", "none", "--duration", "0.1", "--scenario", "s.toml", "--out", "new")
         yield Case(f"scenario called {name}", run, (0,), before=toml('"omega-pair"', f'"{name}"'))
 
 

@@ -135,7 +135,7 @@ def overwritten() -> Iterator[Case]:
 
     words = ("run", *QUICK["run"], *NONE, "--scenario", "dir/report.json", "--out", "dir")
     yield Case("a report over its scenario", words, says="read", before=report_is_a_scenario)
-    words = ("run", *QUICK["run"], "--out", "new", "--json", "new/trace.npz")
+    words = ("run", *QUICK["run"], *NONE, "--out", "new", "--json", "new/trace.npz")
     yield Case("json over the trace", words, says="twice", before=lambda: os.mkdir("new"))
     hard = ("design", "--scenario", "s.toml", "--json", "hard")
     yield Case("a second name of the scenario", hard, says="also", before=lambda: os.link("s.toml", "hard"))
