@@ -335,7 +335,7 @@ class _Best:
         yield "bases [dB]", ", ".join(tried) or None
         yield "ended by --seconds", "a larger basis may be better" if self.ended_by_seconds else None
         yield "last not taken", next((basis.rejected for basis in reversed(self.bases) if basis.rejected), None)
-        if missed := [basis.reason for basis in self.bases if not (basis.proved or basis.rejected)]:
+        if missed := [basis.reason for basis in self.bases if not (basis.certified or basis.rejected)]:
             yield "last not proved", missed[-1]
 
 

@@ -1,8 +1,8 @@
 """Design the optimal coupling: the force filter R of least mismatch whose loop satisfies a condition, with a proof.
 
 The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
-solution until a refined sweep passes, rounds it to decimals and proves it in exact arithmetic. It returns the best
-proved solution. With R(1) = g I the static stiffness F(1) = g E(1) is symmetric for all springs of the environment.
+solution until a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
+proves. With R(1) = g I the static stiffness F(1) = g E(1) is symmetric for all springs of the environment.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ _KEPT_STIFFNESS = 0.5  # A solution is rejected if it renders less than this sha
 _FELT_STIFFNESS = 0.02  # No such floor applies below this share of the environment's static stiffness.
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # Starting (beta, c) of a limiter; only the first if psi = 0.
 _HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
+_RESERVES = (0.95, 2.5, 50.0)  # shares of the margin that stay unused; the next is taken if the proof fails
 # An environment enters the program if it needs more than 1 + _TOLERATED times the damping; scaling covers less.
 _TOLERATED = 0.02
 _SEARCHED = 0.2  # least share of --seconds for the search between the vertices of ranges
@@ -54,17 +55,17 @@ class _BasisResult:
     states: int  # order of the loop
     mismatch_db: float  # objective
     g: float  # rendered share of the static stiffness
-    reason: str | None  # reason why the coupling is not certified and proved, or None
+    reason: str | None  # reason why a sweep, or with a limiter the proof, does not certify the coupling, or None
     seconds: float  # time since the design began
-    rejected: str | None = None  # reason why the coupling is rejected although it is proved, or None
+    rejected: str | None = None  # reason why the coupling is rejected although it is certified, or None
 
     @property
-    def proved(self) -> bool:
+    def certified(self) -> bool:
         return self.reason is None
 
     @property
     def taken(self) -> bool:
-        return self.proved and self.rejected is None
+        return self.certified and self.rejected is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ def design(
             hurried = search.over()
             break
         gained = np.inf if result.reason else search.gained(best, candidate)
-        if best and candidate.g < floor and result.proved:
+        if best and candidate.g < floor and result.certified:
             result = replace(
                 result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another's"
             )
@@ -153,16 +154,16 @@ def design(
             better.append(candidate)
         hurried = not settled and search.over()
         hopeless = len(results) >= budgets.UNPROVED_BASES and not any(
-            each.proved for each in results[-budgets.UNPROVED_BASES :]
+            each.certified for each in results[-budgets.UNPROVED_BASES :]
         )
         if settled or hurried or (hopeless and not loop.ranges):
             break
-    if loop.ranges:
-        for candidate in better[: -budgets.RANGED_BASES - 1 : -1]:
-            best = search.between(candidate)
-            hurried |= best.searched is not None and best.searched.ended and search.over()
-            if best.proved:
-                break
+    proved_last = better[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
+    for candidate in proved_last:
+        best = search.between(candidate) if loop.ranges else search.proved_or_smaller(candidate)
+        hurried |= best.searched is not None and best.searched.ended and search.over()
+        if best.proved:
+            break
     if best is None or not best.proved or search.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, search.scaled(), search.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, search.merit(one)))
@@ -290,6 +291,11 @@ class _Search:
         """Whether this-environment is the only constraint, without ranges and without a latency."""
         return not (self.constrained or self.loop.latency or self.loop.ranges)
 
+    @property
+    def proves_last(self) -> bool:
+        """Whether only the best coupling of all bases is proved. A limiter is solved for with proved multipliers."""
+        return not self.options.limiter
+
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
         """Return the limiters to solve for: that of the solution `before` with its certified multiplier, or the starts.
 
@@ -368,7 +374,7 @@ class _Search:
     def over_basis(
         self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
     ) -> tuple[Optimal, _BasisResult]:
-        """Return the optimum over a basis, scaled until every sweep passes, and proved if it gains `least` dB.
+        """Return the optimum over a basis, scaled until every sweep passes. With a limiter it is also proved.
 
         If the optimum renders less than the share `floor` of the static stiffness, it is solved again with a larger
         weight of the stiffness.
@@ -397,16 +403,28 @@ class _Search:
         coupling, needs = self.kept_in_all(problem)
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
-        for share in (0.95, 2.5, 50.0):  # The unused share of the margin grows until the proof succeeds.
+        for share in _RESERVES:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             candidate = self._assessed(scaled, scaled.g)
             if self.gained(before, candidate) < least:
                 return replace(candidate, reason=_SETTLED)
-            if self.loop.ranges or (candidate := self._proved(candidate, slip)).proved:
+            if self.proves_last or (candidate := self._proved(candidate, slip)).proved:
                 break
         return candidate
+
+    def proved_or_smaller(self, candidate: Optimal) -> Optimal:
+        """Return the coupling with a proof, its forces scaled down if necessary, or unproved if all scalings fail."""
+        coupling, needs = candidate.coupling, candidate.requirement.ratio
+        assert isinstance(coupling, ForceFilter)
+        proved = self._proved(candidate, None)
+        for share in _RESERVES[1:]:
+            if proved.proved:
+                break
+            smaller = _scaled(coupling, (1 - share * program.MARGIN) / max(needs, 1 - program.MARGIN))
+            proved = self._proved(self._assessed(smaller, smaller.g), None)
+        return proved
 
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in

@@ -22,13 +22,14 @@ from haptic_loop.controller.lti import Lti, Sampled
 from haptic_loop.design import program
 from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre
 from haptic_loop.design.bound import BoundBeside, _causal, bound
-from haptic_loop.design.certificate import verify
+from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.conditions import ratio_in
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.frequency import hermitian, on_circle
 from haptic_loop.design.optimal import _SETTLED, _BasisResult, design
 from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
+from haptic_loop.design.result import NotProved
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
 from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import load
@@ -175,7 +176,7 @@ def test_every_basis_is_reported_as_it_is_finished():
     found = design(loop_of("n3"), SHORT, progress=heard.append)
     assert tuple(heard) == found.bases
     assert [basis.taps for basis in heard] == [4, 8]
-    assert all(basis.proved for basis in heard)
+    assert all(basis.certified for basis in heard)
     assert heard[0].seconds < heard[1].seconds <= found.wall_s
 
 
@@ -204,6 +205,32 @@ def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
         assert each.rejected
     if taken == 1:
         assert "renders 0.200 of the stiffness" in found.bases[2].rejected
+
+
+@pytest.mark.parametrize("refused", [1, 3])
+def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
+    """After one failed proof the best filter is scaled down; after three the filter of the basis before is proved."""
+    usual, left, asked = prove, iter(range(refused)), []
+
+    def refusing(loop, coupling, *more, **options):
+        asked.append(coupling)
+        if next(left, None) is not None:
+            raise NotProved("not this time")
+        return usual(loop, coupling, *more, **options)
+
+    monkeypatch.setattr("haptic_loop.design.optimal.prove", refusing)
+    loop = loop_of("n3")
+    found = design(loop, SHORT)
+    assert [basis.taken for basis in found.bases] == [True, True]
+    assert found.proved
+    assert len(asked) == refused + 1
+    assert found.coupling is asked[-1]
+    first = asked[0]
+    if refused == 1:
+        assert 0.99 < found.coupling.g / first.g < 1
+    else:
+        np.testing.assert_array_equal(found.coupling.R, smallest("n3").coupling.R)
+    assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
@@ -723,4 +750,4 @@ def test_every_loop_gets_an_answer_and_proof(seed):
     found = design(hostile(np.random.default_rng(seed)), SMALLEST)
     assert found.proved
     assert isinstance(found.coupling, ForceFilter)
-    assert found.bases[0].proved
+    assert found.bases[0].certified
