@@ -77,6 +77,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(DesignOptions.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
 
 
+@pytest.mark.slow
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
 
     loop = load().loop("I")

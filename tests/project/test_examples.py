@@ -7,6 +7,8 @@ import pytest
 from forked import run
 
 ROOT = Path(__file__).parents[2]
+#: examples of more than two seconds
+SLOW = ("limits_of_any_coupling", "unstable_and_certified", "your_own_device", "mujoco_two_fingers", "wheel")
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "classics")  # test_classics.py runs its rows
 
 #: what each must print; figures are those that docs and other tests have
@@ -68,7 +70,11 @@ def test_missing_damping_ends_the_example_clearly(tmp_path):
     assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can guarantee nothing to any human\n"
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def _marked(path):
+    return pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem in SLOW else ())
+
+
+@pytest.mark.parametrize("path", [_marked(path) for path in EXAMPLES])
 def test_an_example_runs(path, tmp_path):
     done = run(["python", path, *ASKS.get(path.stem, ())], tmp_path)
     assert done.returncode == 0, done.stderr

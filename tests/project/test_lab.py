@@ -5,6 +5,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from haptic_loop.cli.main import COMMANDS, _command
 from haptic_loop.cli.options import DOES_NOT_HOLD, DONE
 from tests.asked import decisive
@@ -22,6 +24,7 @@ def go(command: str, *words: str, holds: bool = True) -> None:
     assert code == DONE if holds else code in (DONE, DOES_NOT_HOLD)
 
 
+@pytest.mark.slow
 def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # the first basis is as good for this

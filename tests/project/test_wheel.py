@@ -49,6 +49,7 @@ def users_folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_console_script_ignores_the_users_modules(installed, users_folder):
     words = ["run", "--case", "none", "--duration", "0.3", "--no-plot"]
     done = subprocess.run([installed / "haptic-loop", *words], cwd=users_folder, capture_output=True, text=True)
@@ -56,6 +57,7 @@ def test_console_script_ignores_the_users_modules(installed, users_folder):
     assert (users_folder / "out").is_dir()
 
 
+@pytest.mark.slow
 def test_wheel_installs_one_package(installed, users_folder):
     code = "import haptic_loop, haptic_loop.sim, sys; print(haptic_loop.sim.__file__); haptic_loop.load('omega-pair')"
     done = subprocess.run([installed / "python", "-c", code], cwd=users_folder, capture_output=True, text=True)

@@ -87,7 +87,9 @@ def children(pid: int) -> list[int]:
 @pytest.mark.parametrize(
     ("end", "words", "workers_and_their_clerk"),
     [
-        (signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
+        pytest.param(
+            signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3, marks=pytest.mark.slow
+        ),
         (signal.SIGKILL, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
     ],
 )

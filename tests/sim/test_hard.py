@@ -122,6 +122,7 @@ def test_encoder_steps_move_traces_less_than_a_step():
     assert np.abs(free[:, :2]).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_one_simulated_hour_does_not_drift():
     """0.6 Hz at 1.2 ms repeats every 12500 ticks exactly: the last period is the one of the first minute."""
     loop = assemble(load().replace(tap=None), PUBLISHED["I"])

@@ -125,6 +125,7 @@ def test_hands_meet_the_cells_own_environment(optimal):
 OPTIONS = ["--coupling", "optimal", "--grid", "6", "--humans", "10", "--points", "3", "--duration", "1.5"]
 
 
+@pytest.mark.slow
 def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     assert zwidth.main([*OPTIONS, "--out", str(tmp_path)]) == DONE
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out

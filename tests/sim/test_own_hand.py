@@ -184,6 +184,7 @@ class Mixed:
         return [hand for _ in range(n) for hand in Muscles((Muscle, Light)[rng.integers(2)]).draw(rng, 1)]
 
 
+@pytest.mark.slow
 def test_the_adversary_fails_against_enough_damping():
     """The published gains need 1.3987 N s/m."""
     scenario = SCENARIO.replace(delta=(1.42, 1.42), population=Mixed())

@@ -104,6 +104,7 @@ springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
     assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys):
     path = tmp_path / "soft.json"
     assert design_command(["--decay", "0.01", "--out", str(path), "--json", str(tmp_path / "r.json")]) == 0
