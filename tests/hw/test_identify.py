@@ -142,8 +142,13 @@ BETWEEN += ("dry friction that bends at 0.1 m/s", "Stribeck up to 0.06 m/s")
 BETWEEN += ("memory of 10 ms, 1 N s/m", "trace of 10 ms, 0.02 N s/m", "constant 0.001", "coulomb 0.05, slip 0.0005")
 
 
+#: two seconds, where weaker memories of the same dashpot take one
+SLOW = ("memory of 3 ms, 20 N s/m",)
+
+
 def _marked(names):
-    return [pytest.param(name, marks=pytest.mark.validate if name in BETWEEN else ()) for name in names]
+    marks = dict.fromkeys(BETWEEN, pytest.mark.validate) | dict.fromkeys(SLOW, pytest.mark.slow)
+    return [pytest.param(name, marks=marks.get(name, ())) for name in names]
 
 
 @pytest.mark.parametrize("name", _marked(ODD))

@@ -429,7 +429,7 @@ def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
-    run.run_to_the_end(5.0)
+    run.run_to_the_end(2.0)
     (part,) = outcome("I", run.session, recorder, 0).energy_budget
     assert part.limited_ticks == part.surprises == 0
     assert part.ticks == len(recorder)
@@ -447,7 +447,7 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
         recorder = Recorder(2)
         settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
         run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
-        run.run_to_the_end(2.0)
+        run.run_to_the_end(1.3)
         report = outcome("I", run.session, recorder, 0)
         (part,) = report.energy_budget
         path = save(tmp_path, run.session, recorder, report, False)[0]

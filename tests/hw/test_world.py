@@ -129,8 +129,8 @@ def in_the_ball_world(*faults):
         met, link = timed(scenario, ages, 0.99, 100.0)
         return certified_couplings(met, "I", "moving-average", None, link)
 
-    stop = [(1.5, lambda session, now: session.stop("asked to", now))]
-    Rehearsal(session, Emulator(scenario, faults), plan, faults, actions=stop).run_until_armed(3.0)
+    stop = [(1.1, lambda session, now: session.stop("asked to", now))]
+    Rehearsal(session, Emulator(scenario, faults), plan, faults, actions=stop).run_until_armed(2.6)
     x = np.array([row.x for row in rows])
     f = -4e-4 * np.array([row.state.applied for row in rows])[:-1]
     dx = np.diff(x, axis=0)
@@ -145,7 +145,7 @@ def test_motors_in_worlds_are_tested_at_last():
 
 
 def test_a_dead_motor_in_a_world_never_finishes():
-    session, _ = in_the_ball_world("axis6:motor=0@1.2")
+    session, _ = in_the_ball_world("axis6:motor=0@0.8")
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith("motor or encoder of axis 6 did not answer a test force of up to 1 N")
 

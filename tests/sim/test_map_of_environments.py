@@ -122,7 +122,7 @@ def test_hands_meet_the_cells_own_environment(optimal):
         assert (growth < 0).all() == stable
 
 
-OPTIONS = ["--coupling", "optimal", "--grid", "6", "--humans", "10", "--points", "3", "--duration", "1.5"]
+OPTIONS = ["--coupling", "optimal", "--grid", "4", "--humans", "5", "--points", "2", "--duration", "1.5"]
 
 
 @pytest.mark.slow
@@ -135,7 +135,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     assert report["assessment"]["requirements"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["this-environment", "any-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0
-    assert 0 < report["this-environment"]["certified_cells"] < 36
+    assert 0 < report["this-environment"]["certified_cells"] < 16
     assert report["simulation"]["differ_from_linear"] == 0
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)

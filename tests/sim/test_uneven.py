@@ -189,7 +189,7 @@ def test_periods_vary_beside_delays():
 
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
-    rows = list(uneven.uneven_ticks(0, 3, 2500))
+    rows = list(uneven.uneven_ticks(0, 3, 1200))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
     assert sum(row.grow > 0 for row in rows) >= 4
