@@ -301,6 +301,7 @@ def test_undetectable_hands_add_no_damping(odd):
         settled([sitting(odd, "ideal")])
 
 
+@pytest.mark.slow
 def test_damping_in_one_sitting_is_refused(tmp_path, monkeypatch):
     """In virtual time, a dashpot of 0.3 N s/m at the handles in the first one: two records of three agree."""
     sittings = {}  # virtual time repeats bit by bit, so the first two of three serve as the two
