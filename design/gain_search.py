@@ -33,7 +33,7 @@ from haptic_loop.design.frequency import frequencies, hermitian, least_eigenpair
 from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
-from haptic_loop.design.transparency import BAND_HZ, transparency
+from haptic_loop.design.transparency import BAND_HZ, rms_mismatch
 
 #: reserve of the sampled condition, 1.5 times that of the design, for frequencies between the samples
 _SAMPLED_RESERVE = 1.5 * RESERVE
@@ -475,7 +475,7 @@ def least_rms(
         if x is None:
             continue
         coupling = condition.coupling(x)
-        rms = transparency(loop.F(coupling), loop.E(), loop.lam, band_hz).rms_mismatch
+        rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band_hz)
         if rms < least:
             best, least, multiplier = coupling, rms, condition.multiplier(x)
         if loop.channels > FEW:

@@ -48,7 +48,7 @@ from haptic_loop.design.lmi import (
     usable,
 )
 from haptic_loop.design.result import Design, DesignFailed, Infeasible
-from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
+from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
@@ -373,7 +373,7 @@ def _for_this_environment(
         raise (_NoLinearDesign if limiter and nothing else DesignFailed)(None, (), line)
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
     if many:
-        rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
+        rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band)
     requirement = this_environment(loop.F(coupling), loop)
     wall_s = time.perf_counter() - started
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c if many else None)

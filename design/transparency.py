@@ -120,7 +120,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     worst = supremum(relative, grid)[0]
     if worst < _ROUNDING:
         worst = peak = 0.0
-    rms = _rms(mismatch, environment, frequencies(F, environment, low=low, high=high, points=60)) if worst > 0 else 0.0
+    rms = rms_mismatch(F, environment, lam, band_hz) if worst > 0 else 0.0
     return Transparency(
         tau=_ratio(peak, least),
         relative_mismatch=worst,
@@ -142,15 +142,21 @@ def _ratio(numerator: float, denominator: float) -> float:
     return np.inf if numerator > 0 else np.nan
 
 
-def _rms(mismatch, environment: Lti, grid: Array) -> float:
-    """Return the root mean square over log frequency; `grid` is dense where the ratio may be sharp."""
+def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
+    """Compute the rms of the mismatch over log frequency alone, with rounding. Raises ValueError if E is zero."""
+    if silent(environment):
+        raise ValueError(NO_FORCE)
+    target = delay(lam, F.T) @ environment
+    per_hz = 2 * np.pi * F.T
+    low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
 
     def square(logarithm: Array) -> Array:
-        w = np.exp(logarithm)
-        E = environment.at(on_circle(w))
-        return (np.abs(mismatch(w)) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
+        z = on_circle(np.exp(logarithm))
+        E, M = environment.at(z), F.at(z) - target.at(z)
+        return (np.abs(M) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
 
-    logarithm = np.log(grid)
+    # The grid is dense where the ratio may be sharp.
+    logarithm = np.log(frequencies(F, environment, low=low, high=high, points=60))
     return float(np.sqrt(integral(square, logarithm) / (logarithm[-1] - logarithm[0])))
 
 

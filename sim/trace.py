@@ -216,11 +216,8 @@ class Trace(ReadOnly):
             for i in channels
         ]
         table = np.column_stack([self.t, self.x, self.f])
-
-        def content(file: BinaryIO) -> None:
-            np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(["t [s]", *names]), comments="")
-
-        return write(path, content)
+        line = ",".join(["%.9g"] * table.shape[1])
+        return write(path, "\n".join([",".join(["t [s]", *names]), *(line % (*row,) for row in table.tolist()), ""]))
 
 
 # ---- octaves, and lasting oscillations
