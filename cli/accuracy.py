@@ -29,7 +29,6 @@ class _Report:
     case: str
     scenario: str
     coupling: str
-    seed: int
     default_substeps: int
     rows: list[Row]
     skipped: list[str]
@@ -55,7 +54,7 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--duration: RK4 needs {default} steps a tick here; allowed are up to {longest:.3g} s")
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
-    report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
+    report = _Report(args.case, scenario.name, chosen.kind, default, *measured)
     files = render.pictures(args, report.rows, out, {"accuracy.png": "plot_accuracy"}, bool(report.rows))
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
@@ -90,7 +89,7 @@ def _parser() -> options.Parser:
     parser.add_limiter()
     duration = "of each run (default: the scenario's)"
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help=duration)
-    parser.add_output(picture=True)
+    parser.add_output(picture=True, seed=False)
     return parser
 
 

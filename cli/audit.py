@@ -21,7 +21,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 if TYPE_CHECKING:
     from haptic_loop.design.audit import Audit, Help, Margins
-    from haptic_loop.design.coverage import Switching
+    from haptic_loop.design.coverage import SwitchingFigures
     from haptic_loop.sim.report import EncoderSteps
 
 _EXAMPLES = (
@@ -294,7 +294,7 @@ def _stiffest(K: Sequence[float | None]) -> str:
 
 #: name of a row -> function from the requirement and the margins of one condition to its cell
 _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
-    "needs damping": lambda r, _: f"{render.needs(r)}: {render.certified(r, proof=False)}",
+    "needs damping": lambda r, _: f"{r.amounts()}: {render.certified(r, proof=False)}",
     "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),
     "binds at": lambda r, _: render.optional(r.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda _, m: _stiffest(m.stiffest.K),
@@ -339,13 +339,16 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
         yield f"What helps: {each.change} ({needs})."
 
 
-def _switching_remarks(switching: Switching) -> Iterator[str]:
+def _switching_remarks(switching: SwitchingFigures) -> Iterator[str]:
     needs, buffered = switching.requirement, switching.playout
     span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(switching.lo, switching.hi, strict=True))
-    yield f"Any switching of the delays ({span} samples) needs {render.needs(needs)}: {render.certified(needs)}."
+    any_switching = f"Any switching of the delays ({span} samples)"
     if buffered is None:
-        yield f"any switching: {needs.reason}."
+        yield f"{any_switching} is not certified: {needs.reason}."
         return
+    yield f"{any_switching} {needs.words()}: {render.certified(needs)}."
     enough = "certified" if buffered.certified else "not certified"
-    needed = listed(buffered.required_damping)
-    yield f"A playout buffer to the constant {listed(switching.hi)} needs {needed} N s/m: {enough}."
+    needed = f"needs {listed(buffered.required_damping)} N s/m"
+    if math.inf in buffered.required_damping:
+        needed = "is not enough with any damping"
+    yield f"A playout buffer to the constant {listed(switching.hi)} {needed}: {enough}."

@@ -251,7 +251,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
-    switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
+    switching = coverage.SwitchingFigures.of(loop, design.coupling, known) if loop.varying_delay else None
     chosen_options = Options(**_options_of(args, "optimal")) if best else DEFAULT
     nearby, limit, interrupted = None, None, False
     note = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
@@ -343,9 +343,9 @@ def _why_rejected(basis: Any) -> str:
     return "" if basis.taken else " (not taken)" if basis.rejected else " (not proved)"
 
 
-def _switching_words(proof: coverage.Switching) -> str:
+def _switching_words(proof: coverage.SwitchingFigures) -> str:
     span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(proof.lo, proof.hi, strict=True))
-    needs = f"needs {render.needs(proof.requirement)}: {render.certified(proof.requirement, proof=False)}"
+    needs = f"{proof.requirement.words()}: {render.certified(proof.requirement, proof=False)}"
     return f"{span} samples: {needs} (proof: {proof.requirement.proof})"
 
 
@@ -366,7 +366,7 @@ class _Report:
     price: list[coverage.OverRanges] | None
     kind: str  # kind of the coupling
     assessment: Assessment = render.several(_assessment_rows)
-    switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
+    switching: coverage.SwitchingFigures | None = render.figure("damping, any switching", _switching_words)
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     robustness: Robustness | None = render.several(render.robustness_rows)

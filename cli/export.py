@@ -77,7 +77,7 @@ def main(argv: list[str]) -> int:
     claim = own.claim if own and verdict.proved else None
     block = _block(args, stored, verdict, claim)
     path = out_file(args.out, f"out/export/{options.name_of(args.coupling)}-{block.name}.c")
-    test = trial(block, args.seed)
+    test = trial(block)
     write(path, comments_in_unit(c_source(block, test, path.name)))
 
     forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
@@ -99,7 +99,7 @@ def main(argv: list[str]) -> int:
         block.limiter and block.limiter.limit,
         forces if args.process else None,
         _error(block) if args.float else None,
-        {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
+        {"ticks": len(test.inputs), "largest_output": np.abs(test.outputs).max()},
         claim,
     )
     title = f"{block.name} as C99"
@@ -128,7 +128,7 @@ def _parser() -> options.Parser:
     single = "compute in single precision, for processors without double; its error is printed"
     parser.add_argument("--float", action="store_true", help=single)
     parser.add_condition("the condition of the file's certificate, where that is one of your own")
-    parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)")
+    parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)", seed=False)
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
     parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")
     return parser

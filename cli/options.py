@@ -222,15 +222,17 @@ class Parser(argparse.ArgumentParser):
         out: str = "DIR",
         what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>[-<coupling>])",
         picture: bool = False,
+        seed: bool = True,
     ) -> None:
-        """Add the options for the output folder and the seed."""
+        """Add the options for files, and --seed unless nothing is drawn at random."""
         output = self.add_argument_group("output", "the folder of a FILE that you name must exist")
         if picture:
             output.add_argument("--no-plot", action="store_true", help="write no picture")
         self.add_json(output)
         output.add_argument("--out", metavar=out, help=what)
-        seed = "for random draws; recorded (default 0)"
-        output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
+        if seed:
+            drawn = "for random draws; recorded (default 0)"
+            output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=drawn)
 
     def add_details(self) -> None:
         """Add --details."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.files import InJson, plain, remove, write_json
-from haptic_loop.design.result import DesignFailed, Requirement, listed
+from haptic_loop.design.result import DesignFailed, Requirement
 
 if TYPE_CHECKING:  # loaded only by commands that need them
     from rich.table import Table
@@ -263,16 +263,10 @@ def short(condition: str) -> str:
     return condition.replace("environment", "env.")
 
 
-def needs(need: Requirement, digits: int = 6) -> str:
-    """Return the text of required and available damping."""
-    return f"{listed(need.required, digits)} of {listed(need.available, digits)} N s/m"
-
-
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
     """Yield one row for each condition with its damping, and with `proof` whether exact arithmetic proves it."""
     for name, need in requirements.items():
-        asks = f"needs {needs(need, digits)}" if math.isfinite(need.ratio) else "no damping is enough"
-        yield f"damping, {name}", f"{asks}: {certified(need, proof)}"
+        yield f"damping, {name}", f"{need.words(digits)}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
@@ -336,5 +330,5 @@ def delay_rows(part: VaryingDelays) -> Rows:
         growth = f"{period.growth_rate_per_s:+.4f} 1/s with a period of {period.ticks} ticks"
         yield "worst switching found", f"{growth}: {verdict(period.verdict)}"
     if proof:
-        yield "damping, any switching", f"needs {needs(proof.requirement, 5)}: {certified(proof.requirement)}"
+        yield "damping, any switching", f"{proof.requirement.words(5)}: {certified(proof.requirement)}"
     yield "these delays covered", "[green]yes[/]" if part.certified.covered else "[yellow]no[/]"

@@ -11,7 +11,7 @@ from haptic_loop.cli import render
 from haptic_loop.controller.environment import RIGID_WALL, Environment
 from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult
 from haptic_loop.design.gain_search import SOFTEST
-from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite
+from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
 from haptic_loop.design.robustness import Robustness
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.couplings import assessed, choose
@@ -164,10 +164,10 @@ def gain_rows(assessment: Assessment) -> render.Rows:
     """Yield the rows of a spring-damper's gains, or of the static stiffness."""
     gains = assessment.gains
     if "K" in gains:
-        K, B = (render.listed(gains[name], 5) for name in ("K", "B"))
+        K, B = (listed(gains[name], 5) for name in ("K", "B"))
         yield "coupling K / B", f"{K} N/m / {B} N s/m"
     if "stiffness" in gains:
-        yield "coupling, static", f"{render.listed(gains['stiffness'], 5)} N/m"
+        yield "coupling, static", f"{listed(gains['stiffness'], 5)} N/m"
 
 
 _NEVER = "no damping is enough"

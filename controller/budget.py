@@ -307,15 +307,15 @@ class EnergyBudget(_Net):
 class Shell(_Net):
     """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
-    W[k+1] = min(cap, W[k] + f'(u - u_-)), and f = s f_wanted with the largest s in [0, 1] for which W[k+1] >= 0. V
+    W[k+1] = W[k] + f'(u - u_-), and f = s f_wanted with the largest s in [0, 1] for which W[k+1] >= 0. V
     responds within the tick, u = u0 - D_V f, so that W[k+1] is a concave parabola in s, nonnegative at 0, and s is its
     upper root. Then sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is
     certified for any environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
     """
 
-    def __init__(self, V: Lti, *, start: float = 0.0, cap: float = np.inf, nsim: int = 1) -> None:
+    def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:
         """Raise ValueError if V is not square, or if its direct part is not passive."""
-        super().__init__(start, cap, nsim)
+        super().__init__(start, np.inf, nsim)
         if V.inputs != V.outputs:
             raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected as many")
         if np.linalg.eigvalsh((V.D + V.D.T) / 2).min() < -1e-12 * max(1e-300, float(np.abs(V.D).max())):

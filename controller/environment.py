@@ -306,7 +306,7 @@ class _NoModel(SingularLoop):
         super().__init__(_NO_MODEL)
 
 
-class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
+class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A MuJoCo scene instead of a network. It has no known E(z), so only any-environment can be certified."""
 
     file: str  # MJCF
@@ -330,7 +330,7 @@ class Network(
     walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
     block: Block | None = None  # an E(z) that is added to the network
     elements: tuple[Any, ...] = ()  # objects of a user's own classes; their parts become springs and walls
-    world: World | None = None  # a MuJoCo scene in place of springs, masses, walls and block
+    world: SceneFile | None = None  # a MuJoCo scene in place of springs, masses, walls and block
     points: dict[str, tuple[str, ...]] = {}  # the nodes of each point's coordinates; ground for a fixed coordinate
     linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model
 
@@ -364,7 +364,7 @@ class Network(
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
 
-    def _check_world(self, world: World) -> None:
+    def _check_world(self, world: SceneFile) -> None:
         beside = [name for name in ("springs", "masses", "walls", "block", "elements") if getattr(self, name)]
         if beside:
             raise ValueError(f"world and {beside[0]}: a world is the whole environment, give one of them")

@@ -79,6 +79,12 @@ class DeviceBounds(Strict, frozen=True):
                 raise ValueError(f"{name} is {getattr(self, name):g}, allowed are {low:g} to {high:g} {unit}")
 
 
+def check_shortest(T_min: float | None, T: float) -> None:
+    """Raise ValueError unless a declared shortest period T_min [s] is positive and at most T."""
+    if T_min is not None and not 0 < T_min <= T:
+        raise ValueError(f"T_min is {T_min:g} s, expected above 0 and at most T = {T:g} s")
+
+
 class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of the digest
     """All data from which a condition certifies a coupling."""
 
@@ -120,8 +126,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             self._check_varying_delay(self.varying_delay)
         if self.T_max is not None and not self.T <= self.T_max < float("inf"):
             raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
-        if self.T_min is not None and not 0 < self.T_min <= self.T:
-            raise ValueError(f"T_min is {self.T_min:g} s, expected above 0 and at most T = {self.T:g} s")
+        check_shortest(self.T_min, self.T)
         if self.known_devices is not None and len(self.known_devices) != m:
             raise ValueError(f"known_devices has {len(self.known_devices)} entries for {m} channels")
         if self.latency is not None:

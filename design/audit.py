@@ -26,7 +26,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import Switching
+from haptic_loop.design.coverage import SwitchingFigures
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE
@@ -355,7 +355,7 @@ class Audit:
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the loop's own environment at the constant delays
-    switching: Switching | None
+    switching: SwitchingFigures | None
     helps: list[Help]
     not_covered: str = CAVEATS
     left_over: LeftOver | None = off_table("if given", None)  # the necessary damping of known devices (Theorem A)
@@ -394,7 +394,7 @@ def audit(
     return Audit(
         assessment,
         {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
-        Switching.of(loop, coupling, needs["switching"]) if loop.varying_delay else None,
+        SwitchingFigures.of(loop, coupling, needs["switching"]) if loop.varying_delay else None,
         _helps(constant, coupling, conditions[fails]),
         left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )

@@ -234,10 +234,10 @@ def centre(program: Program, x: Array, t: float) -> Array:
     return x
 
 
-def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> Array:
+def towards(start: Array, x: Array, program: Program) -> Array:
     """Return x if it is feasible, else a feasible point on the way from the feasible `start` to x.
 
-    The point is at `reserve` of the distance from `start` to the boundary.
+    The point is at nine tenths of the distance from `start` to the boundary.
     """
     if program.feasible(x):
         return x
@@ -245,7 +245,7 @@ def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> A
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if program.feasible(start + middle * (x - start)) else (low, middle)
-    return start + reserve * low * (x - start)
+    return start + 0.9 * low * (x - start)
 
 
 def _solved(hessian: Array, right: Array) -> Array:

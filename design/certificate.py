@@ -476,14 +476,12 @@ def requirements_of(
     loop: Loop,
     coupling: Coupling,
     known: Certificate | None = None,
-    more: bool = True,
     own: Condition | None = None,
 ) -> dict[str, Requirement]:
     """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
     The environment is the nominal one and the delays theta are constant; design.assessment adds ranges and switching.
-    `known` is a certificate that holds; its proof is not repeated. If `more` is false, other conditions are proved only
-    if `known` does not belong to this loop and coupling.
+    `known` is a certificate that holds; its proof is not repeated.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -495,7 +493,7 @@ def requirements_of(
     def judged(each: Condition, needs: Requirement) -> Requirement:
         if each.name == proved:
             return replace(needs, proof="rational")
-        return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
+        return _with_proof(loop, filed(loop, coupling), each, needs)
 
     with within(budgets.EXACT):  # one budget for all proofs
         return {each.name: judged(each, needs) for each, needs in pairs}

@@ -273,7 +273,9 @@ class Condition(ABC):
         reason = self.beyond(loop)
         try:
             requirement = (
-                refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
+                refusal(self.name, loop.delta, reason, applies=False)
+                if reason
+                else self.required(loop, coupling, multiplier)
             )
         except SingularLoop as error:
             requirement = refusal(self.name, loop.delta, str(error))

@@ -17,7 +17,7 @@ from haptic_loop.design.result import Design, DesignFailed, Requirement, suffice
 from haptic_loop.design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
-# Switching delays, compared with a playout buffer.
+# SwitchingFigures delays, compared with a playout buffer.
 
 
 _NOT_COVERED = (
@@ -36,7 +36,7 @@ class _Playout:
 
 
 @dataclass(frozen=True)
-class Switching:
+class SwitchingFigures:
     """Requirement for any switching within a loop's range of delays; if it is infinite, further figures are None."""
 
     requirement: Requirement = off_table("inlined")
@@ -47,7 +47,7 @@ class Switching:
     not_covered: str | None = off_table("if given", None)
 
     @classmethod
-    def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> Switching:
+    def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> SwitchingFigures:
         """Evaluate a coupling in the nominal environment; `known` is its requirement there, if it was evaluated."""
         loop = loop.at(loop.environment)
         requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays

@@ -47,7 +47,7 @@ from haptic_loop.design.facts import (
     Demand,
     Fact,
     HandsSide,
-    Limiter,
+    Limited,
     Switching,
     Unknowns,
     Walls,
@@ -513,7 +513,7 @@ class LimitedForces(ThisEnvironment):
         return {"rho": self.rho(loop)}
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        return (*super().facts(loop), Limiter(self.rho(loop), self.lags))
+        return (*super().facts(loop), Limited(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
         """Return c with one row per device and one entry per lag; c is at the end of the multipliers."""
@@ -658,7 +658,7 @@ class _AnyEnvironment(Multiplied):
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
         if _in_frame(loop) and any(loop.psi):
-            obstacle = "a latency" if loop.latency else "delays that switch"
+            obstacle = "latency" if loop.latency else "delays that switch"
             return f"with delay in the environment its multiplier is of whole, constant samples: no {obstacle}"
         return None if any(loop.psi) else loop.environment.active(loop.T)
 
@@ -697,7 +697,7 @@ class _AnyEnvironment(Multiplied):
         """Return the requirement with `multiplier`, or with the least multiplier if one is needed."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
-            return refusal(self.name, loop.delta, reason or self._without(coupling))
+            return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)
         if _in_frame(loop):
             return self._in_frame(V, loop, multiplier)
         if not any(loop.psi):

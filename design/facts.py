@@ -202,9 +202,9 @@ class Collected(Generic[Block]):
 
     # -- terms of rows
 
-    def sums(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
+    def sums(self, row: int, channel: int, weights: Weights) -> None:
         """Add the weighted sent force to a row. The force is the sum of its steps, which is a pole at z = 1."""
-        self._sums.append((row, channel, weights, scale))
+        self._sums.append((row, channel, weights, 1))
 
     def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
         """Add the weighted steps of the sent force to a row."""
@@ -709,7 +709,7 @@ def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
 _SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's diagonal, so that c may be rounded
 
 
-class Limiter(Fact):
+class Limited(Fact):
     """Forces that leave through the limiter of controller.law, which has the lag rho > 0 [N/m] on each device.
 
     The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights, so
@@ -781,7 +781,7 @@ def compose(
     hands, T = hands or hands_side(loop), G.T
     walls = len(loop.environment.walls) if any(isinstance(fact, Walls) for fact in facts) else 0
     block: Collected[Block] = Collected(T, path, walls, hands.inputs(loop, T))
-    if any(isinstance(fact, Limiter) for fact in facts):
+    if any(isinstance(fact, Limited) for fact in facts):
         block.limit()
     _take(block, hands, loop, values, scaled)
     for fact in facts:

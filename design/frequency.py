@@ -21,11 +21,11 @@ _ROUNDING = 1e-20  # least mean that counts: the squared difference of two respo
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
-def integral(response: Callable[[Array], Array], grid: Array, error: float = _ERROR) -> float:
+def integral(response: Callable[[Array], Array], grid: Array) -> float:
     """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
     Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval is halved if
-    the two results differ by more than its share of `error`, relative to the integral. Because rounding would cause
+    the two results differ by more than its share of _ERROR, relative to the integral. Because rounding would cause
     endless halving, means below _ROUNDING do not count. If too many intervals qualify, only the worst are halved.
     """
     left, right = grid[:-1], grid[1:]
@@ -35,7 +35,7 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = _ER
         middle = (left + right) / 2
         first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
         fine = first + second
-        share = max(error * (settled + fine.sum()) / length, _ROUNDING) * (right - left)
+        share = max(_ERROR * (settled + fine.sum()) / length, _ROUNDING) * (right - left)
         excess = np.abs(fine - coarse) - share
         rough = excess > 0
         if rough.sum() > budgets.INTEGRAL_INTERVALS:

@@ -35,9 +35,9 @@ def usable(loop: Loop) -> Array:
     return (1 - RESERVE) * even_damping(loop)
 
 
-def _low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
-    """Return w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi f0)), f0 in Hz (section 6 of the paper)."""
-    a = 2 * np.pi * f0 * T
+def _low_pass(channels: int, T: float) -> Lti:
+    """Return w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi 80 Hz)) (section 6 of the paper)."""
+    a = 2 * np.pi * 80.0 * T
     gain, pole = a / (1 + a), 1 / (1 + a)
     one = np.eye(channels)
     return Lti(pole * one, one, gain * pole * one, gain * one, T)
@@ -125,10 +125,10 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
     return Lti(E.A, E.B * root, E.T * root[:, None] * E.C, E.T * root[:, None] * E.D * root, 1.0)
 
 
-def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
+def balanced(G: Lti) -> Lti:
     """Return a stable G with equal diagonal Gramians, by the square-root method.
 
-    States with a Hankel value below `negligible` times the largest are dropped. They are unreachable or unobservable to
+    States with a Hankel value below 1e-11 times the largest are dropped. They are unreachable or unobservable to
     rounding, so the response does not change.
     """
     import scipy
@@ -137,7 +137,7 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
         return G
     reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
     U, hankel, Vt = scipy.linalg.svd(show.T @ reach)
-    keep = hankel > negligible * max(hankel[0], 1e-300)
+    keep = hankel > 1e-11 * max(hankel[0], 1e-300)
     scale = 1 / np.sqrt(hankel[keep])
     left = (show @ U[:, keep] * scale).T
     right = reach @ Vt[keep].T * scale

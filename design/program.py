@@ -270,7 +270,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
     slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
     own_real = modes[np.abs(modes.imag) <= 1e-6].real
     fast, real, pairs = [], [a for a in slow.tolist() if not (np.abs(own_real - a) < _NEAR * (1 - a)).any()], []
-    for mode in _distinct(modes):
+    for mode in _separate(modes):
         if abs(mode.imag) > 1e-6:
             pairs.append((-2 * mode.real, abs(mode) ** 2))
         elif m > full and abs(mode) < _FASTER:
@@ -301,7 +301,8 @@ def _zeros(E: Lti) -> Complex:
     return np.linalg.eigvals(E.A - E.B @ np.linalg.solve(D, E.C)).astype(complex)
 
 
-def _distinct(modes: Complex) -> list[complex]:
+def _separate(modes: Complex) -> list[complex]:
+    """Return modes that lie apart by 5 % of their distance to the circle or more, for a basis or a coarse grid."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
@@ -521,7 +522,7 @@ class Problem:
         even = np.linspace(constraint.low, constraint.high, 50)
         rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
-        modes = np.array(_distinct(modes[modes.imag > 1e-6]), dtype=complex)
+        modes = np.array(_separate(modes[modes.imag > 1e-6]), dtype=complex)
         around = (np.angle(modes)[:, None] + (1 - np.abs(modes))[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
         w = np.unique(np.concatenate([even, rising, around]))
         return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]

@@ -71,6 +71,7 @@ class Requirement(Generic[C]):
         bound: Lower bound of the ratio over all multipliers, at the frequencies of the search.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
+        applies: False if the condition does not cover the loop or the coupling, whatever the damping.
     """
 
     condition: C
@@ -83,11 +84,21 @@ class Requirement(Generic[C]):
     bound: float | None = None
     guarantee: str | None = None
     lag: tuple[float, ...] | None = None
+    applies: bool = True
 
     def __repr__(self) -> str:
         verdict = f"certified, {self.proof}" if self.certified else "not certified"
-        shown = f"needs {listed(self.required)} of {listed(self.available)} N s/m"
-        return f"Requirement({self.condition}: {shown}, {verdict})"
+        return f"Requirement({self.condition}: {self.words()}, {verdict})"
+
+    def amounts(self, digits: int = 6) -> str:
+        """Return the required and the available damping, or in words that no damping is enough."""
+        if math.isfinite(self.ratio):
+            return f"{listed(self.required, digits)} of {listed(self.available, digits)} N s/m"
+        return "no damping is enough" if self.applies else "does not apply"
+
+    def words(self, digits: int = 6) -> str:
+        """Return `amounts` as a predicate: "needs 1.2 of 1.37 N s/m"."""
+        return f"needs {self.amounts(digits)}" if math.isfinite(self.ratio) else self.amounts(digits)
 
     @property
     def ratio(self) -> float:
@@ -129,9 +140,9 @@ def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequen
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirement[C]:
+def refusal(condition: C, available: tuple[float, ...], reason: str, applies: bool = True) -> Requirement[C]:
     """Return an infinite requirement with its reason."""
-    return Requirement(condition, (np.inf,) * len(available), available, None, reason)
+    return Requirement(condition, (np.inf,) * len(available), available, None, reason, applies=applies)
 
 
 def finite(value: float) -> float | None:

@@ -20,6 +20,7 @@ from haptic_loop.design.result import ANY, suffices
 #: More than _FEW environments are first compared at every _THIN-th frequency. Only those within _NEAR of the worst one
 #: are then swept at all frequencies.
 _FEW, _THIN, _NEAR = 12, 12, 0.03
+_PERCENT = 10.0  # change of a parameter in reports
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def at(loop: Loop, network: Network) -> Loop:
     return loop.at(network).switching(None)
 
 
-def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
+def vertices(network: Network, percent: float = _PERCENT) -> dict[str, Network]:
     """Return networks by name, each with one spring, all springs or one mass changed by plus or minus `percent`.
 
     Raises InputError if a changed stiffness or mass would exceed the largest that a network may have.
@@ -71,14 +72,12 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
     return vertices
 
 
-def robustness(
-    loop: Loop, coupling: Coupling, percent: float = 10.0, condition: Condition = THIS_ENVIRONMENT
-) -> Robustness:
+def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness:
     """Return the worst requirement of a coupling over `vertices`, by the refined sweep of the condition.
 
     For many vertices a coarse sweep first finds the candidates near the worst one.
     """
-    networks = {"nominal": loop.environment, **vertices(loop.network, percent)}
+    networks = {"nominal": loop.environment, **vertices(loop.network)}
     loops = {name: at(loop, one) for name, one in networks.items()}
     order, rough = list(loops), dict.fromkeys(loops, np.inf)
     if len(loops) > _FEW:
@@ -91,7 +90,7 @@ def robustness(
         ratio = condition.ratio(loops[name], coupling)
         if ratio > worst:
             worst, where = ratio, name
-    return Robustness(percent, worst, where, suffices(worst))
+    return Robustness(_PERCENT, worst, where, suffices(worst))
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:

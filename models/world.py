@@ -213,14 +213,14 @@ class World:
         """The length of one step of the scene [s]."""
         return self.model.opt.timestep
 
-    def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> Port:
+    def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> WorldPort:
         """Return a simulation of the scene from its initial pose, with force limits (m,) [N] at the contacts.
 
         A limit bounds each component of a contact's force. If the contact's channels are one of the `balls`, it bounds
         the length of the force.
         """
         limits = np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float)
-        return Port(self, limits, balls)
+        return WorldPort(self, limits, balls)
 
     def linear(self, pose: Array | str | None = None, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
         """Linearise the scene near a pose, without the springs G, by centred differences of one step.
@@ -458,7 +458,7 @@ _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # the last of the types of equalities and friction
 
 
-class Port:
+class WorldPort:
     """One simulation of a world, tick by tick, with the energy that the scene has generated."""
 
     def __init__(self, world: World, force_limit: Array, balls: Sequence[slice] = ()) -> None:

@@ -27,7 +27,7 @@ from haptic_loop.controller.environment import (
     Spring,
     Wall,
 )
-from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop
+from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop, check_shortest
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.controller.units import PositionUnit, in_unit
@@ -217,8 +217,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
     def _check_timing(self) -> None:
-        if self.T_min is not None and not 0 < self.T_min <= self.T:
-            raise ValueError(f"T_min is {self.T_min:g} s, expected above 0 and at most T = {self.T:g} s")
+        check_shortest(self.T_min, self.T)
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
         if self.period and self.T_min is not None and self.period.shortest < self.T_min:
@@ -796,10 +795,10 @@ def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
     return [row for row, node in zip(np.eye(len(AXES)).tolist(), nodes, strict=False) if node != GROUND]
 
 
-def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
+def world_environment(table: dict[str, Any]) -> Network:
     """Return the environment of an [environment] table with the key `world`. Raises InputError."""
     try:
-        return msgspec.convert(_with_world({"environment": table}, folder)["environment"], Network)
+        return msgspec.convert(_with_world({"environment": table}, Path())["environment"], Network)
     except ValueError as error:
         raise InputError(str(error)) from None
 

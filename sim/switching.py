@@ -24,7 +24,7 @@ from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.coverage import Switching
+from haptic_loop.design.coverage import SwitchingFigures
 from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import switching_guarantee
@@ -56,13 +56,13 @@ class Period:
 # ---- one run
 
 
-def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> tuple[Simulation, Period | None]:
+def switching(simulation: Simulation, seed: int, ticks: int) -> tuple[Simulation, Period | None]:
     """Return the loop under the scenario's varying delays, and their period if they are adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
     period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
     recorded = period.delays if period else None
-    delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), recorded)
+    delays = _draw_delays(simulation.scenario, seed, 0, max(ticks, _SHORTEST), recorded)
     return replace(simulation, process=replace(simulation.process, delays=delays[:, :, None])), period
 
 
@@ -261,7 +261,7 @@ class DelaysCovered:
 
     covered: bool
     covers: str  # the covered delays, in words
-    switching: Switching | None = off_table(default=None)
+    switching: SwitchingFigures | None = off_table(default=None)
     on_file: DelayRange | None = None
 
     @classmethod
@@ -279,7 +279,7 @@ class DelaysCovered:
             return cls(certified, text if certified else constants)
         loop = scenario.loop("I").switching(span)  # the case does not matter to stability
         on_file = on_file if on_file and on_file.contains(span) else None
-        figures = Switching.of(loop, assessment.coupling, assessment.requirements.get(SWITCHING.name))
+        figures = SwitchingFigures.of(loop, assessment.coupling, assessment.requirements.get(SWITCHING.name))
         lossy = scenario.loses_packets
         if proof := _how_proved(figures, on_file):
             cover = "any switching of the delays within their range is covered"
@@ -294,7 +294,7 @@ class DelaysCovered:
         return cls(False, words, figures, on_file)
 
 
-def _how_proved(figures: Switching, on_file: DelayRange | None) -> str:
+def _how_proved(figures: SwitchingFigures, on_file: DelayRange | None) -> str:
     """Name the evidence that any switching within the range is safe; "" if there is none."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"

@@ -68,11 +68,11 @@ class EnvironmentsMet:
         return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
 
 
-def disagreement_words(findings: Findings, engine: str, most: int = 3) -> str:
-    """Return the number of disagreements, and for the first ones both rates and a command that repeats them."""
+def disagreement_words(findings: Findings, engine: str) -> str:
+    """Return the number of disagreements, and for the first three both rates and a command that repeats them."""
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
-    for k in places[:most]:
+    for k in places[:3]:
         rates = f"exact {findings.exact[k]:+.3g} 1/s, {engine} {findings.mujoco[k]:+.3g} on its map"
         if findings.trace_decides[k]:
             rates += f" and {findings.trace[k]:+.3g} ± {findings.trace_error[k]:.2g} on its trace"

@@ -34,7 +34,7 @@ from haptic_loop.sim.run import Simulation, assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario
 
 if TYPE_CHECKING:  # loads MuJoCo, which other scenarios and --help do not need
-    from haptic_loop.models.world import Contact, Port, World
+    from haptic_loop.models.world import Contact, World, WorldPort
 
 _ROUNDING = 1e-9  # entries of A below this relative size are rounding of differences over 1e-6 m
 _APART = 1e-12  # entries of D_V below this relative size count as rounding
@@ -206,9 +206,9 @@ class Touched:
         return InWorld(shell, [scene.port(process.force_limit, process.balls) for _ in range(nsim)], damping)
 
 
-def live(simulation: Simulation, start: float = START_J) -> Simulation:
+def live(simulation: Simulation) -> Simulation:
     """Return the loop with its world for any number of ticks. The net itself delays the forces."""
-    touched, process = Touched(start), simulation.process
+    touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:
         return Late(touched.net(simulation, process, nsim), simulation.scenario.theta)
@@ -240,7 +240,7 @@ class Late:
 class InWorld:
     """A world, its shell, and the energy that hands and devices were given."""
 
-    def __init__(self, shell: Shell, ports: list[Port], damping: Array) -> None:
+    def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
         """`damping` (m, m) [N/m]: Delta/T, so that devices dissipate dx' Delta dx/T in a period."""
         self.ports, self._shell, self._damping = ports, shell, damping
         m, nsim = len(damping), len(ports)
@@ -287,6 +287,7 @@ class InWorld:
 RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the hands' initial speeds
 _NEVER = 1e3  # [J] W0 with which a shell never acts, for measurements
+_ADVERSARIES = 20  # sets of hands that are thrown without a shell
 _STREAM = 11  # keeps these draws apart from those of the hands with the same seed
 
 
@@ -368,10 +369,10 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
     return least
 
 
-def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
+def least_at_port(scenario: Scenario, coupling: Coupling, seed: int) -> dict[str, float]:
     """Return for each adversary the least energy [J] at a port without a shell; 0 if the scene gave no energy."""
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
-    hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
+    hands = thrown(scenario, coupling, _ADVERSARIES, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
         least[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
     return least

@@ -187,11 +187,9 @@ def _list(values: tuple[int, ...]) -> str:
 class _ShownScene:
     """The scene of devices and object in a picture, with handles that the mouse can hold."""
 
-    def __init__(
-        self, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE, drawn: DrawnObject | None = None
-    ) -> None:
+    def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
         self.scene, self.force_limit, self.object = scene, force_limit, drawn
-        self.model = _dressed(scene, size)
+        self.model = _dressed(scene)
         self.data = mujoco.MjData(self.model)
         self.device = _owners(scene)  # joint -> device
         self._channels = [_own(scene, device) for device in range(_devices(scene))]
@@ -261,10 +259,10 @@ class _ShownScene:
 class _ShownWorld(_ShownScene):
     """The MuJoCo scene of a world in a picture, with each device as a stylus whose tip is the device's position."""
 
-    def __init__(self, world: World, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
+    def __init__(self, world: World, force_limit: Array) -> None:
         self.force_limit = force_limit
         self.model = copy.deepcopy(world.model)  # The loop changes its own model while a window draws.
-        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = _SIZE
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
         self._bodies = [self.model.body(contact.body).id for contact in world.contacts]
@@ -328,11 +326,11 @@ def stage_for(session: LiveLoop) -> _ShownScene:
     return _ShownScene(simulation.scene, simulation.process.force_limit, drawn=object_of(simulation))
 
 
-def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
+def _dressed(scene: Scene) -> mujoco.MjModel:
     """Return the scene's model with shapes, places, colours and a camera's distance, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = size
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     where = _places(scene)
     seen = set[int]()

@@ -28,7 +28,7 @@ from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import LimitedForces
 from haptic_loop.design.exact import _prove_positive_real, find_storage
-from haptic_loop.design.facts import KnownMotor, Limiter, compose, compose_any
+from haptic_loop.design.facts import KnownMotor, Limited, compose, compose_any
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
@@ -1017,7 +1017,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     loop, beta, c = one(T, 1.3, 1), np.array([3e-5]), 0.4
     G = taps([K + B / T, -B / T], T)
     cost = period_cost(loop, 1.0, beta)
-    made = compose(G, loop, (Limiter((RHO,)),), {"c": (c,)}, hands=KnownMotor(cost, beta)).free
+    made = compose(G, loop, (Limited((RHO,)),), {"c": (c,)}, hands=KnownMotor(cost, beta)).free
     free, v, de = np.zeros((3, N))  # dx - de, v, de
     free[:active], de[:active] = 1e-3 * rng.normal(size=(2, active))
     v[1:active] = rng.normal(size=active - 1)

@@ -16,7 +16,7 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
 from haptic_loop.design import budgets
 from haptic_loop.design.certificate import judged, prove, required_damping
-from haptic_loop.design.coverage import Switching
+from haptic_loop.design.coverage import SwitchingFigures
 from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.exact import find_storage
 from haptic_loop.design.frequency import hermitian
@@ -157,7 +157,7 @@ def test_what_holds_is_proved_exactly(lo, hi):
     found = judged(loop_of(lo, hi), SOFT, SWITCHING)
     assert found.certified
     assert found.proof == "rational"
-    part = Switching.of(loop_of(lo, hi), SOFT)
+    part = SwitchingFigures.of(loop_of(lo, hi), SOFT)
     # equal where nothing varies
     assert part.playout.required_damping[0] <= part.requirement.required[0] * (1 + 1e-9)
     assert part.requirement.certified
