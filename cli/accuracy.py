@@ -14,11 +14,11 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # most steps for a row, which then takes a minute or two
+_MOST_STEPS = 3_000_000  # largest number of steps for a row; that many take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
-    "cycle: standard deviation [N] and frequency of the limit cycle without coupling, once it is sustained",
-    "real: simulated seconds per second; * nothing of the same kind is both faster and nearer",
+    "position: relative rms error; growth: error [1/s], the larger one of the loops with and without the coupling",
+    "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
+    "real: simulated seconds per second; *: no other setting of this engine is both faster and more accurate",
 )
 
 
@@ -36,7 +36,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Measure every engine and step. 0: the default has the right verdict, 1: not, 130: interrupted."""
+    """Measure every engine and step. 0: the defaults judge stability right, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.accuracy")

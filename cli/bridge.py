@@ -39,30 +39,12 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
-    if args.case == "none":
-        raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # A device without a clock applies at once.
-    if at_once and args.condition:
-        choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
-        if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
-            raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
         args.energy_budget = None  # In a world, each contact has an energy budget of its own (`world_start`).
-    if args.energy_budget and at_once:
-        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
-    if args.energy_budget and not args.energy_budget[0]:
-        raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     behind = session_cli.boards_behind(args, scenario)
-    for present, feature in (
-        (args.latch == "arrival", "--latch arrival"),
-        (is_world(scenario), "a world"),
-        (args.energy_budget, "--energy-budget"),
-    ):
-        if behind and present:
-            raise InputError(
-                f"--port is {args.port}: {feature} counts forces by one clock, several boards have several"
-            )
+    _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
     settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated hands never let go.
@@ -95,6 +77,25 @@ def main(argv: list[str]) -> int:
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
     return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
+
+
+def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_boards: bool) -> None:
+    """Raise InputError for options that exclude each other, or that no certificate covers."""
+    if args.case == "none":
+        raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    if at_once and args.condition:
+        choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
+        if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
+            raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
+    if args.energy_budget and at_once:
+        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
+    if args.energy_budget and not args.energy_budget[0]:
+        raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
+    counted = ("--latch arrival", args.latch == "arrival"), ("a world", is_world(scenario))
+    for feature, present in (*counted, ("--energy-budget", args.energy_budget)):
+        if several_boards and present:
+            by_one = f"{feature} counts forces by one clock, several boards have several"
+            raise InputError(f"--port is {args.port}: {by_one}")
 
 
 def _parser() -> argparse.ArgumentParser:

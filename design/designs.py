@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,9 +23,6 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, Know
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import ANY, Design, DesignFailed
 from haptic_loop.design.transparency import NO_FORCE, silent
-
-if TYPE_CHECKING:
-    pass
 
 
 class _Kind(NamedTuple):
@@ -127,15 +124,7 @@ def design_by_kind(
     """
     name, own = name_and_own(condition)
     if kind not in KINDS and ":" in kind:
-        own_design = own_coupling(kind, loop)
-        if not isinstance(own_design, Design):
-            raise ValueError(f"coupling {kind} is {own_design!r} for this loop, expected a design.result.Design")
-        if own:
-            needs = own.judge(loop.at(loop.environment), own_design.coupling)
-            return replace(own_design, condition=own.name, own=own, requirement=needs, phi=None)
-        if name not in (None, own_design.condition):
-            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {own_design.condition}")
-        return own_design
+        return _by_own_function(loop, kind, condition)
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and FILE.py:NAME of your own")
     chosen = KINDS[kind]
@@ -177,6 +166,20 @@ def design_by_kind(
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls or loop.ranges or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)
+
+
+def _by_own_function(loop: Loop, kind: str, condition: str | Condition | None) -> Design:
+    """Return the design of the user's own function, judged by the user's own condition if there is one."""
+    name, own = name_and_own(condition)
+    design = own_coupling(kind, loop)
+    if not isinstance(design, Design):
+        raise ValueError(f"coupling {kind} is {design!r} for this loop, expected a design.result.Design")
+    if own:
+        needs = own.judge(loop.at(loop.environment), design.coupling)
+        return replace(design, condition=own.name, own=own, requirement=needs, phi=None)
+    if name not in (None, design.condition):
+        raise ValueError(f"condition is {condition!r}, but {kind} is designed for {design.condition}")
+    return design
 
 
 def _without_force(loop: Loop) -> bool:

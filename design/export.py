@@ -806,35 +806,41 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     loose = name == "coupling"
     for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
         words[word] = ""
-    if limiter := block.limiter:
-        integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
-        if limiter.balls:
-            balls, defined = _Balls.of(limiter, dtype), _BALLS_DEFINED
-            tables = {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
-            integers |= {"AT": balls.at, "FIRST": balls.first, "LAST": balls.last, "END": balls.end}
-            words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
-            words |= {
-                "residual": _RESIDUAL.hex() + words["f"],
-                "rounding": _ball_rounding(block.single).hex() + words["f"],
-            }
-            words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
-            words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
-            words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
-        else:
-            tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
-            words |= {"turns": str(_turns(system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
-            reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
-            words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
-        for of, rows in {**tables, "KICK": limiter.kick}.items():
-            words["tables"] += "\n\n" + _table("static const", f"{name}_{of}", np.asarray(rows), dtype)
-        for of, values in integers.items():
-            row = ", ".join(map(str, values))
-            words["tables"] += f"\n\nstatic const int {name}_{of}[{len(values)}] = {{{row}}};"
-        words["limit_defined"] = Template(defined).substitute(words)
-        words["limited"] = Template(_LIMITED).substitute(words)
+    if block.limiter:
+        _add_limiter(words, block, block.limiter)
     words["more_declared"] = Template(_FREE_DECLARED).substitute(words) if loose else ""
     words["more_defined"] = Template(_FREE_DEFINED).substitute(words) if loose else ""
     return _SOURCE_C.substitute(words)
+
+
+def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) -> None:
+    """Add the limiter's tables and functions to the words of the C file."""
+    name, dtype = block.name, block.dtype
+    integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
+    if limiter.balls:
+        balls, defined = _Balls.of(limiter, dtype), _BALLS_DEFINED
+        tables = {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
+        integers |= {"AT": balls.at, "FIRST": balls.first, "LAST": balls.last, "END": balls.end}
+        words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
+        words |= {
+            "residual": _RESIDUAL.hex() + words["f"],
+            "rounding": _ball_rounding(block.single).hex() + words["f"],
+        }
+        words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
+        words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
+        words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
+    else:
+        tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
+        words |= {"turns": str(_turns(block.system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
+        reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
+        words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
+    for of, rows in {**tables, "KICK": limiter.kick}.items():
+        words["tables"] += "\n\n" + _table("static const", f"{name}_{of}", np.asarray(rows), dtype)
+    for of, values in integers.items():
+        row = ", ".join(map(str, values))
+        words["tables"] += f"\n\nstatic const int {name}_{of}[{len(values)}] = {{{row}}};"
+    words["limit_defined"] = Template(defined).substitute(words)
+    words["limited"] = Template(_LIMITED).substitute(words)
 
 
 def _comment_c(lines: Iterable[str]) -> Iterable[str]:

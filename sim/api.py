@@ -37,6 +37,7 @@ from haptic_loop.sim.trace import Trace
 from haptic_loop.sim.world import START_J, Claim, InWorld, SceneRecord, Touched, WorldRecord
 
 if TYPE_CHECKING:
+    from haptic_loop.design.assessment import Assessment
     from haptic_loop.sim import crowds
 
 _MOST_HUMANS = 1_000_000
@@ -171,14 +172,8 @@ def simulate(
     assessment = assessed(
         alone, "I", chosen, environment=environment, energy_budget=energy_budget, limiter=clipped, seed=seed
     )
-    net: Wanted | None = None
-    if world:
-        net = Touched(energy_budget or 0.0)
-    elif environment is not None:
-        net = Plugged(environment, energy_budget or 0.0, claim(assessment))
-    elif energy_budget is not None:
-        net = EnergyNet(energy_budget, guarantee=claim(assessment))
     settings, rho = EngineSettings(engine, integrator, substeps), assessment.force_limits.rho
+    net = _net(environment, energy_budget, assessment, world)
     outcome = run_scenario(scenario, chosen.coupling, rho, settings, seed, net)
     trace = outcome.trace
     linear = not (scenario.switches or environment or is_world(scenario))
@@ -200,6 +195,17 @@ def simulate(
         meta |= {"world": plain(WorldRecord.of(trace.net.figures())), "scene": plain(scene)}
         meta |= {"guarantee": stated.words, "guaranteed": stated.guaranteed}
     return replace(trace, meta=meta)
+
+
+def _net(
+    environment: Callable[[Array], Array] | None, energy_budget: float | None, assessment: Assessment, world: bool
+) -> Wanted | None:
+    """Return the shell of a world or of a function, or the energy budget of the devices, if there is any."""
+    if world:
+        return Touched(energy_budget or 0.0)
+    if environment is not None:
+        return Plugged(environment, energy_budget or 0.0, claim(assessment))
+    return None if energy_budget is None else EnergyNet(energy_budget, guarantee=claim(assessment))
 
 
 @one_blas_thread

@@ -30,6 +30,7 @@ from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member
+from haptic_loop.controller.tick import Process
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population
 from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
@@ -236,28 +237,14 @@ def _group(
 ) -> Findings:
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
-    late, mujoco = scenario.usual_latency, nowhere
+    late = scenario.usual_latency
     loops = exact_loops(held_by, simulation.F, late=late)
     frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
     mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
     damping = np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)
     lossless = np.stack([port.damping.max(axis=1) for port in crowd.ports], axis=1).min(axis=1) == 0
-    other: _Other | None = None
-    if not isinstance(validation.engine, str):
-        drawn = crowd.mechanics or ((),) * len(crowd)
-        each = [simulation.held_by(crowd.humans(i), crowd.persons(i), own) for i, own in enumerate(drawn)]
-        make = validation.engine
-        mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
-
-        def one_by_one(sets: NDArray[np.intp], integrator: str, timing: Timing | None) -> Engine:
-            """Make the user's engine, which takes its timing from the simulation."""
-            return OneByOne([make_engine(each[i], make) for i in sets])
-
-        other = one_by_one
-    elif validation.engine != "exact":
-        maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
-        mujoco = Mode.worst([dominant_mode(loop) for loop in maps]).growth
-        other = partial(_batch, held_by, scenario.T, validation.threads)
+    other, growth = _other_engine(validation, simulation, held_by, crowd, frozen)
+    mujoco = nowhere if growth is None else growth
     exact: ImpulseTest | None = None
     witnesses = np.zeros(0, dtype=np.intp)
     if validation.ticks:
@@ -292,6 +279,35 @@ def _group(
 
 #: (numbers of the sets of humans, integrator, timing) -> the other engine
 _Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
+
+
+def _other_engine(
+    validation: Validation,
+    simulation: Simulation,
+    held_by: Variants,
+    crowd: Crowd | HumanSets,
+    frozen: Sequence[Process],
+) -> tuple[_Other | None, Array | None]:
+    """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
+
+    `frozen` are the processes of the contact states. A user's own engine has no maps; its rates are those of traces.
+    """
+    if not isinstance(validation.engine, str):
+        drawn = crowd.mechanics or ((),) * len(crowd)
+        each = [simulation.held_by(crowd.humans(i), crowd.persons(i), own) for i, own in enumerate(drawn)]
+        make = validation.engine
+
+        def one_by_one(sets: NDArray[np.intp], integrator: str, timing: Timing | None) -> Engine:
+            """Make the user's engine, which takes its timing from the simulation."""
+            return OneByOne([make_engine(each[i], make) for i in sets])
+
+        return one_by_one, np.array([simulated_growth(one, None, None, make) for one in each])
+    if validation.engine == "exact":
+        return None, None
+    late = validation.scenario.usual_latency
+    maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
+    growth = Mode.worst([dominant_mode(loop) for loop in maps]).growth
+    return partial(_batch, held_by, validation.scenario.T, validation.threads), growth
 
 
 def _batch(

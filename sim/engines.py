@@ -1,20 +1,20 @@
 """Engines, which move the plant between two samples, for one simulation or for many at once.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
-    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
-                  J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
-    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.accuracy decides
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: MuJoCo computes the accelerations (one
+                  mj_forward a step), and J is the plant's matrix; exact for a linear scene at any stiffness and step
+    RK4, ..       MuJoCo's own integrators; sim.accuracy compares numbers of steps per period
 
-The exponential engine shares J with the exact one, so it checks forces and assembly, but not the stepping in time. RK4
-checks the stepping.
+The exponential and the exact engine have the same J. Their comparison checks MuJoCo's forces and the assembly of the
+scene, but not the stepping in time, which RK4 checks.
 
-A hand's impedance (A, B, C, D) is no body of MuJoCo. Its state and force are part of the exponential step, which stays
-exact. For MuJoCo's own integrators each step lies between two exact half steps, in which impedance and masses interact
-while positions rest (Strang splitting). The splitting is of second order in the step and generates no energy.
+MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step contains its state and force, and stays
+exact. MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the
+positions rest (Strang splitting). The splitting is of second order in the step and generates no energy.
 
-All engines read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
-timing (controller.delay) every tick has its own length, and late forces latch within the tick. The forces that the
-actuators hold are then the last entries of the plant's state.
+All engines read their inputs from a row of a step buffer and write the next row, without copies. With a timing
+(controller.delay) every tick has its own length, and late forces latch within the tick. The plant's state then ends
+with the forces that the actuators hold.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-_RESOLVED, _FOLLOWED = 0.2, 1.0  # limits of mode h [rad] and rate h for a step h that follows the plant
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad] and largest decay per step of a plant that RK4 resolves
 
 
 def least_substeps(integrator: str) -> int:
@@ -189,13 +189,13 @@ def least_substeps(integrator: str) -> int:
 
 
 def default_integrator(scene: Scene) -> str:
-    """Return "exponential" for a smooth scene, and "RK4" for one with friction, where RK4 errs less at equal cost."""
+    """Return "exponential" for a scene without friction, else "RK4", whose error is then smaller at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
     return "RK4" if rubs else EXPONENTIAL
 
 
 def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
-    """Split a tick at its latch times: a list of (seconds, channels whose previous force still acts, (m,) or (0,))."""
+    """Split a tick at its latch times into (seconds, mask (m,) or (0,) of channels whose previous force still acts)."""
     taus = np.array(late or ())
     ends = np.unique(np.concatenate([[0.0], taus, [T]]))
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
@@ -205,8 +205,8 @@ def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDA
 class _Access:
     """Arrays and functions of MuJoCo that a tick reads, writes and calls: (n,) for one simulation, (n, nsim) for many.
 
-    Ticks are closures, because attribute lookups would take longer than the step. A bound method would be a reference
-    cycle that keeps a batch's memory.
+    `ticks` returns closures, because attribute lookups would take longer than the step. A bound method would form a
+    reference cycle, which would keep a batch's memory allocated.
     """
 
     T: float  # [s]
@@ -424,8 +424,8 @@ class MujocoEngine:
 class MujocoBatchEngine:
     """All simulations of a buffer in one mujoco.batch.Batch, one for every set of humans.
 
-    Each simulation steps as in MujocoEngine, bit for bit. Only the exponential integrator sums its products in another
-    order and differs by rounding.
+    Each simulation has the same bits as in MujocoEngine, except with the exponential integrator, which sums products in
+    another order and differs by rounding.
     """
 
     def __init__(
@@ -449,7 +449,7 @@ class MujocoBatchEngine:
         moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
-        # A Runge-Kutta step of a scene without impedances needs no plant of each hand.
+        # MuJoCo's own integrators use the matrices of the plants for impedances only.
         exact_step = integrator == EXPONENTIAL or held_by.impedances
         plants = held_by.plants() if exact_step else _stacked(held_by.scene.plant)
 
@@ -532,8 +532,8 @@ def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujo
 def profiler_off() -> Iterator[bool]:
     """Run without the clock that MuJoCo's Python binding reads several times per step.
 
-    The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether
-    the pointer was found; without it everything runs with the clock. The pointer is restored at the end.
+    The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether the
+    pointer was found; if not, the clock stays on. The pointer is restored at the end.
     """
     pointer = _profiler_clock()
     if pointer is None:
@@ -562,30 +562,30 @@ def _profiler_clock() -> ctypes.c_void_p | None:
 
 @dataclass(frozen=True)
 class _PlantSpeed:
-    """The fastest motions of a plant, which the step of an integrator has to follow."""
+    """The fastest motions of a plant, which bound the step of an integrator."""
 
     mode: float  # [rad/s] of the fastest weakly damped mode, 0 without any
     rate: float  # [1/s] of the strongest damping
 
     def within(self, h: float) -> bool:
-        """Return whether a step of h seconds follows the plant."""
+        """Return whether RK4 steps of h seconds resolve these motions."""
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """Return the least number of RK4 steps in T seconds that follows the plant."""
+        """Return the least number of RK4 steps in T seconds that resolves these motions."""
         return max(
             least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
         )
 
     def hardest(self, h: float) -> str:
-        """Return in words the motion that a step of h seconds follows worst."""
+        """Return in words the motion that steps of h seconds resolve worst."""
         if self.mode / _RESOLVED >= self.rate / _FOLLOWED:
             return f"the mode at {self.mode / (2 * math.pi):.4g} Hz advances {self.mode * h:.3g} rad in a step"
         return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
 
 
 def pace(A: Array) -> _PlantSpeed:
-    """Return the fastest motions of x' = A x, or of a stack; a weakly damped mode turns faster than it decays."""
+    """Return the fastest motions of x' = A x, or of a stack; a mode with |Im| > |Re| counts as weakly damped."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
