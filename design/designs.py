@@ -154,7 +154,7 @@ def design_by_kind(
     make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
 
     if loop.latency and (reason := made_for.beyond(loop)):
-        raise ValueError(f"latency: {reason}")
+        raise ValueError(f"latency: {reason.removeprefix('latency: ')}")
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:

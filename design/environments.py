@@ -775,5 +775,5 @@ def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
 
 
 def _in_frame(loop: Loop) -> bool:
-    """Return whether the block comes from design.facts, because of a latency or switching delays."""
+    """Return whether the block is composed of facts (design.facts), because of a latency or switching delays."""
     return bool(loop.latency or loop.varying_delay)

@@ -240,11 +240,6 @@ class Collected(Generic[Block]):
 
     # -- the block
 
-    @property
-    def states(self) -> int:
-        """The number of states of the block besides those of the environment's response."""
-        return self._bank(self._reads()[1]).order + self._filter()[0].order
-
     def _matrix(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
         out: Any = numbers(np.zeros((self.size, self.size), dtype=int), self.T) + 0
         for i, j, weight in entries:

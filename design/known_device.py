@@ -640,7 +640,7 @@ def positive(H: Complex) -> NDArray[np.bool_]:
 
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "periods up to T_max need a shortest one, T_min (a line of the scenario), for a known device"
-_LATE = "Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
+_LATE = "latency: Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
 _MOST_SHARE = 1e3  # largest share of the damping that a sweep tries for a given beta
 
 

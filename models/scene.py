@@ -451,31 +451,13 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], drawn: bool 
     order = [name for name in mass if name not in own] + own
     _attach_devices(spec, devices)
     row = {joint: -APART * min(i, len(devices) - 1) for i, part in enumerate(placed) for joint in part.joints}
-    for step, name in enumerate(dict.fromkeys(map(_body, own)), start=1):
-        joints = [joint for joint in own if _body(joint) == name]
-        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[joints[0]], _HEIGHT])
-        body.ipos, body.inertia, body.explicitinertial = [0, 0, 0], [1e-3] * 3, True
-        for joint in joints:
-            body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=_axis(joint))
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0, contype=0, conaffinity=0)
+    _add_bodies(spec, own, row)
     for name in order:
         spec.body(_body(name)).mass, joint = float(mass[name]), spec.joint(name)
         joint.damping[0], joint.stiffness[0] = float(damping.get(name, 0.0)), float(stiffness.get(name, 0.0))
-    for i, device in enumerate(devices, start=1):
-        motors = _joints(f"device_{i}/motor", device)
-        for name, friction in zip(motors, _per_channel(device, "friction"), strict=True):
-            if friction:
-                joint = spec.joint(name)
-                joint.frictionloss = friction
-                joint.solref_friction, joint.solimp_friction = _STICK, _HARD
-        if device.transmission:
-            for name in _joints(f"device_{i}/transmission", device):
-                tendon = spec.tendon(name)
-                tendon.damping[0], tendon.stiffness[0] = device.transmission
-        for k, (amount, direction) in enumerate(_dampers(device)[1], start=1):
-            ends = {joint: c for joint, c in zip(motors, direction, strict=True) if c}
-            _add_spring(spec, f"device_{i}/damper_{k}", ends, 0.0, amount)
-        _add_springs(spec, placed[i - 1], damping, stiffness)
+    for i, (device, part) in enumerate(zip(devices, placed, strict=False), start=1):
+        _fill_device(spec, i, device)
+        _add_springs(spec, part, damping, stiffness)
     for part in placed[len(devices) :]:
         _add_springs(spec, part, damping, stiffness)
 
@@ -536,6 +518,36 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
     for i, device in enumerate(devices, start=1):
         if device.axes > 1:
             _free_axes(spec, i, device)
+
+
+def _add_bodies(spec: mujoco.MjSpec, joints: Sequence[str], row: Mapping[str, float]) -> None:
+    """Add the bodies of hands with these joints, each in the row (y [m]) of its device."""
+    import mujoco
+
+    for step, name in enumerate(dict.fromkeys(map(_body, joints)), start=1):
+        own = [joint for joint in joints if _body(joint) == name]
+        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[own[0]], _HEIGHT])
+        body.ipos, body.inertia, body.explicitinertial = [0, 0, 0], [1e-3] * 3, True
+        for joint in own:
+            body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=_axis(joint))
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0, contype=0, conaffinity=0)
+
+
+def _fill_device(spec: mujoco.MjSpec, i: int, device: Device) -> None:
+    """Set friction, transmission and dampers of device i, whose file has been attached."""
+    motors = _joints(f"device_{i}/motor", device)
+    for name, friction in zip(motors, _per_channel(device, "friction"), strict=True):
+        if friction:
+            joint = spec.joint(name)
+            joint.frictionloss = friction
+            joint.solref_friction, joint.solimp_friction = _STICK, _HARD
+    if device.transmission:
+        for name in _joints(f"device_{i}/transmission", device):
+            tendon = spec.tendon(name)
+            tendon.damping[0], tendon.stiffness[0] = device.transmission
+    for k, (amount, direction) in enumerate(_dampers(device)[1], start=1):
+        ends = {joint: c for joint, c in zip(motors, direction, strict=True) if c}
+        _add_spring(spec, f"device_{i}/damper_{k}", ends, 0.0, amount)
 
 
 def _free_axes(spec: mujoco.MjSpec, i: int, device: Device) -> None:
