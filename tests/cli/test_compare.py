@@ -15,6 +15,7 @@ def compare(tmp_path, *options):
     return json.loads((tmp_path / "r.json").read_text())["alternatives"]
 
 
+@pytest.mark.slow
 def test_each_coupling_has_its_price_and_error(tmp_path):
     rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--case", "I")}
     assert list(rows)[:2] == [("none", None), ("published", None)]

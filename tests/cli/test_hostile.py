@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -20,6 +22,7 @@ def driven(*options: str) -> int:
     return int(number[1])
 
 
+@pytest.mark.slow
 def test_hostile_cases_are_answered_well():
     """`make validate` has all pairs of commands, fields and values; here each occurs, in one pair of two or three."""
     assert driven("--short") >= 500

@@ -76,6 +76,7 @@ def test_radians_change_no_number():
     assert repr(wheel.loop("I")).count("N m s/rad") == 1
 
 
+@pytest.mark.slow
 def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
     """Tables, reports, headers, texts of pictures, C comments and logs of the commands that a wheel goes through."""
     stored, out = tmp_path / "wheel.json", tmp_path / "out"

@@ -94,6 +94,7 @@ def test_published_gains_are_refused_by_their_own_condition(tmp_path):
     assert any("5.72 times the damping" in line for line in report["remarks"])
 
 
+@pytest.mark.slow
 def test_three_devices_of_ones_own(tmp_path):
     code, report = run(tmp_path, "--scenario", "three-rigid", "--no-plot", "--duration", "2")
     assert code == 0
@@ -188,6 +189,7 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path):
     assert err == "error: T is 7, allowed are 1e-06 to 0.1 s\n"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
     one_device = str(Path(__file__).parents[2] / "benchmarks/loops/n3-free1.toml")
     words = ["--scenario", one_device, "--psi", "1", "--delta", "0.1", "--condition", "any-environment"]

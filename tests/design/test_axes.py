@@ -580,6 +580,7 @@ def most_energy(share: float, seed: int, count: int = 200, ticks: int = 1500) ->
     return most / start
 
 
+@pytest.mark.slow
 def test_limited_hands_in_space_get_no_energy() -> None:
     """Of 200 lossless hands none gains energy at 1.02 of the requirement 0.518330, and some do at 0.6 of it."""
     assert (most_energy(1.02 * 0.518330, 1) <= 1 + 1e-9).all()
@@ -632,6 +633,7 @@ def test_designs_turn_with_the_axes(condition: str) -> None:
     assert prove(aslant, design.coupling, condition).proof == "rational"
 
 
+@pytest.mark.slow
 def test_optimal_couplings_take_full_levels() -> None:
     Q = np.zeros((4, 4))
     Q[:2, :2] = Q[2:, 2:] = TURN

@@ -148,6 +148,7 @@ def test_a_bound_holds_between_sharp_bends():
     assert 1.3 * least < lower <= least < 0
 
 
+@pytest.mark.slow
 def test_a_bound_names_its_condition():
     """Without a coupling, which known devices allow here, the mismatch is zero."""
     loop = load("omega-pair-known").loop("I")

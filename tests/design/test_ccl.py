@@ -96,6 +96,7 @@ def test_results_are_certified_from_the_coupling_alone(inner):
     assert this_environment(F, DELTA).certified
 
 
+@pytest.mark.slow
 def test_every_descent_step_is_feasible_and_better():
     loop = asked((0, 0))
     family = _FixedOrder(Shaping(loop))
@@ -137,7 +138,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     assert t.value == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize(("order", "diagonal"), [(1, False), (3, True)])
+@pytest.mark.parametrize(("order", "diagonal"), [(1, False), pytest.param(3, True, marks=pytest.mark.slow)])
 def test_three_steps_beat_the_structured_design(order, diagonal, structured):
     """The start is designed for a thousandth less damping, so it is a thousandth worse; each step gains 1 to 3 %."""
     design = ccl.design(asked(), order, diagonal, most_sdps=3)
@@ -146,6 +147,7 @@ def test_three_steps_beat_the_structured_design(order, diagonal, structured):
     assert design.requirement.certified
 
 
+@pytest.mark.slow
 def test_delay_in_the_environment_is_paid_for():
     loop = asked((0, 0), SOFT_NETWORK, psi=(1, 1))
     found = ccl.design(loop, most_sdps=3)

@@ -362,6 +362,7 @@ def test_the_frozen_guarantee_ends_with_another_stiffness():
     assert required(1.0, 10.0) < DELTA
 
 
+@pytest.mark.slow
 def test_saturation_is_outside_every_certificate():
     """A certified loop with two lossless hands: at rest if linear, swinging on at 1.2 Hz between the force limits."""
     hands = (Human((Link(1.2326, 0.0, 34.923),)), Human((Link(0.01999, 0.0, 266.28),)))

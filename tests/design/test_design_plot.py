@@ -127,6 +127,7 @@ def test_required_damping_is_perceived_with_the_hold():
     assert -late.min() == pytest.approx(required, rel=1e-6)  # a grid of 1.6e-5 rad misses a smooth peak by its square
 
 
+@pytest.mark.slow
 def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
     out = tmp_path / "o"
     assert main(["--coupling", "none,published", "--out", str(out), "--json", "-"]) == 0

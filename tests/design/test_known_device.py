@@ -842,6 +842,7 @@ def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=400
     return energy
 
 
+@pytest.mark.slow
 def test_any_environment_gets_walls_and_limiter_free():
     """Under known-device-any at 1.01 no lossless hand gains energy at a limited one-sided wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)

@@ -239,6 +239,7 @@ def test_hands_grow_only_below_the_requirement(mean):
     assert grown(0.6 * need, latencies, mean) > 0
 
 
+@pytest.mark.slow
 def test_latency_designs_beat_a_whole_sample():
     loop = change(PAIR, latency=((0.0, TAU),) * 2)
     found = design_coupling(loop, "spring-damper", "this-environment")

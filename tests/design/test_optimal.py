@@ -415,6 +415,7 @@ def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
         assert robustness(loop, coupling).required_over_available == pytest.approx(worst, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_partial_delay_constraints_leave_a_bound(monkeypatch):
     loop = loop_of("n3")
     whole = bound(loop, knots=8).rms

@@ -28,6 +28,7 @@ STIFF, SOFT = SpringDamper([7806, 3137], [0.105, 1.68]), SpringDamper([500, 350]
 change = msgspec.structs.replace
 
 
+@pytest.mark.slow
 def test_switching_reports_use_the_longest_period(tmp_path):
     """Also of the buffer that makes the delay the largest one."""
     file, more = tmp_path / "r.json", ["--condition", "this-environment", "--T-max", "1.8e-3"]

@@ -232,6 +232,7 @@ def test_failed_searches_claim_no_impossibility():
     assert not isinstance(caught.value, Infeasible)
 
 
+@pytest.mark.slow
 def test_proposed_changes_hold_when_made():
     """Each proposal, designed with more bases, passes the sweep; best first, and never what was asked for."""
     loop = asked((0, 0), psi=(1, 1))

@@ -312,6 +312,7 @@ def test_a_run_says_what_the_file_covers(run, file):
     assert narrow["varying_delay"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
 
 
+@pytest.mark.slow
 def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     wide = run(file, "--varying-delay", "0,3")
     line = (
@@ -344,6 +345,7 @@ def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
     assert "proved exactly" in outcome["varying_delay"]["covers"]
 
 
+@pytest.mark.slow
 def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
     quick = ["--humans", "3", "--engine", "exact", "--duration", "0", "--no-plot", "--out", str(tmp_path / "v")]
     _, outcome = told(capsys, validate_main, "--coupling", file, "--varying-delay", "1,2", *quick)

@@ -251,7 +251,9 @@ def test_every_step_of_the_proof(loop):
         assert min(start, 0) - 1e-12 <= Z1
 
 
-@pytest.mark.parametrize(("loop", "coupling"), [(held(3000.0), COUPLING), (PAIR, BOTH), (DAMPED, BOTH)])
+@pytest.mark.parametrize(
+    ("loop", "coupling"), [(held(3000.0), COUPLING), (PAIR, BOTH), pytest.param(DAMPED, BOTH, marks=pytest.mark.slow)]
+)
 def test_it_is_proved_stored_and_verified(loop, coupling):
     stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
     assert set(stored.certificate.multipliers) == {"a", "a + c", "d", "m"}

@@ -156,6 +156,7 @@ def test_progress_ends_at_its_total():
 # a coupling that is certified at every vertex and at 64 random points, and violated on an edge
 
 
+@pytest.mark.slow
 def test_edge_violations_match_a_dense_sweep(known):
     """The springs at their upper ends: between 0.5 and 2 kg the resonance moves from one vertex to the other."""
     found = known.searched.worst[0]
@@ -169,6 +170,7 @@ def test_edge_violations_match_a_dense_sweep(known):
     assert found.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
 
 
+@pytest.mark.slow
 def test_violations_between_vertices_take_the_guarantee_away(known):
     assert known.certificate is not None
     assert len(known.at_samples) == 64
@@ -186,6 +188,7 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
     assert requirement.proof == "sampled"
 
 
+@pytest.mark.slow
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)

@@ -152,6 +152,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
     return session, recorder, made
 
 
+@pytest.mark.slow
 def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     """Handshake, delay, certificate, forces, ramp, replay: the same session as over the serial link."""
     sdk = StandIn(scenario)

@@ -95,6 +95,7 @@ def played(force, T, mass, b, c, substeps=64):
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_told_from_viscous():
     T = 1.2e-3
     force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.5).signal[:, 0]
@@ -142,8 +143,12 @@ BETWEEN += ("dry friction that bends at 0.1 m/s", "Stribeck up to 0.06 m/s")
 BETWEEN += ("memory of 10 ms, 1 N s/m", "trace of 10 ms, 0.02 N s/m", "constant 0.001", "coulomb 0.05, slip 0.0005")
 
 
-#: two seconds, where weaker memories of the same dashpot take one
-SLOW = ("memory of 3 ms, 20 N s/m",)
+#: two seconds each, where others of their kind take one
+SLOW = (
+    "memory of 3 ms, 20 N s/m",
+    "memory of 3 ms, 0.5 N s/m",
+    "dashpot of 8 N s/m behind a spring, 3 ms, on a light handle",
+)
 
 
 def _marked(names):

@@ -437,7 +437,9 @@ def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
     assert part.reserved_J <= part.energy_J
 
 
-@pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
+@pytest.mark.parametrize(
+    "faults", [pytest.param((), marks=pytest.mark.slow), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"]
+)
 def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path, faults):
     """And the replay repeats what the budget did, bit by bit."""
     for module in ("control", "recording"):

@@ -89,6 +89,7 @@ def test_a_soft_clamp_hides_no_stiffness(clamp):
         assert found.motor_mass_min <= 0.06
 
 
+@pytest.mark.slow
 def test_play_and_presliding_friction_are_refused():
     """By the plant of the benchmark, which has both."""
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))

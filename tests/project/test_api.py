@@ -94,6 +94,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     assert assess(ranges, SpringDamper([300, 300], [0.1, 0.1]), ranges_samples=0).guarantee.any_environment
 
 
+@pytest.mark.slow
 def test_a_session_is_rehearsed():
     """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
     scenario = load().replace(T=1e-3, theta=(1, 1))
@@ -167,6 +168,7 @@ def test_designs_are_certified_and_act_as_couplings():
     assert (validate(load(), found, humans=10, engine="exact", duration=0).exact < 0).all()
 
 
+@pytest.mark.slow
 def test_delays_that_vary_are_simulated():
     text = (SCENARIOS / "omega-pair.toml").read_text()
     scenario = parse(text + "\n[varying_delay]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)

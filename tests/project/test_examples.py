@@ -9,6 +9,7 @@ from forked import run
 ROOT = Path(__file__).parents[2]
 #: examples of more than two seconds
 SLOW = ("limits_of_any_coupling", "unstable_and_certified", "your_own_device", "mujoco_two_fingers", "wheel")
+SLOW += ("first_steps", "neural_environment", "compare_couplings")
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "classics")  # test_classics.py runs its rows
 
 #: what each must print; figures are those that docs and other tests have

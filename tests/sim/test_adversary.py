@@ -39,6 +39,7 @@ def test_nobody_destabilises_sufficient_damping():
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
+@pytest.mark.slow
 def test_where_the_condition_binds_slowly_it_is_tight():
     """Without coupling and with delays of 4 and 9 samples it binds at 8 Hz: half a per cent short, a hand is found."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}

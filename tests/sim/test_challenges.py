@@ -4,8 +4,13 @@ import pytest
 
 from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 
+#: the longest ones
+SLOW = ("limited, any environment", "energy budget")
 
-@pytest.mark.parametrize("name", GUARANTEES)
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GUARANTEES]
+)
 def test_requirements_suffice_and_much_less_fails(name):
     """No motion and no lossless hand takes more than it may, at any tick; with too little some motion does."""
     rows = list(challenges(0, loops=1, hands=8, seconds=0.6, names=[name]))

@@ -96,6 +96,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     )
 
 
+@pytest.mark.slow
 def test_clipping_breaks_certificates_that_damped_hands_mend():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified

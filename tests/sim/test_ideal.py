@@ -81,6 +81,7 @@ def test_undefined_errors_have_a_reason():
     json.dumps(plain(lost), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_the_command_ranks_the_designs(tmp_path):
     """The optimum renders case I to half a percent; any-environment's spring-damper is about half of the force off."""
     errors = {}

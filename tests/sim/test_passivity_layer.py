@@ -128,6 +128,7 @@ def test_reports_say_what_the_budget_did(tmp_path):
     assert part["guarantee"].startswith("no passive hand is given any energy beyond")
 
 
+@pytest.mark.slow
 def test_uneven_periods_cannot_exceed_the_budget():
     """It reserves for the longest tick; the loop without a coupling, which grows, takes what it is given."""
     scenario = stiffer(load().replace(duration=4.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)

@@ -729,6 +729,7 @@ def test_the_window_shows_scene_and_devices(ball):
     assert stage.grip(window.perturb) == Grip(1, (pytest.approx(0.03),))
 
 
+@pytest.mark.slow
 def test_a_film_of_a_world_shows_the_scene(ball, tmp_path, capsys):
     running = LiveLoop(ball, Inline(), (), math.inf)
     try:
