@@ -568,6 +568,7 @@ def test_the_smaller_requirement_is_taken():
     assert verify(Stored.of(loop, coupling, prove(loop, coupling, "known-device"))).proved
 
 
+@pytest.mark.slow
 def test_one_beta_serves_all_environments_of_ranges():
     first = PAIR.environment.springs[0]
     ranges = Ranges(springs=(UncertainSpring(first.between, (0.9 * first.stiffness, 1.1 * first.stiffness)),))
@@ -732,7 +733,7 @@ def test_designs_refuse_what_known_devices_exclude():
 # Maps and what is left.
 
 
-@pytest.mark.parametrize("name", ["known-device", "known-device-any"])
+@pytest.mark.parametrize("name", ["known-device", pytest.param("known-device-any", marks=pytest.mark.slow)])
 def test_a_map_agrees_with_single_sweeps(name):
     """A stack of spring-dampers before a rigid wall: to three hundredths, and never above the plain condition."""
     loop = one(1e-3, 1.37, environment=RIGID_WALL)
@@ -764,7 +765,7 @@ def random_walls(rng, T):
     return Network(("tip",), springs[which], masses if which else {})
 
 
-@pytest.mark.parametrize("theta", [0, 1])
+@pytest.mark.parametrize("theta", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_pair_grows_above_the_requirement(theta):
     """Lossless hands before lossless environments behind a coupling at 1.01 of what it needs; some grow at 0.6."""
     T, rng = 1e-3, np.random.default_rng(theta)

@@ -385,6 +385,7 @@ def test_ranges_fall_back_to_a_proved_basis():
     assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
 
 
+@pytest.mark.slow
 def test_range_couplings_are_proved_at_every_vertex():
     loop = loop_of("n3")
     nominal = smallest("n3")

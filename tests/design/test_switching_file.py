@@ -239,6 +239,7 @@ def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
     assert required_damping(less, SOFT, "this-environment").ratio > 1
 
 
+@pytest.mark.slow
 def test_random_members_switch_without_growing_hands(ranged):
     """Lossless hands, members drawn from the ranges, greedy switching. With half of the damping some grow."""
     rng = np.random.default_rng(1)

@@ -237,6 +237,7 @@ class BridgeOnTerminal:
         os.close(self.slave)
 
 
+@pytest.mark.slow
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     """With the line of status drawn and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
     names = ("SIGQUIT", "SIGTERM", "SIGHUP")

@@ -23,8 +23,6 @@ SLOW = regenerate.SLOW
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
 IN_ORDER = [command for command in IN_ORDER if not SLOW.search(command)]
-#: commands of seconds whose options quicker commands of these pages run as well, one at a time
-LENGTHY = re.compile(r"repeats\.py|--generations 20|--pattern adversarial|--script|zwidth --rigid")
 SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
@@ -38,6 +36,11 @@ IN_TEXT = sorted(
         if "FILE" not in c and not SLOW.search(c)
     }
 )
+
+
+def of_page(page, *values, name):
+    """A parameter set; `make test` runs that of the README, and `make suite` those of all pages, a minute."""
+    return pytest.param(*values, id=name, marks=() if page in ("README.md", ROOT / "README.md") else pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +59,7 @@ def printed():
     return {}
 
 
-def _marked(command):
-    return pytest.param(command, marks=pytest.mark.slow if LENGTHY.search(command) else (), id=command)
-
-
-@pytest.mark.parametrize("command", [_marked(command) for command in IN_ORDER])
+@pytest.mark.parametrize("command", [of_page(COMMANDS[command], command, name=command) for command in IN_ORDER])
 def test_every_command_runs(command, place, printed):
     """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
     done = run(command, place)
@@ -69,7 +68,9 @@ def test_every_command_runs(command, place, printed):
     printed[command] = done.stdout
 
 
-@pytest.mark.parametrize(("page", "command", "pattern", "shown"), QUICK, ids=[block[1] for block in QUICK])
+@pytest.mark.parametrize(
+    ("page", "command", "pattern", "shown"), [of_page(block[0], *block, name=block[1]) for block in QUICK]
+)
 def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
     """`python tests/tools/regenerate.py` writes it anew."""
     output = printed.get(command) or run(command, place).stdout
@@ -79,6 +80,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not regenerate.same_line(a, b)] == []
 
 
+@pytest.mark.slow
 def test_designs_named_in_sentences_exist(place):
     """No page has one at times."""
     for command in IN_TEXT:
@@ -95,7 +97,7 @@ def test_measured_output_is_of_a_command_that_exists(page, command, pattern, sho
     assert shown == regenerate.kept(shown, pattern)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if SNIPPETS[page]], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [of_page(page, page, name=page.name) for page in PAGES if SNIPPETS[page]])
 def test_every_snippet_runs(page, place, monkeypatch):
     """All Python blocks of a page, in order, in one namespace."""
     monkeypatch.chdir(place)

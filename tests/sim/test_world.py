@@ -212,6 +212,7 @@ def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
     assert acted[False] > 1400
 
 
+@pytest.mark.slow
 def test_an_active_scene_is_held_back(tmp_path):
     """A motor with negative damping drives a body against the contacts: neither gravity nor a spring gives that."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="left" pos="-0.03 0 0">{TIP}</body>
