@@ -17,7 +17,7 @@ from haptic_loop.design.result import Design, DesignFailed, Requirement, suffice
 from haptic_loop.design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
-# SwitchingFigures delays, compared with a playout buffer.
+# Switching delays, compared with a playout buffer.
 
 
 _NOT_COVERED = (
