@@ -56,7 +56,11 @@ def test_a_design_for_it_is_proved_and_tight(folder):
         ("compare", ["--coupling", f"joined.json,moving-average:{OWN}", "--no-plot"]),
         ("run", ["--coupling", "joined.json", "--duration", ".1", "--no-plot"]),
         ("validate", ["--coupling", "joined.json", "--humans", "3", "--duration", "0", "--no-plot"]),
-        ("zwidth", ["--grid", "4", "--points", "0", "--humans", "2", "--mark", "900,.4", "--no-plot"]),
+        pytest.param(
+            "zwidth",
+            ["--grid", "4", "--points", "0", "--humans", "2", "--mark", "900,.4", "--no-plot"],
+            marks=pytest.mark.slow,
+        ),
         ("zwidth", ["--coupling", "joined.json", "--grid", "4", "--points", "0", "--humans", "2", "--no-plot"]),
         ("bridge", ["--rehearse", "--coupling", "joined.json", "--duration", ".1", "--no-plot"]),
     ],

@@ -127,7 +127,9 @@ def test_static_stiffness_is_an_exact_share(name):
         assert (g * E1 == F1).all()
 
 
-@pytest.mark.parametrize("name", [pytest.param("n0", marks=pytest.mark.validate), "n3", "n4", "o12"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("n0", marks=pytest.mark.validate), "n3", "n4", pytest.param("o12", marks=pytest.mark.slow)]
+)
 def test_the_bound_is_below_and_close(name):
     limit = bound(loop_of(name), knots=16)
     assert limit.rms < best(name).figures.rms_mismatch
@@ -516,7 +518,7 @@ ORDINARY = {
 }
 
 
-@pytest.mark.parametrize("name", ORDINARY)
+@pytest.mark.parametrize("name", [*list(ORDINARY)[:2], pytest.param(list(ORDINARY)[2], marks=pytest.mark.slow)])
 def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
     monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # what the cone program does not have

@@ -31,6 +31,7 @@ def test_agreed_figures(coupling, lam, sup, rms):
     assert decibels(figures.rms_mismatch) == pytest.approx(rms, abs=0.006)
 
 
+@pytest.mark.slow
 def test_against_a_dense_sweep():
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = np.geomspace(0.5, 80, 400_001)

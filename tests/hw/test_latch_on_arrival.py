@@ -102,6 +102,7 @@ def test_the_report_names_the_latency():
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"
 
 
+@pytest.mark.slow
 def test_a_session_replays_bit_for_bit(tmp_path, capsys):
     file = tmp_path / "r.json"
     options = ["--rehearse", "--theta", "0", "--latch", "arrival", "--duration", "0.3", "--no-plot"]

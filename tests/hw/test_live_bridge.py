@@ -260,7 +260,9 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "paces", [(0.5,), pytest.param((1.0, *PACES), marks=pytest.mark.validate)], ids=["once", "all"]
+    "paces",
+    [pytest.param((0.5,), marks=pytest.mark.slow), pytest.param((1.0, *PACES), marks=pytest.mark.validate)],
+    ids=["once", "all"],
 )
 def test_a_device_is_identified_over_the_line(tmp_path, paces):
     """Half a second a sweep, nobody at the handles: a bound below the emulated device's 1.37 N s/m, or why not."""

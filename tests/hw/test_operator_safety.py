@@ -243,6 +243,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
         IncidentLog(tmp_path)
 
 
+@pytest.mark.slow
 def test_doubts_reach_log_and_picture(tmp_path, capsys):
     """Forces of 0.05 N at most are cut for most of a second: report, incidents and title say stopped."""
     words = "--rehearse --force-cap 0.05 --duration 1.5 --measure 60 --out"

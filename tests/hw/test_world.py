@@ -93,6 +93,7 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
     assert f"{limited} ticks whose limited channels did not settle" in shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budget", [pytest.param(0.002, marks=pytest.mark.validate), 0.02])
 def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
     """A motor with negative damping: forces are whole steps of 0.4 mN, and the account still holds."""

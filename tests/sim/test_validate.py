@@ -211,6 +211,7 @@ def test_a_human_depends_on_seed_and_index_only():
     assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
 
 
+@pytest.mark.slow
 def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
     monkeypatch.setattr(examine_module, "_BATCH", 20)

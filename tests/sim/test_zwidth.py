@@ -523,6 +523,7 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_maps_cover_latency_and_longest_periods(tmp_path):
     """1000 N/m before a rigid wall needs 0.7749 N s/m at 0.13 ms of 1.2 ms, 1.8 as a whole sample; 0.9 up to 1.8."""
     file = tmp_path / "r.json"
