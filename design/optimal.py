@@ -403,6 +403,7 @@ class _Search:
         coupling, needs = self.kept_in_all(problem)
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
+        tried: list[Optimal] = []
         for share in _RESERVES:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
@@ -410,9 +411,12 @@ class _Search:
             candidate = self._assessed(scaled, scaled.g)
             if self.gained(before, candidate) < least:
                 return replace(candidate, reason=_SETTLED)
-            if self.proves_last or (candidate := self._proved(candidate, slip)).proved:
+            if self.proves_last:
+                return candidate
+            tried.append(self._proved(candidate, slip))
+            if tried[-1].proved:
                 break
-        return candidate
+        return tried[-1]
 
     def proved_or_smaller(self, candidate: Optimal) -> Optimal:
         """Return the coupling with a proof, its forces scaled down if necessary, or unproved if all scalings fail."""
