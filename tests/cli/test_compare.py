@@ -33,6 +33,7 @@ def test_each_coupling_has_its_price_and_error(tmp_path):
     assert (tmp_path / "out" / "couplings.png").stat().st_size > 50_000
 
 
+@pytest.mark.slow
 def test_a_row_is_the_run_of_that_coupling(tmp_path):
     """The run uses the other engine."""
     rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--no-plot")}

@@ -366,6 +366,7 @@ def certified(delta, theta=(1, 2)):
     return design_coupling(loop, "spring-damper", "any-environment").coupling
 
 
+@pytest.mark.slow
 def test_hands_behind_the_shell_get_its_budget():
     """The certificate for any environment, with a mass of negative damping, and with one that talks nonsense."""
     E = active_environment()

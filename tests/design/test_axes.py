@@ -431,6 +431,7 @@ def test_known_devices_take_full_levels() -> None:
     assert least(needs.ratio * (1 - 1e-3)) < 0
 
 
+@pytest.mark.slow
 def test_known_devices_with_full_levels_permit_more_stiffness() -> None:
     loop = msgspec.structs.replace(ONE_DEVICE, known_devices=(BOUNDS,) * 2)
     known, every = (design_by_kind(loop, "moving-average", name) for name in ("known-device-any", "any-environment"))

@@ -581,6 +581,7 @@ def test_one_beta_serves_all_environments_of_ranges():
     assert certificate.required[0] == pytest.approx(1.37 * max(each), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_any_environment_couplings_are_proved_from_files():
     loop, coupling = change(KNOWN, theta=(0, 1), lam=(0, 1)), SpringDamper([4000.0, 1300.0], [6.0, 2.5])
     assert not required_damping(loop, coupling, "any-environment").certified
@@ -1103,6 +1104,7 @@ def test_no_hand_gains_energy_from_ages_of_forces(name):
     assert hands_on_a_wall(loop, 0.1 * together_needs(name), coupling=COUPLING, **bound) > 0
 
 
+@pytest.mark.slow
 def test_switching_before_any_environment_is_that_of_chi():
     """He[V/(1-z)] > l (Lam - alpha d d*/2)^-1 l*/4 + h^2/(2 alpha), d = (1, beta (z - 1)), l of the mean delay."""
     loop, coupling = change(one(1e-3, 1.0, 1), varying_delay=DelayRange((0,), (2,))), SpringDamper([600.0], [1.2])
@@ -1129,6 +1131,7 @@ def test_switching_before_any_environment_is_that_of_chi():
     assert verify(Stored.of(change(loop, delta=(1.001 * share,)), coupling, certificate)).proved
 
 
+@pytest.mark.slow
 def test_an_assessment_guarantees_switching_on_known_devices():
     loop = change(TOGETHER["switching"][0], delta=(0.85,))
     found = assess(loop, COUPLING, limiter=False)

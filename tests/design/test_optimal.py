@@ -655,6 +655,7 @@ def test_the_report_says_that_seconds_ended_it(tmp_path, capsys, monkeypatch):
     assert "ended by --seconds" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys, brief):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
     options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "3600"]

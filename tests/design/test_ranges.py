@@ -289,6 +289,7 @@ def test_nothing_is_promised_where_a_sample_inside_violates(robust):
     assert not broken.proved
 
 
+@pytest.mark.slow
 def test_fixed_couplings_may_cover_ranges():
     for gains, any_environment in (((878.7, 551.8), True), ((2000.0, 1500.0), False)):
         check = check_ranges(LOOP, SpringDamper(gains, (0.3865, 0.522)), samples=8)

@@ -43,6 +43,7 @@ def test_the_designed_gains_are_proved_for_any_switching(made):
     assert report["assessment"]["transparency"]["rms_mismatch_db"] == pytest.approx(-3.37, abs=0.05)
 
 
+@pytest.mark.slow
 def test_no_lossless_human_grows_under_the_worst_switching(made):
     """The hardest that we have: lossless hands, greedy switching. With 30 % less damping some do grow."""
     _, coupling = made

@@ -211,6 +211,7 @@ def test_design_check_repeats_the_search(tmp_path, capsys):
 # the design
 
 
+@pytest.mark.slow
 def test_range_designs_hold_between_their_ends():
     found = optimal.design(MASS, Options(bases=((4, 3), (8, 6))))
     assert found.proved

@@ -298,6 +298,7 @@ def test_c_and_python_agree_byte_for_byte(library, episodes):
     assert compared > 12_000
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_no_sanitizer_complains(tmp_path, episodes):
     """The same traffic, with the same answers, through an executable with AddressSanitizer and UBSan."""

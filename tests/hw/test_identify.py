@@ -50,6 +50,7 @@ def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
     return recorder, session
 
 
+@pytest.mark.slow
 def test_known_parameters_come_back():
     """A compliant and a rigid device with dry friction, neither of them the ones the search begins with.
 

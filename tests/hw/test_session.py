@@ -257,6 +257,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
 
 
+@pytest.mark.slow
 def test_long_delays_wait_in_the_host(scenario):
     """Of 16 and 17 ticks, 15 are the line's: the host's forces come one and two ticks after their displacement."""
     (made,) = certified_couplings(scenario.replace(theta=(16, 17)), "I", None, None, 1, spare=0)
@@ -425,6 +426,7 @@ class _Thief:
         return -2.0 * np.sign(way)
 
 
+@pytest.mark.slow
 def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))

@@ -138,6 +138,7 @@ def in_the_ball_world(*faults):
     return session, -(f * dx + scenario.delta / np.array(scenario.T) * dx**2).sum(axis=1).cumsum()
 
 
+@pytest.mark.slow
 def test_motors_in_worlds_are_tested_at_last():
     """Within W0; the account is that of the devices, by their motion and the applied forces."""
     session, given = in_the_ball_world()
@@ -171,6 +172,7 @@ def test_a_force_in_steps_never_overdraws_the_shell():
     assert 0 < dearer < 2000
 
 
+@pytest.mark.slow
 def test_a_session_in_a_world_has_no_replay(tmp_path, capsys):
     from haptic_loop.cli import replay
 

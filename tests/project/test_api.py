@@ -120,6 +120,7 @@ def test_a_session_that_is_refused_says_why():
     assert session.result is session.zero_after is session.coupling is None
 
 
+@pytest.mark.slow
 def test_a_rehearsal_at_its_force_limit_is_stopped():
     """As the command says it: forces that were cut for most of a second are not the forces that were asked for."""
     weak = tuple(replace(device, force_limit=0.03) for device in load().device)

@@ -144,6 +144,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
     assert not report["holds"]
 
 
+@pytest.mark.slow
 def test_the_rate_by_shortage():
     rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 10))
     found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}

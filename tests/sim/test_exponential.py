@@ -310,6 +310,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
     assert found.cpu_s > 0
 
 
+@pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
     """The reference knows 64 steps, which the search does not look at."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500

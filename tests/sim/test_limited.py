@@ -112,6 +112,7 @@ def test_a_script_limits_forces_as_the_command_does():
         assert trace.meta["assessment"]["force_limits"]["rho"] == (None if rho is None else list(rho))
 
 
+@pytest.mark.slow
 def test_the_report_says_which_guarantee_holds(tmp_path):
     def report(*options) -> dict:
         where = [

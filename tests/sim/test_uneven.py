@@ -187,6 +187,7 @@ def test_periods_vary_beside_delays():
     assert len(run(simulation, "exact").t) == scenario.samples
 
 
+@pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
     rows = list(uneven.uneven_ticks(0, 3, 1200))

@@ -88,6 +88,7 @@ def test_drawn_devices_are_within_their_bounds(engine):
     assert 0.3 < (masses == 0.06).mean() < 0.7  # the worst device is at its bounds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("humans", [150, pytest.param(400, marks=pytest.mark.validate)])
 def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
     """At 1.001 of what known-device asks none grows, on no device of the bounds; the worst one replays."""
