@@ -206,8 +206,8 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     """Return the largest `response` over [grid[0], grid[-1]], refined between grid points, and its frequency.
 
     The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The
-    brackets are narrowed by a factor of 8, ten times or until two rounds gain nothing, which locates a smooth peak to
-    rounding. A bracket whose peak cannot reach the largest any more is dropped.
+    brackets are narrowed ten times, until two rounds gain nothing, or until no bracket can gain 1e-13 of the largest
+    value, which locates a smooth peak to rounding.
     """
     spend(_POINT * grid.size)
     values = response(grid)
@@ -219,14 +219,18 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     bracket = _brackets(values, grid, top - 0.2 * abs(top))
     settled = 0
     for _ in range(10):
-        value, w, bracket, reach = _narrowed(response, *bracket)
-        settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
+        bracket = _narrowed(response, bracket)
+        w, value = bracket[:, 1]
+        settled = settled + 1 if value.max() <= top + _GAIN * abs(top) else 0
         if value.max() > top:
             top, where = float(value.max()), float(w[np.argmax(value)])
-        bracket = bracket[0][reach >= top], bracket[1][reach >= top]
-        if settled == 2 or not bracket[0].size:
+        bracket = bracket[:, :, _reach(bracket) > top + _GAIN * abs(top)]
+        if settled == 2 or not bracket.size:
             break
     return top, where
+
+
+_GAIN = 1e-13  # relative gain of a peak that a search neglects
 
 
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
@@ -238,35 +242,61 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
     values = response(grid)
     top = float(values.max())
     least = top - near * abs(top) if np.isfinite(top) and near < np.inf else -np.inf
-    _, _, bracket, _ = _narrowed(response, *_brackets(values, grid, least))
-    value, w, *_ = _narrowed(response, *bracket)
+    bracket = _narrowed(response, _narrowed(response, _brackets(values, grid, least)))
+    w, value = bracket[:, 1]
     return w[value > above]
 
 
-def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
-    """Return the neighbours of the 32 highest local maxima of at least `above`."""
+def _brackets(values: Array, grid: Array, above: float) -> Array:
+    """Return the 32 highest local maxima of at least `above` between their neighbours.
+
+    A bracket is three points: axis 0 is their frequencies and values, axis 1 left, peak and right, axis 2 the brackets.
+    """
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
     at = np.flatnonzero(local & (values >= above))
     at = at[np.argsort(values[at])[-32:]]
-    return grid[np.maximum(at - 1, 0)], grid[np.minimum(at + 1, grid.size - 1)]
+    three = np.stack([np.maximum(at - 1, 0), at, np.minimum(at + 1, grid.size - 1)])
+    return np.stack([grid[three], values[three]])
 
 
-def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
-    """Return the best of 17 points per bracket: value, frequency, bracket of its neighbours, largest possible peak.
+#: distances from the parabola's peak to trial points, in widths of the bracket: near ones for a smooth peak, whose
+#: distance from that of the parabola falls with the square of the width, far ones for a kink
+_NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
+_EVEN = np.arange(1, 8)[:, None] / 8
+
+
+def _narrowed(response: Response, bracket: Array) -> Array:
+    """Return each bracket (`_brackets`) around the best of its points and of 16 more between them."""
+    (left, middle, right), (low, high, last) = bracket
+    width = right - left
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal points or values: the middle
+        rise, fall = (high - low) / (middle - left), (last - high) / (right - middle)
+        shift = 0.5 * (rise * (right - middle) + fall * (middle - left)) / (rise - fall)
+    peak = np.clip(middle + np.where(np.isfinite(shift), shift, 0.0), left, right)
+    near = width * _NEAR
+    trial = np.clip(np.concatenate([left + width * _EVEN, peak - near, peak[None], peak + near]), left, right)
+    spend(_POINT * trial.size)
+    w = np.concatenate([bracket[0], trial])
+    values = np.concatenate([bracket[1], response(trial.ravel()).reshape(trial.shape)])
+    order = np.argsort(w, axis=0, kind="stable")
+    w, values = np.take_along_axis(w, order, 0), np.take_along_axis(values, order, 0)
+    at = np.argmax(values, axis=0)
+    best = np.take_along_axis(w, at[None], 0)  # some points may be the same
+    three = np.stack([np.maximum((w < best).sum(axis=0) - 1, 0), at, np.minimum((w <= best).sum(axis=0), len(w) - 1)])
+    return np.stack([np.take_along_axis(w, three, 0), np.take_along_axis(values, three, 0)])
+
+
+def _reach(bracket: Array) -> Array:
+    """Return the largest possible peak of each bracket.
 
     Between its three points a parabola rises by at most a quarter of the drop to the lower neighbour. The largest
     possible peak is taken as four times that rise above the value.
     """
-    trial = np.linspace(left, right, 17)
-    spend(_POINT * trial.size)
-    values = response(trial.ravel()).reshape(trial.shape)
-    at, column = np.argmax(values, axis=0), np.arange(left.size)
-    below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), values[at, column]
-    lower = np.minimum(values[below, column], values[above, column])
+    low, best, last = bracket[1]
+    lower = np.minimum(low, last)
     # The condition `where` avoids inf - inf.
-    reach = best + np.subtract(best, lower, out=np.zeros_like(best), where=lower < best)
-    return best, trial[at, column], (trial[below, column], trial[above, column]), reach
+    return best + np.subtract(best, lower, out=np.zeros_like(best), where=lower < best)
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:
