@@ -180,10 +180,21 @@ def inverse(M: Array) -> Array:
     """Return M^-1 in the arithmetic of M. Raises SingularLoop if M is singular or too ill-conditioned."""
     if M.dtype == object:
         return solve(M, fractions(np.eye(M.shape[-1])))
-    if M.size and np.max(np.linalg.cond(M)) > 1e12:
+    try:
+        result = np.linalg.inv(M)
+        # The product of the Frobenius norms is at least the condition, whose singular values take far longer.
+        below = _square_norm(M) * _square_norm(result) <= 1e24
+    except np.linalg.LinAlgError:
+        result, below = None, np.False_
+    if M.size and (result is None or (not below.all() and np.max(np.linalg.cond(M)) > 1e12)):
         solved = "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12)"
         raise SingularLoop(f"{solved}: soften the environment or the coupling, or give psi a sample")
-    return np.linalg.inv(M)
+    return result
+
+
+def _square_norm(M: Array) -> Array:
+    """Return the sum of the squares of each matrix, over the last two axes."""
+    return np.einsum("...ij,...ij->...", M, M)
 
 
 def positive_definite(M: Any) -> bool:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import spend, within
-from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.lti import Array, Lti, frozen
 from haptic_loop.design import budgets
 
 # ----------------------------------------------------------------------------------------------------
@@ -160,15 +161,22 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. A repeated pole
     counts once, because two points that differ by rounding only would make the bracket of a peak there too narrow.
     """
-    even = np.linspace(low, high, points)
-    logarithmic = np.geomspace(low, high, points)
     poles = _distinct(np.concatenate([g.poles() for g in systems])) if systems else np.zeros(0)
     width = np.maximum(1 - np.abs(poles), 1e-9)
-    offsets = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
-    offsets = np.concatenate([-offsets, offsets])
-    around = (np.abs(np.angle(poles))[:, None] + width[:, None] * offsets).ravel()
-    grid = np.sort(np.concatenate([even, logarithmic, around]))  # np.unique would import numpy.ma, which takes 6 ms.
+    around = (np.abs(np.angle(poles))[:, None] + width[:, None] * _OFFSETS).ravel()
+    # np.unique would import numpy.ma, which takes 6 ms.
+    grid = np.sort(np.concatenate([_spaced(low, high, points), around]))
     return grid[(grid >= low) & (grid <= high) & np.append(True, grid[1:] != grid[:-1])]
+
+
+_OFFSETS = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
+_OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # of frequencies around a pole, in its width
+
+
+@lru_cache(maxsize=64)
+def _spaced(low: float, high: float, points: int) -> Array:
+    """Return frequencies, half of them evenly spaced in w and half in log w."""
+    return frozen(np.concatenate([np.linspace(low, high, points), np.geomspace(low, high, points)]), 1)
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
