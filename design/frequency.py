@@ -271,7 +271,7 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
 #: distances from the parabola's peak to trial points, in widths of the bracket: near ones for a smooth peak, whose
 #: distance from that of the parabola falls with the square of the width, far ones for a kink
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
-_EVEN = np.arange(1, 8)[:, None] / 8
+_EIGHTHS = np.arange(1, 8)[:, None] / 8
 
 
 def _narrowed(response: Response, bracket: Array) -> Array:
@@ -283,7 +283,7 @@ def _narrowed(response: Response, bracket: Array) -> Array:
         shift = 0.5 * (rise * (right - middle) + fall * (middle - left)) / (rise - fall)
     peak = np.clip(middle + np.where(np.isfinite(shift), shift, 0.0), left, right)
     near = width * _NEAR
-    trial = np.clip(np.concatenate([left + width * _EVEN, peak - near, peak[None], peak + near]), left, right)
+    trial = np.clip(np.concatenate([left + width * _EIGHTHS, peak - near, peak[None], peak + near]), left, right)
     spend(_POINT * trial.size)
     w = np.concatenate([bracket[0], trial])
     values = np.concatenate([bracket[1], response(trial.ravel()).reshape(trial.shape)])
