@@ -183,7 +183,8 @@ def inverse(M: Array) -> Array:
     try:
         result = np.linalg.inv(M)
         # The product of the Frobenius norms is at least the condition, whose singular values take far longer.
-        below = _square_norm(M) * _square_norm(result) <= 1e24
+        with np.errstate(over="ignore", invalid="ignore"):  # a product that overflows is not below
+            below = _square_norm(M) * _square_norm(result) <= 1e24
     except np.linalg.LinAlgError:
         result, below = None, np.False_
     if M.size and (result is None or (not below.all() and np.max(np.linalg.cond(M)) > 1e12)):

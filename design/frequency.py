@@ -213,7 +213,7 @@ def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
 def supremum(response: Response, grid: Array) -> tuple[float, float]:
     """Return the largest `response` over [grid[0], grid[-1]], refined between grid points, and its frequency.
 
-    The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The
+    Local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The
     brackets are narrowed ten times, until two rounds gain nothing, or until no bracket can gain 1e-13 of the largest
     value, which locates a smooth peak to rounding.
     """
@@ -256,16 +256,17 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 
 
 def _brackets(values: Array, grid: Array, above: float) -> Array:
-    """Return the 32 highest local maxima of at least `above` between their neighbours.
+    """Return the local maxima of at least `above` between their neighbours: the 32 that may become the highest.
 
-    A bracket is three points: axis 0 is their frequencies and values, axis 1 left, peak and right, axis 2 the brackets.
+    Where the response is flat, rounding makes many maxima, which may be higher than the grid points of a true peak. A
+    bracket is three points: axis 0 is their frequencies and values, axis 1 left, peak and right, axis 2 the brackets.
     """
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
     at = np.flatnonzero(local & (values >= above))
-    at = at[np.argsort(values[at])[-32:]]
     three = np.stack([np.maximum(at - 1, 0), at, np.minimum(at + 1, grid.size - 1)])
-    return np.stack([grid[three], values[three]])
+    bracket = np.stack([grid[three], values[three]])
+    return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
 #: distances from the parabola's peak to trial points, in widths of the bracket: near ones for a smooth peak, whose

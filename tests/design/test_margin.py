@@ -197,6 +197,17 @@ def test_supremum_finds_a_needle():
     assert w == pytest.approx(1.2345, abs=1e-6)
 
 
+def test_rounding_elsewhere_hides_no_peak():
+    """Fifty maxima by rounding are higher than the grid points beside the peak, which lies between two of them."""
+
+    def response(w):
+        return np.where(w < 0.5, 1 + 1e-9 * np.cos(200 * np.pi * w), 1.001 - 200 * (w - 0.7525) ** 2)
+
+    grid = np.linspace(0, 1, 201)
+    assert (response(grid[grid > 0.5]) < 1 - 1e-9).all()
+    assert supremum(response, grid) == pytest.approx((1.001, 0.7525), rel=1e-9)
+
+
 def test_the_factor_with_multiplier_is_least():
     """He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s, (11) to (14): met at s, kept above, missed below."""
     V, theta, delta, phi = SpringDamper([300.0, 200.0], [0.2, 0.3]).compliance(T), (1, 2), np.array(DELTA), (0.37, 0.1)
