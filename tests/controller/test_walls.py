@@ -187,7 +187,9 @@ def boxed(scenario):
     return scenario.replace(environment=network, device=devices, tap=None)
 
 
-@pytest.mark.parametrize(("name", "humans", "seconds"), [("exact", 200, 6.0), ("mujoco", 20, 3.0)])
+@pytest.mark.parametrize(
+    ("name", "humans", "seconds"), [("exact", 200, 6.0), pytest.param("mujoco", 20, 3.0, marks=pytest.mark.slow)]
+)
 def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
     """Walls of 20000 and 2000 N/m hit at up to 0.3 m/s, a coupling certified for whatever is passive.
 

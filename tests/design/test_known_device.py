@@ -682,7 +682,8 @@ def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
 STIFFER = Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))
 
 
-@pytest.mark.parametrize("ranges", [None, pytest.param(STIFFER, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ranges", [None, STIFFER])
 def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
     monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
@@ -747,6 +748,7 @@ def test_a_map_agrees_with_single_sweeps(name):
         assert ratio >= swept * 0.98
 
 
+@pytest.mark.slow
 def test_necessary_and_proved_damping_nearly_agree():
     left = left_over(KNOWN, PUBLISHED["I"], required_damping(KNOWN, PUBLISHED["I"], "known-device"))
     assert left.attained

@@ -228,7 +228,7 @@ def grown(damping, latencies, mean, seed=3):
     return growing(steps, energy, mean, rng, TICKS)
 
 
-@pytest.mark.parametrize("mean", [1, 100, None])
+@pytest.mark.parametrize("mean", [1, 100, pytest.param(None, marks=pytest.mark.slow)])
 def test_hands_grow_only_below_the_requirement(mean):
     latencies = np.linspace(0, TAU, 3)
     need = required_damping(

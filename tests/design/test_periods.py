@@ -160,7 +160,7 @@ def grown(damping, mean, seed=7):
     return growing(steps, energy, mean, rng, TICKS)
 
 
-@pytest.mark.parametrize("mean", [50, 1000, None])
+@pytest.mark.parametrize("mean", [50, 1000, pytest.param(None, marks=pytest.mark.slow)])
 def test_hands_grow_only_below_the_longest_periods_requirement(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)

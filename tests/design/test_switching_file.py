@@ -295,6 +295,7 @@ def run(tmp_path, capsys):
     return report
 
 
+@pytest.mark.slow
 def test_a_run_says_what_the_file_covers(run, file):
     remark = "the file proves delays switching within [1, 2] samples, which covers "
     assert not any("file" in line for line in run(file)["remarks"])

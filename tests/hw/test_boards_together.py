@@ -63,6 +63,7 @@ def watched(emulator):
     return ticks
 
 
+@pytest.mark.slow
 def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
     """Through a slip, forces are 1 and 2 steps old, and the host's energies are those at the devices, in integers."""
     rehearsal = rehearsal_of(scenario, alone, made, 1.0001, begin_us=SLIP_SOON)

@@ -374,6 +374,7 @@ def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
     assert np.percentile(true, 98) <= ages.quantile(0.99)
 
 
+@pytest.mark.slow
 def test_answers_that_overtake_each_other_are_timed(scenario):
     """A late answer that comes together with a younger one leaves no trace, so a second round tells them apart.
 

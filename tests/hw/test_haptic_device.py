@@ -182,6 +182,7 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     assert replay.main([str(tmp_path / "trace.npz")]) == 0
 
 
+@pytest.mark.slow
 def test_certificates_say_that_the_host_clocks(scenario):
     """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)

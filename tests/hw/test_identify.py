@@ -157,6 +157,7 @@ def _marked(names):
     return [pytest.param(name, marks=marks.get(name, ())) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(ODD))
 def test_rigs_that_are_not_ideal_have_bounds(odd, name):
     """Viscous friction is 1 N s/m: the bound is never above, and at most a twentieth below."""
@@ -228,6 +229,7 @@ def judged(records):
     return _Made(lambda name: bench["judged"](*rigs[name], signal)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(NOT_VISCOUS))
 def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
     """Dry friction is left out of the truth, as of the bound: what bends with speed is viscous at no level."""
@@ -384,6 +386,7 @@ def test_an_axis_that_does_not_move_gives_nothing():
         identify(np.zeros(100), np.ones(100), 1e-3, STEP, rigid=True)
 
 
+@pytest.mark.slow
 def test_a_record_with_gaps_gives_no_bound():
     scenario = load()
     recorder, session = record_of(scenario, "up:drop=0.01@0.4")

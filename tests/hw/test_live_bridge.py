@@ -105,6 +105,7 @@ def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
     assert world["given_J"] <= 2e-3 + world["released_J"]
 
 
+@pytest.mark.slow
 def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
     monkeypatch.chdir(tmp_path)
@@ -348,6 +349,7 @@ def test_uncertified_couplings_are_not_armed(emulator, scenario):
     assert "not certified" in session.cause
 
 
+@pytest.mark.slow
 def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
     emulator = EmulatorProcess("--fault=unplug@0.05", f"--pace={PACE}")
     session, _ = run(emulator, scenario, lambda ages: rungs)

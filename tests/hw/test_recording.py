@@ -267,6 +267,7 @@ springs = [{ between = ["left", "right"], stiffness = 800.0, damping = 1.0 },
 """
 
 
+@pytest.mark.slow
 def test_sessions_limit_vectors(tmp_path):
     """By the limiter of the proof; the channels keep their names, and a replay computes the same forces."""
     scenario = parse(PLANAR)

@@ -59,11 +59,17 @@ def one_of_each_kind():
     return [alike[i % len(alike)] for i, alike in enumerate(kinds.values())]
 
 
-@pytest.mark.parametrize("case", one_of_each_kind(), ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=[pytest.mark.slow] * (i % 3 != 0), id=case.name)
+        for i, case in enumerate(one_of_each_kind())
+    ],
+)
 def test_every_fault_ends_where_it_must(case, scenario, rungs):
     """Stage, cause, time to zero force, counters, no force above the cap, no second arming.
 
-    `python -m tests.checks.faults`, a part of `make validate`, has every axis and sign.
+    Two of three cases are slow. `python -m tests.checks.faults`, a part of `make validate`, has every axis and sign.
     """
     assert _rehearse_case(case, scenario, rungs)[1].wrong == ()
 

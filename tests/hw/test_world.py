@@ -146,6 +146,7 @@ def test_motors_in_worlds_are_tested_at_last():
     assert given.max() <= 2e-3 + session.worlds[0].port.released
 
 
+@pytest.mark.slow
 def test_a_dead_motor_in_a_world_never_finishes():
     session, _ = in_the_ball_world("axis6:motor=0@0.8")
     assert session.stage == Stage.STOPPED

@@ -43,6 +43,7 @@ def test_no_certified_coupling_beats_the_bound():
     assert all(row["best_rms_db"] and row["best_stiffness_share"] for row in ROWS.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.validate)])
 def test_numpy_alone_finds_the_published_requirements(every):
     """One row in four, and in `make validate` all."""

@@ -62,6 +62,7 @@ SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoper
 ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
 
+@pytest.mark.slow
 def test_missing_damping_ends_the_example_clearly(tmp_path):
     text = (ROOT / "examples/your_own_device.py").read_text()
     assert '"damping": 0.9' in text

@@ -56,7 +56,8 @@ def test_no_code_asks_for_a_conditions_name():
         for node in () if place in AT_HOME else ast.walk(_tree(path)):
             if isinstance(node, ast.Compare | ast.match_case):
                 parts = [getattr(part, of, None) for part in ast.walk(node) for of in ("value", "id", "attr")]
-                asking += [f"{place}: {ast.unparse(node)}"] * any(w in CONDITIONS for w in parts if isinstance(w, str))
+                if any(w in CONDITIONS for w in parts if isinstance(w, str)):
+                    asking.append(f"{place}: {ast.unparse(node)}")
     assert not asking
 
 

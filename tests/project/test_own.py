@@ -105,7 +105,9 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("name", "covered"), [("hard", "any-environment"), ("gel", "this-environment")])
+@pytest.mark.parametrize(
+    ("name", "covered"), [pytest.param("hard", "any-environment", marks=pytest.mark.slow), ("gel", "this-environment")]
+)
 def test_an_own_environment_is_proved_and_stored(name, covered, place):
     """The proof is repeated from the file alone, which asks for no class."""
     words = f"--environment mine.py:{name} --condition {covered} --out {name}.json"

@@ -83,13 +83,12 @@ def children(pid: int) -> list[int]:
     return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the kernel lists no children here")
 @pytest.mark.parametrize(
     ("end", "words", "workers_and_their_clerk"),
     [
-        pytest.param(
-            signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3, marks=pytest.mark.slow
-        ),
+        (signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
         (signal.SIGKILL, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
     ],
 )

@@ -86,9 +86,8 @@ def test_mujoco_says_the_same(scenario, lossless):
     assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 
 
-@pytest.mark.parametrize(
-    "scenario", [DEVICES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in DEVICES[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", DEVICES)
 def test_no_adversary_succeeds(scenario):
     """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
     place = load(scenario)

@@ -251,6 +251,7 @@ def test_the_population_meets_lost_packets(tmp_path):
     assert part["humans"] == 0
 
 
+@pytest.mark.slow
 def test_both_engines_see_the_population_grow_alike():
     """Four humans, adversarial delays: MuJoCo's growth within 0.01 1/s of the exact one, as of its constant loops."""
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"))
