@@ -683,7 +683,7 @@ STIFFER = Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ranges", [None, STIFFER])
+@pytest.mark.parametrize("ranges", [None, pytest.param(STIFFER, marks=pytest.mark.validate)])
 def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
     monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
@@ -1075,7 +1075,14 @@ def together_needs(name):
     return required_damping(loop, COUPLING, condition).required[0]
 
 
-@pytest.mark.parametrize("name", ["switching", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:])])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "switching",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:3]),
+        pytest.param("walls-limiter-ranges", marks=pytest.mark.validate),
+    ],
+)
 def test_facts_on_known_devices_are_proved_from_files(name):
     """For less damping than devices of which less is known need; a file without a multiplier is refused."""
     loop, condition = TOGETHER[name]

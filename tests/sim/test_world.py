@@ -83,7 +83,7 @@ class Touch:
 def test_no_hand_is_given_more_than_the_account(name, lossless):
     """Hands thrown at each scene, delays 0 to 3; the shell acts on no tick with random hands."""
     rng, acted, ticks = np.random.default_rng(3), 0, 0
-    for run in range(4):
+    for run in range(3):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
         touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
         for _ in range(500):
