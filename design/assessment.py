@@ -182,13 +182,13 @@ def check_ranges(
     """Check a coupling over the ranges of its loop by this-environment or known-device; return None without ranges.
 
     The search is deterministic. In addition, `samples` environments are drawn at random from inside the ranges, with
-    `seed`. `searched` and `certificate` are the search and the proof of an earlier call or design, which are not
-    repeated. One set of multipliers serves all environments, including those between the vertices.
+    `seed`. The search and the proof are not repeated if an earlier call or design supplies them as `searched` and
+    `certificate`. One set of multipliers serves all environments, including those between the vertices.
     """
     if loop.ranges is None:
         return None
     certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
-    simple = condition.extensible and not multiplier  # Only these conditions have fast sweeps of members.
+    simple = condition.extensible and not multiplier  # Fast sweeps of members exist for this case only.
 
     def need(there: Loop) -> Requirement:
         return required_damping(there, coupling, condition, multiplier)
@@ -236,7 +236,7 @@ def _proved_ranges(
 
 def violated_between(place: Member, ratio: float) -> str:
     """Return the reason why ranges with proved vertices are not guaranteed: a violation between the vertices."""
-    needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
+    needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"
 
 
@@ -258,7 +258,7 @@ class ForceLimits:
         c: The multiplier of the condition `limiter`, one row per channel, no unit.
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
-        less: Whether the guarantee holds in more environments than the limiter's proof, which is for one.
+        less: Whether the limiter is proved in one environment only, while the guarantee covers more.
         energy_budget: The energy W0 [J] that forces may give in total; None without a budget.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
     """
@@ -315,17 +315,16 @@ def _covered_limits(
 ) -> ForceLimits:
     """Return the limiter that a certified condition covers, or clipping with the reason.
 
-    A condition that covers a limiter without a further proof comes first. Otherwise this-environment or known-device
-    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise
-    multipliers are searched for a limiter of the same beta. The proof of `known` is not repeated
-    (design.certificate.recheck).
+    A condition that covers a limiter without a further proof is preferred. Otherwise this-environment or known-device
+    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise multipliers
+    are searched for a limiter of the same beta. `known` is a certificate that has been verified.
     """
     for each in requirements.values():
         if each.certified and each.lag is not None:
             return ForceLimits(each.lag, f"{each.condition} covers limited forces")
     extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
     if not extended:
-        return ForceLimits(None, "no guarantee that it could extend")
+        return ForceLimits(None, "no certified condition that extends to limited forces")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
     candidates = [_by_its_own_block(loop, coupling, proof, known, extended[0])]
     if candidates[0].rho is None and len(extended) > 1:
@@ -486,7 +485,7 @@ class Assessment:
 
     @property
     def held_torques(self) -> str | None:
-        """The remark that no condition counts torques held by a moving device, or None for devices of one axis."""
+        """The remark that conditions ignore the change of pose while torques are held; None for devices of one axis."""
         return held_torques(self.loop)
 
     def without_guarantee(self, reason: str) -> Assessment:
@@ -536,12 +535,12 @@ def assess(
     Args:
         loop: The loop; ranges, switching delays, latency and longest period must all be covered.
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
-        environment: The environment that runs, if it is not the loop's: a network, or a function that is plugged in
-            behind the coupling and a shell that makes it passive.
-        energy_budget: W0 [J] of the shell (default 0 for a function, 2 mJ for a MuJoCo world), or, without a shell, of
-            an energy budget at the devices (controller.budget; default: no budget).
-        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling and holds; it is
-            verified unless this process has made or verified it.
+        environment: The environment that runs, if it is not the loop's: a network, or a function. A function is
+            connected to the coupling through a shell that makes it passive.
+        energy_budget: W0 [J]. With a shell it is the shell's (default: 0 for a function, 2 mJ for a MuJoCo world).
+            Without a shell it is that of an energy budget at the devices (controller.budget; default: no budget).
+        certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
+            unless this process has made or verified it.
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or
             known-device if the loop has bounds of its devices.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.

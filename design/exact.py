@@ -76,7 +76,7 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # units of counted work of a product of integers, and for each of their bits
+_LIMBS, _BIT = 5e-9, 3e-11  # counted work of a product of two integers, and of each of their bits
 
 
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
@@ -249,7 +249,7 @@ def _whitening(W: Array) -> _Integers | None:
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
-    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2  # powers of two that make the diagonal even
+    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2  # powers of two that equalise the diagonal
     with np.errstate(over="ignore"):
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
     if not np.isfinite(W).all():  # An entry is far too large for the diagonal.
@@ -272,17 +272,17 @@ def _whitening(W: Array) -> _Integers | None:
 # Kalman-Yakubovich-Popov: if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
 # then A is stable (x'Px falls along x+ = Ax, by the first block) and He G > 0 on the unit circle, because
-# [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequalities are tested exactly for a rounded P,
-# which is as good as any other. The errors of all other rounding are bounded and subtracted.
+# [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. P may be rounded, because any P that satisfies both
+# inequalities is a proof. The errors of all other rounding are bounded and subtracted.
 
 
-_MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; our own have some hundred
+_MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; our own files have a few hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
 _LEFT = 0.02  # largest residual of the Riccati equation, relative to its drive
-_UNIT = 2.0**-53  # of double precision
-_ACCURACIES = (48, 112), (192, 192)  # pairs of binary digits of P, and of A, B, C and D, with which a proof is tried
+_UNIT = 2.0**-53  # unit roundoff of double precision
+_ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
 _MOST_UNITS = 2.0**50
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
@@ -291,11 +291,11 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
     """Return the matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
-    multiples of 2^-bits; the rounded P is exactly known and as good a proof as any other. The other matrices are
-    rounded to multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded
-    down to multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm. The error
-    by E is |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point computes to at
-    least two digits.
+    multiples of 2^-bits; the rounded P is exactly known and may itself be a proof. The other matrices are rounded to
+    multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded down to
+    multiples of u. Without E the error is therefore less than 2 u per entry and 2 (n + m) u in norm. The error by E is
+    |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point computes to at least two
+    digits.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
@@ -343,7 +343,7 @@ def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
             W, units = _kyp_matrix(G, P, bits, finer)
             if units < _MOST_UNITS and _definite(_less(W, math.ceil(units)), finer):
                 return None
-    return f"{reason} is not positive definite, or by so little that it is not proved"
+    return f"{reason} is not positive definite, or too close to singular for a proof"
 
 
 def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
@@ -390,18 +390,18 @@ class Violated(str):
     """The reason why a block has no proof: it is negative beyond rounding at some frequency."""
 
 
-_CLEARLY = 1e-6  # shortage beyond rounding, of a block with inputs of size one
+_CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the block's inputs have size one.
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
-    half of its margin subtracted: D is reduced by a part of mu, the minimum over |z| = 1 of the least eigenvalue of
-    He G. The equation is driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first
-    solved in coordinates in which white noise at the inputs moves all states equally and independently. There the
-    condition number of P is 1e9 in place of 1e15. The original states are tried next. The result is transformed
-    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
+    D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation is
+    driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first solved in coordinates in
+    which white noise at the inputs moves all states equally and independently. There the condition number of P is 1e9
+    in place of 1e15. The original states are tried next. The result is transformed back exactly, and rounded to
+    _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -430,7 +430,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (the change of coordinates, P in these coordinates); with `white` they make the states independent.
+    """Return (a change of coordinates, P in the new coordinates). With `white` the new states are independent.
 
     Raises LinAlgError.
     """
@@ -481,7 +481,7 @@ def _states(G: Lti) -> NDArray[np.complex128]:
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
-    value, w = supremum(  # of 1 - lambda, because `supremum` refines peaks within a fifth of the largest one
+    value, w = supremum(  # 1 - lambda is used, because `supremum` refines only peaks within a fifth of the largest.
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )
     return 1 - value, w
@@ -499,8 +499,8 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    Newton's steps reduce the residual that rounding leaves to a part _LEFT of the drive. They need extended precision,
-    because lightly damped modes have a small margin. Raises LinAlgError if there is no solution.
+    Newton's steps reduce the residual, which rounding has left, below _LEFT times the drive. They need extended
+    precision, because lightly damped modes have a small margin. Raises LinAlgError if there is no solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)

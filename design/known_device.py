@@ -7,10 +7,9 @@ period. Then the motor, its transmission and every passive hand behind the trans
 
     sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
 
-with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx in a period, and the speeds v, v+ at its
-ends.
-docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
-design.necessary has a lower bound for all conditions on these devices.
+with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx in a period, the speeds v and v+ at its
+ends, and dv = v+ - v. docs/theory.md has the proof. The blocks below state that the environment's side returns less
+energy than L. design.necessary has a lower bound for all conditions on these devices.
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """Return the least beta (m,) [s] at which c0 or c2 is 0, for devices with the damping `share` Delta."""
+    """Return the bound of beta (m,) [s], where c0 or c2 becomes 0, for devices with the damping `share` Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
@@ -110,8 +109,8 @@ _SERIES = 0.03  # Below this y the truncated series has an error of 2e-14; above
 def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
     """Return a lower bound of the cost L of a period for devices with the damping `share` Delta, (..., m), as floats.
 
-    For periods in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2). Entries are
-    nan if beta is too large for this damping.
+    For periods in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2), with the
+    mean speed vb = (v + v+)/2 and q as in `_q_bounds`. Entries are nan if beta is too large for this damping.
     """
     longest, shortest = loop.T_max or loop.T, shortest_period(loop) or loop.T
     c0, c2 = _rates(_known(loop, loop.T), np.asarray(share)[..., None] * np.array(loop.delta), beta)
@@ -128,8 +127,8 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 # does not change them. In coordinates with a diagonal Delta the theorem holds, with one beta for all axes of a device.
 
 _SKEW_BITS = 32  # fractional bits of the skew matrix S; they make Q' Delta Q diagonal to about 1e-9 of the damping
-_JACOBI_SWEEPS = 12  # converges quadratically: 6 axes need about five
-_BELOW = 1e-11  # relative distance of d below its exact bound, which covers rounding
+_JACOBI_SWEEPS = 12  # Sweeps converge quadratically: 6 axes need about five.
+_BELOW = 1e-11  # relative margin of d below its exact bound, for rounding
 
 
 def _straightened(loop: Loop) -> Loop:
@@ -156,8 +155,8 @@ def _principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
     """Return a rational orthogonal Q (n, n) and decimals d (n,) with Delta >= Q diag(d) Q' over the rationals.
 
     Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
-    Jacobi's rotations, because additions, products and roots round alike on every machine, so that a proof can be
-    checked on another machine. d is the diagonal of Q' Delta Q less the Gershgorin radii.
+    Jacobi's rotations, whose additions, products and roots round alike on every machine. So every machine can check a
+    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)
@@ -201,7 +200,7 @@ def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], 
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double whose decimal is `beyond` the ball, going from the ball's midpoint in `towards`."""
+    """Return the first double, from the ball's midpoint in the direction `towards`, whose decimal is `beyond` it."""
     import flint
 
     value = float(ball.mid())
@@ -276,17 +275,18 @@ def _exact_cost(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The required damping s Delta: the least s for which some beta and multipliers satisfy the block with the same bounds.
+# The required damping is s Delta, with the least s for which some beta and multipliers make the block positive. The
+# bounds of mass and transmission do not scale with s.
 #
 # L is the least value of an integral that is linear in c0 and c2. Since c0 and c2 are concave in (s, beta), so is L.
 # The other entries are affine in beta and in the multipliers if the multiplier of switching delays is taken as 1/alpha.
 # A tangent of a concave block bounds the block from above. The tangents at the binding frequencies form a linear matrix
 # inequality, whose least s bounds the required s from below.
 
-_LARGEST_ETA = 0.9999  # largest beta that is tried, relative to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least such ratio, at which this-environment requires the same damping to five digits
+_LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
+_LEAST_ETA = 1e-5  # least tried ratio; this-environment then requires the same damping to five digits
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
-_TOGETHER = 100  # So many matrices take hardly longer than one, so a step may try several shares per frequency.
+_TOGETHER = 100  # matrices in a stack, which take hardly longer than one: a step tries several shares at once
 _WORST, _IN_A_CUT = 6, 28  # frequencies at which a cut locates the least share, and number of bisections there
 _VIOLATED = 3  # number of frequencies at which a round adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
@@ -411,7 +411,7 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,), and (1 + m + q, k, n, n): the block for zero beta and multipliers, then the slope of each."""
+        """Return z (k,) and blocks (.., k, n, n): that for zero beta and multipliers, then its slope in each."""
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(self.device.size)
         each = [(no_beta, none), *((beta, none) for beta in np.eye(m)[:, self.device])]
@@ -455,10 +455,10 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n), concave in x because inputs w are scaled by 1/alpha relative to that in `at`."""
+        """Return the block (k, n, n) with L; rows of switching delays are scaled, which makes it concave in x."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = _with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
-        for a in np.flatnonzero(self.inverse) + self.m:
+        for a in np.flatnonzero(self.inverse) + self.m:  # 1/alpha
             own = np.real(np.diagonal(parts[1 + a], axis1=1, axis2=2)).min(axis=0) > 0
             ratio[own] = x[a] / at[a]
         return ratio[:, None] * block * ratio
@@ -589,7 +589,7 @@ class _Search:
         root = np.array([[0.0, 1.0], [1.0, 0.0]]) / _LARGEST_ETA
         blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
-        # The point with the share `least` satisfies all tangents.
+        # The minimum cannot exceed `least`, because the point with that share satisfies all tangents.
         settings = (SETTINGS[0], INTERIOR, *SETTINGS[1:])
         x = program.solve("beta of the known devices", lambda x: x[-1] <= 1 + _GAP, settings)
         slack = np.linalg.eigvalsh(blocks[0].at(x))[:, 0]
@@ -599,11 +599,11 @@ class _Search:
 
 _ETAS = (0.03, 0.3, 0.1, 0.9)  # shares of the largest beta for the first tangents; the search begins at the second
 _SLACK = 0.002  # A tangent with a larger least eigenvalue (its entries are about one) is dropped.
-_BETWEEN = 1e-4  # A frequency is added if the share exceeds that at the sampled frequencies by more, relatively.
+_BETWEEN = 1e-4  # largest relative excess of the share between sampled frequencies; beyond it one more is sampled
 
 
 def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
-    """Return the entries 11, 22 and twice the entry 21 of the form L on (dx, v) at z (k,), in the order 11, 21, 22."""
+    """Return the entry 11, twice the entry 21, and the entry 22 of the form L on (dx, v) at z (k,)."""
     turn, cosine = 1 + 1 / z[:, None], z.real[:, None]
     return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
 
@@ -639,7 +639,7 @@ def positive(H: Complex) -> NDArray[np.bool_]:
 # The conditions.
 
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
-_NO_SHORTEST = "periods up to T_max need a shortest one, T_min (a line of the scenario), for a known device"
+_NO_SHORTEST = "T_min: a known device with periods up to T_max needs a shortest period; add T_min to the scenario"
 _LATE = "latency: Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
 _MOST_SHARE = 1e3  # largest share of the damping that a sweep tries for a given beta
 
@@ -776,10 +776,10 @@ class KnownDevice(Condition):
         return sweep.response(0, beta, tuple(values[3 * m :]), max(_MOST_SHARE, 2 * sweep.floor(beta)))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the required share of the damping (n,) for a stack of couplings, to three hundredths, on a grid.
+        """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid.
 
-        Shares between _LEAST_DRAWN and that of the plain condition are tried with beta = _DRAWN times the largest beta
-        of each channel. The grid is coarse because a map needs thousands of couplings.
+        Shares from _LEAST_DRAWN to the share of the plain condition are tried, with beta = _DRAWN times the largest
+        beta of each channel. The grid is coarse because a map needs thousands of couplings.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):

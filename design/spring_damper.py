@@ -3,7 +3,7 @@
 The gains that any-environment certifies form a convex set, described here. design.gain_search searches gains for one
 environment.
 
-Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (gain_set).
+Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (`_GainSet`).
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat W|^2, and the row of a multiplier is
 # 2 (1 - Theta-hat W). By a Schur complement the condition is affine in (k, b), without conservatism.
 #
-# `lemma1` turns this condition into one matrix inequality, whose unknowns are half of its entries. With more than
-# _MOST_STORED unknowns the condition in (k, b) alone is imposed at sampled frequencies, and frequencies at which the
-# solution violates the condition are added. Both methods give the same gains.
+# `lemma1` turns this condition into one matrix inequality, with the entries of a symmetric storage matrix as further
+# unknowns. If these are more than _MOST_STORED, the condition is imposed at sampled frequencies instead, and
+# frequencies at which the solution violates it are added. Both methods give the same gains.
 
 
 _MOST_STORED = 180  # largest number of unknowns besides the gains, of all channels
@@ -129,10 +129,10 @@ class _GainSet:
         self._stored = stored if stored.sum() <= most_stored else None
 
     def solve(self, cost: Array, what: str, more: Sequence[Inequality] = ()) -> Array:
-        """Return the unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N) in their sets, then others.
+        """Return the unknowns of least cost. The first ones are the gains (k_1, ..., k_N, b_1, ..., b_N).
 
-        `more` are further inequalities. Raises the errors of ConeProgram.solve, and DesignFailed if the gains violate
-        an inequality after all rounds.
+        The gains are in their sets, and all unknowns satisfy the inequalities `more`. Raises the errors of
+        ConeProgram.solve, and DesignFailed if the gains violate an inequality after all rounds.
         """
         N, own = len(self.channels), len(cost)
         blocks = [*more, Inequality.least(range(2 * N), 0.0)]
@@ -201,7 +201,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
-    g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # (2N, k, N): its slopes, diagonals
+    g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # slopes of g: diagonals (2N, k, N)
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
     scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
     rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
@@ -234,7 +234,7 @@ def design(
         loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
-        limiter: Whether the proof covers limited forces too; that of any-environment always does.
+        limiter: Whether the proof covers limited forces, too; proofs of any-environment always do.
         band_hz: The band of the rms mismatch [Hz].
         W1: The output weight of (23).
         W2: The input weight of (23).
@@ -250,15 +250,15 @@ def design(
         return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
     if named(condition).extensible:
         if loop.varying_delay and limiter:
-            raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
+            raise ValueError("limiter: limited forces are proved for constant delays only; leave out the limiter")
         return _for_this_environment(loop, starts, limiter, band_hz)
     if loop.varying_delay:
-        raise ValueError("delays that vary are designed for by the this-environment condition only")
+        raise ValueError("delays that vary: use this-environment, the only condition with such designs")
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-#: significant digits of the gains in loops of more than FEW channels: exact proofs with all digits take minutes. What
-#: rounding changes is less than RESERVE.
+#: significant digits of the gains in loops of more than FEW channels: exact proofs with all digits take minutes.
+#: Rounding changes the required damping by less than RESERVE.
 _DIGITS = 5
 _SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
 _MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a search ends within half a minute
@@ -281,7 +281,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     """
     if not named(condition).extensible:  # Limited forces are covered with rho = 0.
         if limiter and named(condition) is KNOWN_DEVICE:
-            raise ValueError("limiter: forces that are limited are not covered by known-device, ask this-environment")
+            raise ValueError("limiter: known-device designs do not cover limited forces; use this-environment")
         _require_few(
             loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
         )
@@ -346,14 +346,14 @@ def _for_this_environment(
     band = band_hz or BAND_HZ
     span = loop.varying_delay
     if band_hz and span:
-        raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
+        raise ValueError("band_hz: designs for delays that vary use 0.5 to 80 Hz; leave out band_hz")
     sampled = partial(SwitchingLoop, loop) if span else partial(SampledLoop, loop, band)
     many = loop.channels > FEW
     if many:
         starts = likeliest_first(sampled(), starts)
     coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
     nothing = coupling is None and not many
-    if limiter and not nothing:  # The result is a little softer than without limits, so the search starts there.
+    if limiter and not nothing:  # The search starts at the unlimited result, because limits soften it only a little.
         limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
         coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
@@ -406,14 +406,14 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
 
-_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # of the largest beta
+_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried beta over the largest
 _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
     """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and device.
 
-    It is l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    It is l Lam^-1 l*/4 with the form Lam of L, l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
     """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
@@ -446,7 +446,7 @@ def _stiffest_known(loop: Loop) -> Design:
 
 
 def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
-    """Return K [N/m] and B [N s/m] of each axis of a device, of largest sum of K for any environment.
+    """Return the K [N/m] and B [N s/m] of each axis of a device with the largest sum of K for any environment.
 
     The share _STIFF_RESERVE of the damping stays unused. All axes have one beta.
     """
@@ -459,7 +459,7 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
     def stiffest(B: float, limits: Array) -> float:
         """Return the largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, or 0.
 
-        |1/D|^2 steps = T, and the real part of 1/D is T/2.
+        With D = (1 - 1/z)/T, |1/D|^2 steps is T, and the real part of 1/D is T/2.
         """
         a, b = limits * T, (limits * steps * B - 0.5) * T
         c = limits * steps * B**2 - B
@@ -490,7 +490,7 @@ def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
 
 
 def _limits(axes: Sequence[Loop], eta: float, z: Complex, reserve: float) -> list[Array]:
-    """Return chi (k,) of each axis of a device for one beta, a share of the largest that all axes allow."""
+    """Return chi (k,) of each axis of a device for one beta: `eta` times the largest one that all axes allow."""
     beta = eta * np.min([largest_beta(one, 1 - reserve) for one in axes], axis=0)
     share = np.full(z.size, 1 - reserve)
     return [_chi(z, one.theta, period_cost(one, share, beta), beta)[:, 0] for one in axes]
@@ -547,7 +547,7 @@ _STIFF_DIGITS = 6
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
-    """Return starts around 2 d/(n T), the largest stiffness of a linear coupling for any passive environment.
+    """Return starts around 2 d/((theta + 1) T), the stiffest linear coupling for any passive environment.
 
     With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency.
     Therefore the last start has the environment's stiffness at half the sampling rate.
@@ -595,12 +595,10 @@ def _stiffest_in_frame(loop: Loop) -> Design:
     """Return the stiffest linear coupling for any environment with a latency or switching delays.
 
     He[V/(1-z)] = chi is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, whose series is finite, and V(1)/2 is the
-    mean of chi (docs/theory.md). The multiplier of least mean is found by a convex program, or in closed form.
+    mean of chi (docs/theory.md). A convex program or a closed form gives the multiplier of least mean.
     """
     if loop.latency and loop.varying_delay:
-        line = (
-            "moving-average: no series is known for a latency and delays that switch together, ask for a spring-damper"
-        )
+        line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
         raise DesignFailed(None, (), line)
     started, channels = time.perf_counter(), []
     chi, unit = _late_chi if loop.latency else _switched_chi, (1.0,) * loop.channels
@@ -633,7 +631,7 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of |v|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), where v is the mean window, h half its range."""
+    """Return chi_k of |v|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), where v is the mean window and h = (hi - lo)/2."""
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
     window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)

@@ -198,7 +198,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
-        "P is not positive definite, or by so little that it is not proved"
+        "P is not positive definite, or too close to singular for a proof"
     )
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
     assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the model has 1 states"

@@ -725,7 +725,7 @@ def test_spring_dampers_before_walls_use_the_device():
 
 
 def test_designs_refuse_what_known_devices_exclude():
-    with pytest.raises(ValueError, match="not covered"):
+    with pytest.raises(ValueError, match="not cover"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
         design_coupling(PAIR, "spring-damper", "known-device")
@@ -1154,7 +1154,7 @@ def test_longest_period_alone_proves_no_known_device():
     """A declared T_max means that periods vary, even where it equals T: between ticks of 1 ms and 10 us hands grow."""
     loop = msgspec.structs.replace(KNOWN, T_max=KNOWN.T)
     refused = assess(loop, PUBLISHED["I"])
-    assert "need a shortest one, T_min" in refused.requirements["known-device"].shortfall
+    assert "T_min" in refused.requirements["known-device"].shortfall
     assert refused.guarantee is None
     assert not assess(
         msgspec.structs.replace(loop, known_devices=None), PUBLISHED["I"], condition="known-device"

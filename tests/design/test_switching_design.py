@@ -82,7 +82,7 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
 
 
 def test_any_environment_designs_refuse_varying_delays():
-    with pytest.raises(ValueError, match="this-environment condition only"):
+    with pytest.raises(ValueError, match="use this-environment"):
         design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
 
 
