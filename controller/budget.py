@@ -3,9 +3,9 @@
     EnergyBudget        before the delays, at the port of the devices
     Shell               at the port of the environment, behind a coupling that is certified for any environment
 
-*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0. Here a[k] is
-the force that acts in [kT, (k+1)T), of which the device feels -a[k], and dx[k] = x[k+1] - x[k]. With
-delta' = (1 - eps) delta the budget computes
+*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the
+energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), of which the device feels -a[k], and
+dx[k] = x[k+1] - x[k]. With delta' = (1 - eps) delta the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
@@ -22,10 +22,10 @@ R is the sum over future ticks. With constant delays the budget knows which forc
 it, and a tick without a report counts with its largest loss.
 
 *Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. By summation by parts, sum a'de is at most q/2
-times the total change of the acting force. |dx| is at least the measured |dx| minus q. So a tick with the
-measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel. The largest loss of the
-tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss. A constant force costs nothing if
-the encoder dithers.
+times the total change of the acting force. |dx| is at least the measured |dx| minus q. So a tick with the measured dx
+adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel, where a_- is the force of the
+previous tick. The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this
+loss. While the force is constant, an encoder that dithers costs no energy.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
 that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
@@ -52,7 +52,7 @@ _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 @dataclass(frozen=True, kw_only=True)
 class NetFigures:
-    """Counts of the ticks in which a net changed the force."""
+    """Counts of the ticks in which a passivity layer changed the force."""
 
     guarantee: str | None  # the guarantee in one line
     ticks: int
@@ -61,7 +61,7 @@ class NetFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ShellFigures(NetFigures):
-    """Figures of a net that computes an energy W."""
+    """Figures of a passivity layer with an energy account W."""
 
     start_J: float
     cap_J: float | None
@@ -81,7 +81,7 @@ class BudgetFigures(ShellFigures):
 
 
 class _Acting:
-    """Counts of a net's action in every simulation."""
+    """Counts, for every simulation, the ticks in which a passivity layer changes the force."""
 
     def __init__(self, nsim: int) -> None:
         self.ticks = 0
@@ -92,7 +92,7 @@ class _Acting:
         self.limited += np.asarray(acted)
 
     def figures(self, guarantee: str | None = None) -> NetFigures:
-        """Return the figures of the simulation in which the net acted most."""
+        """Return the counts of the simulation in which the layer acted most."""
         return NetFigures(guarantee=guarantee, ticks=self.ticks, limited_ticks=int(self.limited.max()))
 
 
@@ -168,8 +168,8 @@ class EnergyBudget(_Net):
 
         Args:
             delta: Damping (m,), or the matrix Delta_D (m, m), that the devices guarantee [N s/m]. A matrix is
-                diagonalised device by device, r(f) = T f' Delta^-1 f/4, and encoder errors are bounded in its principal
-                axes.
+                diagonalised device by device. Then r(f) = T f' Delta^-1 f/4, and encoder errors are bounded in the
+                principal axes.
             T: The largest period [s].
             packets: The ages of the forces that a tick uses.
             encoder_step: Steps (m,), or one for all, to which positions are rounded [m].
@@ -225,8 +225,8 @@ class EnergyBudget(_Net):
     def limit(self, wanted: ArrayLike, dx: ArrayLike, acted: ArrayLike | None = None) -> Array:
         """Return the force to send now (m, nsim) [N]: s times `wanted`, with one s in [0, 1] for all channels.
 
-        `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. By default
-        the latter is the sent force if the delays are constant, and unknown otherwise. The first call ignores both.
+        `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. Without
+        `acted` it is the sent force if delays are constant, and unknown otherwise. The first call ignores both.
         `wanted` must be clipped to forces that the device can apply. A force that is nan or larger than 1e12 N is sent
         as zero.
         """
@@ -289,7 +289,7 @@ class EnergyBudget(_Net):
 
         Each tick that the packet reaches then reserves max(M, s^2 r + s b), where M is its present reserve. The sum of
         the reserves is within the energy if and only if sum (s^2 r + s b) <= room + sum M for every set of these ticks.
-        Only sets of the ticks with the smallest s at which s^2 r + s b exceeds M need a check.
+        It is enough to check the first n ticks, for every n, in the order of the s at which s^2 r + s b exceeds M.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
         scale, now = np.ones_like(room), self._reserve[self._reached]  # (ticks that the packet reaches, nsim)
@@ -307,17 +307,18 @@ class EnergyBudget(_Net):
 class Shell(_Net):
     """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
-    W[k+1] = W[k] + f'(u - u_-), and f = s f_wanted with the largest s in [0, 1] for which W[k+1] >= 0. V
-    responds within the tick, u = u0 - D_V f, so that W[k+1] is a concave parabola in s, nonnegative at 0, and s is its
-    upper root. Then sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is
-    certified for any environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
+    W[k+1] = W[k] + f'(u - u_-), where u_- is u of the previous tick, and f = s f_wanted with the largest s in [0, 1]
+    for which W[k+1] >= 0. V responds within the tick, u = u0 - D_V f, so that W[k+1] is a concave parabola in s,
+    nonnegative at 0, and s is its upper root. Then sum f'(u - u_-) >= -W0 at every tick, so the environment is passive.
+    With a coupling that is certified for any environment and psi = 0 the loop is safe. A tick is a call of `free`, then
+    of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:
         """Raise ValueError if V is not square, or if its direct part is not passive."""
         super().__init__(start, np.inf, nsim)
         if V.inputs != V.outputs:
-            raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected as many")
+            raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected equal numbers")
         if np.linalg.eigvalsh((V.D + V.D.T) / 2).min() < -1e-12 * max(1e-300, float(np.abs(V.D).max())):
             raise ValueError(f"the coupling's direct part {V.D.tolist()} is not passive")
         self._V = V
@@ -341,7 +342,7 @@ class Shell(_Net):
         self._earn(rise)
 
     def charge(self, energy: float) -> None:
-        """Subtract an energy [J] >= 0 that reached the devices on another way than through the port."""
+        """Subtract an energy [J] >= 0 that reached the devices other than through the port."""
         self._earn(np.full_like(self.energy, -energy))
 
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:

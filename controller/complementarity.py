@@ -98,7 +98,7 @@ class BoxProblem(_Problem):
         _ = self.regular
 
     def solve(self, q: Array) -> tuple[Array, Array]:
-        """Return (v, f), both (n, nsim), for every column of q. A force at a limit is equal to it."""
+        """Return (v, f), both (n, nsim), for every column of q. Forces at a limit equal it exactly."""
         lower, upper = self.lower[:, None], self.upper[:, None]
         if self._separate:
             f = np.minimum(np.maximum(q, lower), upper)
@@ -172,9 +172,9 @@ class BoxProblem(_Problem):
     def _pivoted(self, q: Array) -> Array:
         """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
 
-        Changing only the first wrong sign ends for every P-matrix M. Index n changes only if all others are right for
-        its present sign. By uniqueness index n then has each of its three signs at most once. Between two changes of
-        index n the same holds for index n - 1, and so on.
+        Changing only the first wrong sign terminates for every P-matrix M: index n changes only when all others are
+        right for its present sign, so that, by uniqueness, it has each of its three signs at most once. Between two of
+        its changes the same holds for index n - 1, and so on.
         """
         n, k = q.shape
         M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
@@ -280,7 +280,7 @@ _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its 
 
 
 class _BallBlock:
-    """Vectors whose slips act on each other's forces."""
+    """Vectors that M couples, so that they are solved for together."""
 
     def __init__(self, at: NDArray[np.intp], M: Array, limit: Array, balls: tuple[int, ...]) -> None:
         self.at, self.limit, self.balls = at, limit, balls

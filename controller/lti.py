@@ -67,7 +67,7 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so that they stay in the cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of blocks of a response, which fit into the cache
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
@@ -77,7 +77,7 @@ _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
-    """Return the work of a response for `spend`, within a factor of 2.5 (to 200 states, 8 inputs, 2000 points)."""
+    """Return the work of a response for `spend`, within a factor of 2.5 (up to 200 states, 8 inputs, 2000 points)."""
     return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
 
@@ -330,8 +330,8 @@ class Lti(ReadOnly):
     def _schur(self) -> tuple[Complex, Complex]:
         """The Schur form A = U S U* of the core states, with S upper triangular.
 
-        If A is block lower triangular, as that of delay lines and of chains of sections, each diagonal block has a
-        Schur form of its own, and S keeps the zeros of A. Its blocks are in reverse order.
+        If A is block lower triangular, as for delay lines and chains of sections, each diagonal block gets its own
+        Schur form, and S keeps the zeros of A. The blocks of S are in reverse order.
         """
         import scipy
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 # called device_i/motor, and so on. The scenario gives the parameters. The scene's XML contains shapes that are only
 # drawn; the simulated model does not.
 #
-# The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
+# The last link of a human ends on ground, or on the body of a person who holds several devices.
 # Gravity, contacts and constraints are off, except for the Coulomb friction of devices. The inputs are MuJoCo
 # actuators: first the external forces (voluntary motion and taps), then one motor per device with gear -1, because the
 # device feels -f.
@@ -61,12 +61,12 @@ _Array = NDArray[np.floating[Any]]
 #: defaults it stops within 7e-5 m and creeps at 6e-4 m/s.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
-APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one device, and above the rail
+APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies
 DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
-_EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
+_EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # left by attached files
 _FORCE = "/force"  # part of the names of the motors' actuators
-#: Custom numbers whose names start so describe an impedance: the joint of the handle, the joint of the base (-1: none),
+#: Custom numbers with this prefix describe an impedance: the joint of the handle, the joint of the base (-1: none),
 #: then the rows of [[A, B], [C, D]].
 _IMPEDANCE = "impedance_"
 
@@ -324,7 +324,7 @@ class _Placed(NamedTuple):
 
     @property
     def handles(self) -> int:
-        """Number of joints of the handles: the first ones."""
+        """Number of joints that belong to handles; they come first."""
         return self.port.handles * self.port.axes
 
 
@@ -388,7 +388,7 @@ _Drawn = tuple[tuple[Mechanics, ...], ...]
 
 
 def _mechanics(device: Device, drawn: Sequence[Mechanics]) -> tuple[dict[str, Any], tuple[Any, Any] | None]:
-    """Return bodies and transmission of a device, as arrays over the sets if the mechanics are drawn."""
+    """Return bodies and transmission of a device, as arrays over the sets if the mechanics are random."""
     if not drawn:
         return dict(device.bodies), device.transmission
     rows = [(d.motor_mass, d.handle_mass, d.transmission_damping, d.transmission_stiffness) for d in drawn]
@@ -438,7 +438,7 @@ def _per_channel(device: Device, name: str) -> list[float]:
 
 
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed], drawn: bool = True) -> Scene:
-    """Compile the scene; without `drawn` its MJCF is empty, which saves half of the time."""
+    """Compile the scene. Without `drawn` its `xml` is empty, which saves half of the time."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -693,7 +693,7 @@ def _link(row: _Array, axes: int) -> Link:
     return Link(float(row[0]), tuple(map(tuple, damping)), tuple(map(tuple, stiffness)))
 
 
-MIXED = 0  # a number of links: half of the humans have one link and half have two
+MIXED = 0  # value of `links`: each human has one link or two, with equal probability
 
 
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
@@ -813,7 +813,7 @@ class Variants:
         return 2 * self.scene.model.nv + sum(z.order for _, z in self.impedances)
 
     def repeated(self, times: int) -> Variants:
-        """Return a copy in which every set of humans stands `times` times in succession."""
+        """Return a copy that repeats every set of humans `times` times in succession."""
         return self.taken(np.repeat(np.arange(len(self)), times))
 
     def taken(self, sets: NDArray[np.intp]) -> Variants:

@@ -28,7 +28,7 @@ from haptic_loop.sim.trace import Trace
 #: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s] below this growth rate the errors of engines may change its sign
-_JUDGED = 4.0, 20.0, 100.0  # [s] durations that are tried until the sign of a varying loop's growth counts
+_JUDGED = 4.0, 20.0, 100.0  # [s] durations, tried in turn until the sign of a varying loop's growth is certain
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
 _SHORTEST_TRACE = 200  # ticks that a growth rate needs
 SETTLED = 10.0  # time constants before which fast decaying modes may still hide a slow growing one
@@ -254,7 +254,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # The rounding error of y is relative to the terms that cancel in y, and to the error of the eigenvector.
+    # The error of y is proportional to the terms that cancel in y, and to the error of the eigenvector.
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -369,7 +369,7 @@ def _not_decidable(growth: float, exact: float, seconds: float) -> str:
     longer = _DECAY_TIMES / abs(exact)
     return (
         f"not decidable in {seconds:g} s: the trace's fit is {growth:+.3g} 1/s, the eigenvalue's {exact:+.3g} 1/s; "
-        f"the verdict is the eigenvalues', a trace of {longer:.3g} s would tell"
+        f"the verdict is that of the eigenvalues; a trace of {longer:.3g} s would decide"
     )
 
 
@@ -446,7 +446,7 @@ class _LateBalance(Balance):
     """The energy of each tick if forces latch within the tick, so that each period has two parts."""
 
     before: Array  # (m, 1) [N/m] delta/t2, for the part before the latch; `damping` is delta/(T_max - t1)
-    seen: Array  # (nsim, m, entries) of models.hold.at_the_latch: positions at the latch
+    seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
         x, s, f = buffer.x[: count + 1], buffer.s[:count], buffer.f[:count]

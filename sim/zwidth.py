@@ -103,7 +103,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def usual_scale(self) -> str:
-        """Linear against a rigid wall; logarithmic in environments, in which far stiffer couplings can be safe."""
+        """Linear against a rigid wall, else logarithmic, because far stiffer couplings can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
@@ -124,8 +124,8 @@ class CouplingSweep(_Sweep):
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """Return F of every coupling, a stack for each frozen contact state, with all walls touching first.
 
-        A device without contact to a rigid wall is safe, so that only states with contact are tested. Random hands meet
-        the frozen states; certificates cover walls that make and break contact.
+        A device without contact to a rigid wall is safe, so that only states with contact are tested. Random hands are
+        tested in each frozen state; certificates cover walls that make and break contact.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
@@ -136,7 +136,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,); inf if no damping is enough. Walls make and break contact."""
+        """Return required over available damping (n,); inf if no damping is enough. Contact may change."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -366,11 +366,11 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
 
 
 # ----------------------------------------------------------------------------------------------------
-# The map: both certificates and the population over the whole grid, MuJoCo at a sparse part of it.
+# The map: conditions and population in every cell, MuJoCo in a few cells.
 
 
 _SLICE = 60  # cells in one pass of a condition; with walls one
-_SAMPLE = 25  # cells that decide which humans are the leading ones
+_SAMPLE = 25  # cells that decide which humans lead, that is, are tried first
 
 
 @dataclass(frozen=True, eq=False)
