@@ -83,14 +83,14 @@ def _parser() -> options.Parser:
     parser.add_coupling(", ".join(NAMES))
     parser.add_energy_budget()
     add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
-    steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
+    steppers = "integrator of MuJoCo (default exponential, RK4 with friction)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: as many as the plant's fastest motion needs)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
     error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
-    check = "run RK4 beside the exponential engine, with which it shares no matrix"
+    check = "also run RK4, which shares no matrix with the exponential engine"
     add("--cross-check", action="store_true", help=check)
     parser.add_human()
     parser.add_band()
@@ -278,7 +278,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
         "CPU s": "{r.cpu_s:.3f}",
         "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # below the clock's resolution
     }
-    title = "speed against error on this scene (*: the cheapest that keeps --error, this run)"
+    title = "speed against error on this scene (*: this run, the cheapest within --error)"
     return render.columns(title, cells, engines)
 
 

@@ -37,8 +37,8 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] a rehearsal that has not ended this long after its run is stopped
-_SHOWN_US = 100_000  # [us] of virtual time between two moves of a rehearsal's progress bar
+_SPARE = 600.0  # [s] time after its run until a rehearsal that has not ended is stopped
+_SHOWN_US = 100_000  # [us] virtual time between two updates of a rehearsal's progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 
 
@@ -49,7 +49,7 @@ def add_link_options(parser: options.Parser) -> None:
     port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
     port += f"{FORCE_DIMENSION}[:0x,1x], devices and axes"
     add("--port", metavar="PATH", help=port)
-    virtual = "the whole session in virtual time with an emulated device: no port, no waiting, the same everywhere"
+    virtual = "the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
     fault = (
         "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; the prefix up: or down: means "
@@ -78,7 +78,7 @@ def add_link_options(parser: options.Parser) -> None:
 def add_safety_options(parser: options.Parser) -> None:
     """Add limits of force and speed, and the switch that the user has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
-    cap = "largest force, of rotary devices at the radius of the hand (default 2, for first sessions)"
+    cap = "largest force (default 2, for first sessions); of a rotary device, at the radius of the hand"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
     speed = "fastest motion of a hand while forces act (default 1, or the least credible_speed of the devices)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
@@ -92,7 +92,7 @@ def add_safety_options(parser: options.Parser) -> None:
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
     add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
-    add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+    add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
     parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
@@ -271,7 +271,7 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
     if host_clocked(args):
         adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
         if not adapter.guarded:
-            console(args).print("the device has no watchdog of its own: were this program killed, its force would stay")
+            console(args).print("the device has no watchdog: if this program is killed, the last force stays on")
         if adapter.unused_axes and not args.clamped:
             _ask_for_clamp("; ".join(adapter.unused_axes))
         return adapter
