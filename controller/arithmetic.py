@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -129,8 +130,12 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return a controller of the BLAS libraries of NumPy and of SciPy, which is loaded here."""
-    import scipy.linalg  # noqa: F401
+    """Return a controller of the BLAS libraries of NumPy and of SciPy.
+
+    SciPy is loaded here, unless its library will have one thread anyway because of the environment.
+    """
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()
 

@@ -333,19 +333,16 @@ class Lti(ReadOnly):
         If A is block lower triangular, as for delay lines and chains of sections, each diagonal block gets its own
         Schur form, and S keeps the zeros of A. The blocks of S are in reverse order.
         """
-        import scipy
-
         core = self._lines[0]
         A, n = self.A[np.ix_(core, core)], core.size
         last = np.maximum.accumulate(np.where((A != 0) | np.eye(n, dtype=bool), np.arange(n), 0).max(axis=1))
         ends = 1 + np.flatnonzero(last == np.arange(n))
-        if ends.size == 1:
-            S, U, *_ = scipy.linalg.schur(A, output="complex")
-            return S, U
+        if ends.size == 1 < n:
+            return _schur_form(A)
         U = np.zeros((n, n), dtype=np.complex128)
         for first, end in pairwise([0, *ends.tolist()]):
             own = A[first:end, first:end]
-            U[first:end, n - end : n - first] = 1 if end - first == 1 else scipy.linalg.schur(own, output="complex")[1]
+            U[first:end, n - end : n - first] = 1 if end - first == 1 else _schur_form(own)[1]
         return np.triu(U.conj().T @ A @ U), U
 
     def dc(self) -> Array:
@@ -474,6 +471,13 @@ class Lti(ReadOnly):
         D = inverse(self.D)
         B, C = times(self.B, D), times(D, self.C)
         return Lti(self.A - times(B, self.C), B, -C, D, self.T)
+
+
+def _schur_form(A: Array) -> tuple[Complex, Complex]:
+    import scipy  # slow to load
+
+    S, U, *_ = scipy.linalg.schur(A, output="complex")
+    return S, U
 
 
 def _is_lower(A: Array) -> bool:
