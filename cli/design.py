@@ -19,7 +19,7 @@ from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_con
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
+from haptic_loop.design.program import OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
 from haptic_loop.design.robustness import Robustness, ranges_around, robustness_nearby
 from haptic_loop.design.transparency import BAND_HZ
@@ -244,25 +244,34 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
         )
 
 
-def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
-    from haptic_loop.design import coverage
+def _bound_and_robustness(
+    args: argparse.Namespace, loop: Loop, design: Design, file: str
+) -> tuple[BoundBeside | None, Robustness | None, bool]:
+    """Return the bound of an optimal coupling, the robustness, and whether Ctrl-C left out one of them."""
     from haptic_loop.design.bound import BoundBeside
     from haptic_loop.design.optimal import Optimal
 
-    band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
+    limit, note = None, f"{file} is stored (Ctrl-C leaves out what follows)"
+    try:
+        if isinstance(design, Optimal):
+            with render.progress(f"{note}: working out the bound"):
+                band, chosen = args.band_hz or BAND_HZ, Options(**_options_of(args, "optimal"))
+                limit = BoundBeside.of(loop, design, design.figures.rms_mismatch_db, band, chosen)
+        with render.progress(f"{note}: working out robustness"):
+            return limit, robustness_nearby(loop, design.coupling, named(design.asked)), False
+    except KeyboardInterrupt:
+        return limit, None, True
+
+
+def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
+    """Return the report on a stored design, with its bound and its robustness."""
+    from haptic_loop.design import coverage
+    from haptic_loop.design.optimal import Optimal
+
+    best = design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.SwitchingFigures.of(loop, design.coupling, known) if loop.varying_delay else None
-    chosen_options = Options(**_options_of(args, "optimal")) if best else DEFAULT
-    nearby, limit, interrupted = None, None, False
-    note = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
-    try:
-        if best:
-            with render.progress(f"{note}: working out the bound"):
-                limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, chosen_options)
-        with render.progress(f"{note}: working out robustness"):
-            nearby = robustness_nearby(loop, design.coupling, named(design.asked))
-    except KeyboardInterrupt:
-        interrupted = True
+    limit, nearby, interrupted = _bound_and_robustness(args, loop, design, str(stored.file))
     nominal = None
     if kind_of(args.coupling).model:
         nominal = partial(design_by_kind, kind=args.coupling, **_options_of(args, args.coupling))

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -296,6 +296,37 @@ def _varying(
     return switching, timing
 
 
+class _Tests(NamedTuple):
+    """Parts of a report that each say whether a claim holds, under the names that they have in it."""
+
+    own_humans: _Own
+    energy_audit: verdicts.EnergyAudit | None
+    switching: verdicts.Growing[VaryingDelays] | None
+    timing: verdicts.Growing[UnevenTicks] | None
+    adversary: verdicts.Attacked | None
+    adversary_population: verdicts.Attacked | None
+
+
+def _tested(
+    args: argparse.Namespace,
+    chosen: Chosen,
+    assessment: Assessment,
+    question: Validation,
+    findings: Findings,
+    searched: _Searched,
+    certified: bool,
+) -> _Tests:
+    """Return the tests besides the growth with random humans."""
+    mode = worst_mode(assemble(question.scenario, chosen.coupling))
+    own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
+    plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
+    # W counts delta dx^2/T, and a proof for known devices does not bound this sum.
+    energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
+    switching, timing = _varying(question, chosen, assessment, findings, certified)
+    worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
+    return _Tests(own, energy, switching, timing, worst, drawn)
+
+
 def _reported(
     args: argparse.Namespace,
     chosen: Chosen,
@@ -311,15 +342,8 @@ def _reported(
     certified = guarantee is not None
     if question.environments:  # The humans meet environments of the ranges.
         certified = guarantee is not None and guarantee.environments in (ANY, RANGES)
-    mode = worst_mode(assemble(scenario, chosen.coupling))
-    own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
-    plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
-    # W counts delta dx^2/T, and a proof for known devices does not bound this sum.
-    energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
-    switching, timing = _varying(question, chosen, assessment, findings, certified)
-    worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
-    also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
-    also = also and not chosen.fails(assessment.requirements)
+    tests = _tested(args, chosen, assessment, question, findings, searched, certified)
+    also = all(test.holds for test in tests if test) and not chosen.fails(assessment.requirements)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
@@ -340,16 +364,11 @@ def _reported(
         disagreement_words=verdicts.disagreement_words(findings, engine_name(question.engine)),
         disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
         worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,
-        own_humans=own,
+        **tests._asdict(),
         largest_difference_per_s=verdicts.largest(np.abs(findings.mujoco - findings.exact)),
         traces=traces,
         assessment=assessment,
         settled=traces and traces.settled(),
-        energy_audit=energy,
-        switching=switching,
-        timing=timing,
-        adversary=worst,
-        adversary_population=drawn,
         certified=certified,
         holds=also and not disagreements and not (certified and wrong.any()) if any_done else None,
         reason=None if any_done else _NOTHING,

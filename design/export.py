@@ -333,7 +333,7 @@ def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
 
 
 def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Solve f = q - M e for (e, f) by the operations of the C file, in their order and in the precision of q."""
+    """Solve f = q - M e for (e, f) line by line as the C function of _BALLS_DEFINED, in the precision of q."""
     at, first, last, ends, M, resolvent, tau, limit = problem
     m, real = len(q), type(q[0])
     zero, one, two = real(0), real(1), real(2)
@@ -351,7 +351,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             u[i] = asked[i]
         for _ in range(_MOST_STEPS):
             size, worst = zero, zero
-            for i in rows:
+            for i in rows:  # g is u within the limits, and v the rest over tau
                 square = zero
                 for k in range(first[i], last[i]):
                     square += u[k] * u[k]
@@ -361,7 +361,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
                     share[i], normal[i] = limit[i] / length, u[i] / length
                     g[i] = share[i] * u[i]
                 v[i] = (u[i] - g[i]) / tau[i]
-            for i in rows:
+            for i in rows:  # residual r
                 terms = abs(g[i]) + abs(asked[i])
                 r[i] = g[i] - asked[i]
                 for j in rows:
@@ -373,14 +373,14 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             if worst <= one:
                 solved = True
                 break
-            if tried and two * worst > best:
+            if tried and two * worst > best:  # Newton's step is replaced by the other one.
                 for i in rows:
                     u[i] = back[i]
                 tried = False
                 continue
             if tried or best == zero:
                 best = worst
-            for i in rows:
+            for i in rows:  # `back` is the step of Douglas and Rachford, and `a` holds the equations of Newton's step.
                 x[i] = asked[i]
                 for j in rows:
                     x[i] += M[i][j] * ((two * g[j] - u[j]) / tau[j])

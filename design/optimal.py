@@ -123,42 +123,9 @@ def design(
     search = _Search.of(loop, options)
     if exactly := search.nothing():
         return exactly
-    best: Optimal | None = None
-    better: list[Optimal] = []  # successive best results
-    results: list[_BasisResult] = []
-    hurried, floor, gained = False, _felt(min(search.simple, 1.0)), np.inf
-    for taps, poles in options.bases:
-        if taps > _LARGE and gained < _PROMISING_DB:
-            break
-        if results and not search.room(taps, poles, max((r.states for r in results if r.reason is None), default=0)):
-            continue
-        try:
-            with within(search.left if results else np.inf, "a larger basis", clock=search.over if results else None):
-                least = _SETTLED_DB if taps > _LARGE else -np.inf
-                candidate, result = search.over_basis(taps, poles, best, floor, least)
-        except TooLong:
-            hurried = search.over()
-            break
-        gained = np.inf if result.reason else search.gained(best, candidate)
-        if best and candidate.g < floor and result.certified:
-            result = replace(
-                result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another's"
-            )
-        elif gained <= 0 or result.reason == _SETTLED:
-            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
-        results.append(result)
-        progress(result)
-        settled = result.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[search.simply])
-        if result.taken:
-            best, floor = candidate, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * candidate.g))
-            better.append(candidate)
-        hurried = not settled and search.over()
-        hopeless = len(results) >= budgets.UNPROVED_BASES and not any(
-            each.certified for each in results[-budgets.UNPROVED_BASES :]
-        )
-        if settled or hurried or (hopeless and not loop.ranges):
-            break
-    proved_last = better[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
+    improving, results, hurried = _over_bases(search, progress)
+    best = improving[-1] if improving else None
+    proved_last = improving[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
     for candidate in proved_last:
         best = search.between(candidate) if loop.ranges else search.proved_or_smaller(candidate)
         hurried |= best.searched is not None and best.searched.ended and search.over()
@@ -168,6 +135,48 @@ def design(
         rivals = [one for one in (best, search.scaled(), search.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, search.merit(one)))
     return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
+
+
+def _over_bases(
+    search: _Search, progress: Callable[[_BasisResult], None]
+) -> tuple[list[Optimal], list[_BasisResult], bool]:
+    """Return the successive best couplings, the result of each basis, and whether --seconds ended the search."""
+    improving: list[Optimal] = []
+    results: list[_BasisResult] = []
+    floor, gained = _felt(min(search.simple, 1.0)), np.inf
+    for taps, poles in search.options.bases:
+        if taps > _LARGE and gained < _PROMISING_DB:
+            break
+        if results and not search.room(taps, poles, max((r.states for r in results if r.reason is None), default=0)):
+            continue
+        best = improving[-1] if improving else None
+        try:
+            with within(search.left if results else np.inf, "a larger basis", clock=search.over if results else None):
+                least = _SETTLED_DB if taps > _LARGE else -np.inf
+                candidate, result = search.over_basis(taps, poles, best, floor, least)
+        except TooLong:
+            return improving, results, search.over()
+        gained = np.inf if result.reason else search.gained(best, candidate)
+        if best and candidate.g < floor and result.certified:
+            result = replace(
+                result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another's"
+            )
+        elif gained <= 0 or result.reason == _SETTLED:
+            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
+        results.append(result)
+        progress(result)
+        if result.taken:
+            floor = max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * candidate.g))
+            improving.append(candidate)
+        if result.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[search.simply]):
+            break
+        if search.over():
+            return improving, results, True
+        last = results[-budgets.UNPROVED_BASES :]
+        hopeless = len(last) == budgets.UNPROVED_BASES and not any(each.certified for each in last)
+        if hopeless and not search.loop.ranges:
+            break
+    return improving, results, False
 
 
 # Tried betas, as shares of the largest one. All channels have the same share, on which the mismatch hardly depends.

@@ -205,30 +205,16 @@ def draw_run(
             its prediction replace the zoom of the displacements.
         around: Names of the curves, and walls.
     """
-    last, growth = result.t.size, onset.growth if onset else None
-    around = around or Contacts(result.names)
-    if onset and onset.until is not None:
-        last = int(np.searchsorted(result.t, onset.until))
-    if onset and growth is not None:
-        last = min(last, onset.steady)
-    near = _sharpest(result, frequency_hz, last if last > 1 else result.t.size)
-    zoomed = growth is not None or _stands_out(result, near, last)
+    growth, around = onset.growth if onset else None, around or Contacts(result.names)
+    parts = _shown_parts(result, frequency_hz, onset)
+    zoomed = len(parts) > 1
     shape: dict[str, Any] = {"width_ratios": (2, 1)} if zoomed else {}
-    figure, axes = _panels(title, 2, 1 + zoomed, (11, 6.4), sharex=False if growth is not None else "col", **shape)
+    figure, axes = _panels(title, 2, len(parts), (11, 6.4), sharex=False if growth is not None else "col", **shape)
     if growth is not None:
         axes[0, 0].sharex(axes[1, 0])
-    parts = (slice(None), near)[: 1 + zoomed]
     _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts, around)
     _draw_walls(axes[:, 0], result, around)
-    two, alike = _two_points(result), _coinciding(result.f, around)
-    # Calm curves are drawn last, so that agitated ones do not hide them.
-    for axis, part, width in zip(axes[1], parts, (0.9, 1.4), strict=False):
-        for i in _calmest_last(result.f):
-            style = STYLES[i % len(STYLES)]
-            label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
-            axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
-    axes[0, 0].set_ylabel("displacement [mm]" if two else _one_point(result))
-    axes[1, 0].set_ylabel("force fed back [N]")
+    _draw_forces(axes[1], result, parts, around)
     if ideal:
         _draw_ideal(axes[1], result, ideal, parts)
     if onset and onset.until is not None:
@@ -244,6 +230,17 @@ def draw_run(
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
     return figure
+
+
+def _shown_parts(result: Run, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
+    """Return the whole run, and the part of the zoom if the loop grows or the forces stand out in this part."""
+    last, grows = result.t.size, onset is not None and onset.growth is not None
+    if onset and onset.until is not None:
+        last = int(np.searchsorted(result.t, onset.until))
+    if onset and grows:
+        last = min(last, onset.steady)
+    near = _sharpest(result, frequency_hz, last if last > 1 else result.t.size)
+    return (slice(None), near) if grows or _stands_out(result, near, last) else (slice(None),)
 
 
 def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
@@ -329,6 +326,18 @@ def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], arou
                 style = STYLES[i % len(STYLES)]
                 label, handle = f"{around.name(i)}, handle (thick)", 1e3 * result.x_handle[part, i]
                 axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
+    axes[0].set_ylabel("displacement [mm]" if two else _one_point(result))
+
+
+def _draw_forces(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
+    """Draw the forces; calm curves are drawn last, so that agitated ones do not hide them."""
+    two, alike = _two_points(result), _coinciding(result.f, around)
+    for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
+        for i in _calmest_last(result.f):
+            style = STYLES[i % len(STYLES)]
+            label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
+            axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
+    axes[0].set_ylabel("force fed back [N]")
 
 
 def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:

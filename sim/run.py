@@ -195,14 +195,9 @@ def run(
 
     def keep(buffer: StepBuffer, first: int, count: int) -> bool:
         nonlocal diverged, net, done
-        net, rows = buffer.net, buffer.rows[:count]
-        diverged = engine.troubled()
-        if not np.isfinite(rows.sum()):  # Checking the sum first is faster than checking every row.
-            finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
-            diverged |= not finite.all()
-            count = count if finite.all() else int(np.argmin(finite))
-        done = first + count
-        record[first:done] = rows[:count, :, 0]
+        finite = _finite_ticks(buffer, count)
+        net, diverged, done = buffer.net, engine.troubled() or finite < count, first + finite
+        record[first:done] = buffer.rows[:finite, :, 0]
         progress(done, ticks)
         return diverged
 
@@ -210,10 +205,9 @@ def run(
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
     except KeyboardInterrupt:  # The finished ticks are kept.
         interrupted = True
+    record.setflags(write=False)
     n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
-    for part in (record, z, s, w, f):
-        part.setflags(write=False)
     return Trace(
         t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
@@ -228,6 +222,14 @@ def run(
         net=net,
         names=scenario.channel_names,
     )
+
+
+def _finite_ticks(buffer: StepBuffer, count: int) -> int:
+    """Return the number of ticks before the first one whose state or force is not finite, at most `count`."""
+    if np.isfinite(buffer.rows[:count].sum()):  # Checking the sum first is faster than checking every row.
+        return count
+    finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
+    return count if finite.all() else int(np.argmin(finite))
 
 
 def _columns(rows: Array, which: tuple[int, ...]) -> Array:
