@@ -669,7 +669,7 @@ class Crowd:
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """The persons with several devices: their channels, and their port with a leading axis over the sets."""
+        """For each person with several devices: the devices, and the port with a leading axis over the sets."""
         return tuple((holds, Port.body(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
 
     def humans(self, i: int) -> tuple[Human, ...]:
@@ -784,7 +784,7 @@ class HumanSets:
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """The persons with several devices: their channels, and their port with a leading axis over the sets."""
+        """For each person with several devices: the devices, and the port with a leading axis over the sets."""
         return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
 
     def humans(self, i: int) -> tuple[Hand, ...]:
