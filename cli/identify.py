@@ -46,22 +46,6 @@ from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
 from haptic_loop.models.device import Device, RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
 
-_LIMITS = (
-    "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "
-    "between parts of a record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale; of all "
-    "sittings the least. It does not see friction that changes with temperature or wear, nor that of a handle behind "
-    "its transmission apart from the motor's. What may be a dashpot behind a spring with 2 ms of memory or more is "
-    "not in delta, for it damps nothing at high frequency; a shorter memory counts as damping. A hand that rests on "
-    "the handle springs it: refused from 5 newtons per metre on. One that only damps is not in the bound if nobody "
-    "touched the handle in one of the sittings. Dry friction is left out of delta: it dissipates too, but ever less "
-    "than a viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay. The bound "
-    "holds up to the speed of the records; hw.bridge stops a handle there."
-)
-_TRANSMISSION_LIMITS = (
-    "The bounds of motor and transmission (95 %, and 0.5 % for the encoder's scale) describe a spring and a damper in "
-    "parallel at these forces. They say nothing of a part on the motor's side that resonates above 250 Hz, of an "
-    "encoder that is not on the motor's shaft, or of a transmission that was tightened or warmed since."
-)
 _LEVELS = 1.0, 0.5  # shares of the force in the sittings with clamped handles; play shows as a difference
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 
@@ -89,17 +73,22 @@ class _Report:
     bounded: bool = off_table()
     warnings: list[str] = off_table()
     reason: str | None = off_table("if given")
-    limits: str = off_table(default=_LIMITS)
     transmissions: list[TransmissionBounds] | None = off_table("if given", None)  # of every axis, by --transmission
     no_transmissions: str | None = off_table("if given", None)  # why there are none, where they were requested
 
+    @property
+    def verdict(self) -> str:
+        """The bounds of all axes, or why there are none, in one line."""
+        if not self.bounded:
+            return f"No bound of the damping: {self.reason or 'see the warnings'}."
+        speed = math.floor(1e2 * min(axis.viscosity.speed for axis in self.axes)) / 1e2
+        bounds = ", ".join(f"{_floored(axis.delta, 4)} N s/m on axis {i}" for i, axis in enumerate(self.axes, start=1))
+        return f"By these records the damping is at least {bounds}, up to {speed:.2f} m/s."
+
     def lines(self) -> list[str]:
         """Return the lines below the table."""
-        reason = [f"no bound: {self.reason}"] if self.reason else []
-        if self.no_transmissions:
-            reason.append(f"no bounds of motor and transmission: {self.no_transmissions}")
-        more = [_TRANSMISSION_LIMITS] if self.transmissions else []
-        return [*reason, *(f"[yellow]{warning}[/]" for warning in self.warnings), self.limits, *more]
+        refused = [f"no bounds of motor and transmission: {self.no_transmissions}"] if self.no_transmissions else []
+        return [*refused, *(f"[yellow]{warning}[/]" for warning in self.warnings)]
 
 
 def main(argv: list[str]) -> int:
@@ -132,7 +121,7 @@ def main(argv: list[str]) -> int:
             tables.append(_table(device, report.axes[own], report.transmissions and report.transmissions[own]))
         files.append(write(out / "devices.toml", "\n".join(tables)))
     shown = [_figures(report), *([_bounds(report.transmissions)] if report.transmissions else [])]
-    render.publish(args, report, shown, report.lines(), out, files)
+    render.publish(args, report, shown, report.lines(), out, files, report.verdict)
     right = report.bounded and not report.no_transmissions
     return options.exit_code(right, bool([*sittings, *clamped][-1].signals))
 
