@@ -336,7 +336,7 @@ def _show(session: Session) -> None:
     """Overwrite the status line, unless the terminal would block."""
     words, drive, counters = [str(session.stage)], session.drive, session.counters
     if session.stage == Stage.MEASURING:
-        words.append(f"{len(session.measurement.ages)} of {session.settings.measure} answers")
+        words.append(f"{len(session.measurement.result.values)} of {session.settings.measure} answers")
     elif session.stage == Stage.MEASURED:
         words.append("designing the coupling")
     elif drive and drive.x:

@@ -12,6 +12,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import sub
@@ -277,7 +278,7 @@ class Drive:
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
         expected: monitor.Expected,
-        still: Sequence[int] | None = None,
+        still: Sequence[int],
     ) -> None:
         """Take `still` (m,) [counts], the encoders' noise, and `expected`, which predicts motions in its test."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
@@ -289,12 +290,10 @@ class Drive:
         self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
-        about = limits.cap, T, units, expected, still, config.theta == 0, limits.lever
-        self._test = monitor.EncoderTest(*about) if settings.test_encoders else None
-        self._last_test = monitor.EncoderTest(*about, alive=True) if settings.test_encoders else None
-        self._encoders = monitor.EncoderMonitor(
-            units.encoder_step, units.force_step, T, still, limits.lever, limits.cap
-        )
+        about = limits, T, units, still
+        tests = [monitor.EncoderTest(*about, expected, config.theta == 0, alive) for alive in (False, True)]
+        self._test, self._last_test = tests if settings.test_encoders else (None, None)
+        self.encoders = monitor.EncoderMonitor(*about)
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
@@ -305,11 +304,6 @@ class Drive:
         self._test_plan = arming.test_plan
         self._commands = None if settings.behind else monitor.CommandMonitor(config)  # each board has its own
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
-
-    @property
-    def dead(self) -> str | None:
-        """A message about an axis that stands still although a force has acted on it for long, or None."""
-        return self._encoders.dead
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
         """Return the force [steps] for `state`, which came at `now` [us], `ticks` ticks after the previous STATE.
@@ -328,7 +322,7 @@ class Drive:
         self._check_motion(x, ticks)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
-        self._encoders.check(state.counts, state.applied, ticks)
+        self.encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
         if ticks > 1 and self.x is not None:
@@ -568,28 +562,24 @@ def certified_couplings(
     condition: str | Condition | None,
     link: int,
     spare: int = 2,
-    limiter: bool | None = None,
-    start: float = START_J,
-    behind: tuple[int, ...] = (),
+    **more: Any,
 ) -> tuple[CertifiedCoupling, ...]:
     """Return the coupling for the measured delay and up to `spare` reserves, each certified for one tick more.
+
+    `more` are the other arguments of `certified_coupling`.
 
     A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on none.
     It needs less damping than the previous coupling would need with these delays. It has the same kind or file; where
     that is not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is
     certified, the list ends. Raises SafetyStop where the first coupling is not certified.
     """
-    more: dict[str, Any] = {"limiter": limiter, "start": start, "behind": behind}
     candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(candidates) <= spare and wanted:
-        kind, by = wanted[0]
-        try:
-            reserve = certified_coupling(scenario, case, kind, by, candidates[-1].link + 1, **more)
-        except (SafetyStop, InputError):
-            wanted.pop(0)
-            continue
-        if _softer(reserve, candidates[-1]):
+        reserve = None
+        with suppress(SafetyStop, InputError):
+            reserve = certified_coupling(scenario, case, *wanted[0], candidates[-1].link + 1, **more)
+        if reserve and _softer(reserve, candidates[-1]):
             candidates.append(reserve)
         else:
             wanted.pop(0)

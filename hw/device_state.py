@@ -54,7 +54,11 @@ class Device:
             if not at_once or (frame is None and self.phase != wire.Phase.DISARMED):
                 self.take(frame)
         if self.phase == wire.Phase.RAMP:
-            self._ramp_down()
+            assert self.config is not None
+            self.ramp_left -= 1
+            self.applied = tuple(_scaled(f, self.ramp_left, self.config.ramp) for f in self.ramp_from)
+            if self.ramp_left == 0:
+                self.phase = wire.Phase.STOPPED
         return self.applied, self._speak(counts)
 
     def take(self, frame: wire.Force | None) -> None:
@@ -78,13 +82,6 @@ class Device:
             self.phase, self.held = wire.Phase.ARMED, 0
             self.run = min(self.run + 1, self.config.ramp_in)
             self.applied = self.config.limited(self.run, self.applied, frame.force)
-
-    def _ramp_down(self) -> None:
-        assert self.config is not None
-        self.ramp_left -= 1
-        self.applied = tuple(_scaled(f, self.ramp_left, self.config.ramp) for f in self.ramp_from)
-        if self.ramp_left == 0:
-            self.phase = wire.Phase.STOPPED
 
     def halt(self, cause: wire.Cause) -> None:
         """Go to zero force, by a ramp while armed and otherwise at once. The first cause stays."""
@@ -120,21 +117,18 @@ class Device:
     def receive(self, data: bytes, now_us: int) -> None:
         """Process bytes that came at `now_us`, in pieces of any length."""
         for message in self.decoder.feed(data):
-            self._understand(message, now_us)
-
-    def _understand(self, message: wire.Message, now_us: int) -> None:
-        if isinstance(message, wire.Force):
-            self.accept(message, now_us)
-        elif isinstance(message, wire.Config):
-            self.configure(message)
-        elif isinstance(message, wire.Hello):
-            self.asked = True
-        elif isinstance(message, wire.Stop) and message.reason == wire.Reason.ESTOP:
-            self.estop(wire.Cause.ESTOP_HOST)
-        elif isinstance(message, wire.Stop):
-            self.halt(wire.Cause.HOST)
-        else:
-            self.unexpected += 1
+            if isinstance(message, wire.Force):
+                self.accept(message, now_us)
+            elif isinstance(message, wire.Config):
+                self.configure(message)
+            elif isinstance(message, wire.Hello):
+                self.asked = True
+            elif isinstance(message, wire.Stop) and message.reason == wire.Reason.ESTOP:
+                self.estop(wire.Cause.ESTOP_HOST)
+            elif isinstance(message, wire.Stop):
+                self.halt(wire.Cause.HOST)
+            else:
+                self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
         """Store a force until its tick, if that tick is ahead, is theta after the answered one and has no force."""

@@ -111,18 +111,18 @@ class Driver:
 
     def _call(self, session: Session) -> None:
         answer: Any
+        understand: Callable[[Any, int], Said]
         try:
             if session.stage == Stage.CONNECTING:
-                if (answer := self.device.info()) is not None:
-                    self.do(session.met(answer, self.clock()))
+                answer, understand = self.device.info(), session.met
             elif session.stage == Stage.CONFIGURING:
                 assert session.config
-                if (answer := self.device.configure(session.config)) is not None:
-                    self.do(session.configured(answer, self.clock()))
+                answer, understand = self.device.configure(session.config), session.configured
             else:
                 force, self._force = self._force, None
-                if (answer := self.device.exchange(force)) is not None:
-                    self.do(session.take(answer, self.clock()))
+                answer, understand = self.device.exchange(force), session.take
+            if answer is not None:
+                self.do(understand(answer, self.clock()))
         except wire.SafetyStop as fault:
             self.do(session.end(Stage.STOPPED, str(fault), self.clock()))
 

@@ -205,17 +205,13 @@ class _EmulatedPlant:
         self.fastest = 0.0  # [m/s] highest speed of any motor so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
 
-    @property
-    def channels(self) -> int:
-        return self.scenario.channels
-
     def begin(self) -> None:
         """Let the scenario's outside forces (voluntary motion, tap) act from the next tick on."""
         self.tick = 0 if self.tick is None else self.tick
 
     def counts(self) -> tuple[int, ...]:
         """Return the counts of the encoders."""
-        return tuple(map(int, (self.s[: self.channels] / self.encoder_step).round().tolist()))
+        return tuple(map(int, (self.s[: self.scenario.channels] / self.encoder_step).round().tolist()))
 
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
         """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
@@ -224,7 +220,7 @@ class _EmulatedPlant:
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
-        f, m, n = np.minimum(np.maximum(f, -self._limit), self._limit), self.channels, self.scene.model.nq
+        f, m, n = np.minimum(np.maximum(f, -self._limit), self._limit), self.scenario.channels, self.scene.model.nq
         for _ in range(self._substeps):
             friction = self.coulomb * np.tanh(self.s[n : n + m] * self.scenario.lever / _SLIP) if self.coulomb else 0.0
             self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])

@@ -365,16 +365,9 @@ def friction(x: Array, force: Array, T: float, step: float) -> Friction:
         if fit is best:
             covariance = spread
     names = {"mass": _MASS, "viscous": _VISCOUS, "coulomb": _DRY, "stiffness": _SPRING}
-    p = best.p
+    places = names | {"constant": _CONSTANT, "drift": _SLOPE, "static": _STATIC, "drag": _DRAG}
     return Friction(
-        mass=float(p[_MASS]),
-        viscous=float(p[_VISCOUS]),
-        coulomb=float(p[_DRY]),
-        stiffness=float(p[_SPRING]),
-        constant=float(p[_CONSTANT]),
-        drift=float(p[_SLOPE]),
-        static=float(p[_STATIC]),
-        drag=float(p[_DRAG]),
+        **{name: float(best.p[i]) for name, i in places.items()},
         slip=slip,
         reach=reach,
         periods=tuple(pair.period for pair in periodic),

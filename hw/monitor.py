@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.hw.limits import Units
+from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Human, Link
@@ -205,7 +205,7 @@ class Measurement:
         elif margin is not None and tick in self._sent:
             self._answers.by_tick[tick] = self._answers.age(margin)
         ages, needed = self._answers.by_tick, self._needed if self._sent is None else -(-self._needed // 2)
-        everything, counted = len(ages) + self.missing, counted // (2 * self._apart - 1)
+        everything, counted = len(ages) + self._missing, counted // (2 * self._apart - 1)
         if everything < needed and counted < _STATES_PER_ANSWER * needed:
             return False
         part = 1 - len(ages) / max(1, everything if everything >= needed else counted)
@@ -228,12 +228,7 @@ class Measurement:
             self._missed -= margin < 0  # a missed answer that comes late is not missing
 
     @property
-    def ages(self) -> list[int]:
-        """Ages of the answers that arrived [us]."""
-        return list(self._answers.by_tick.values())
-
-    @property
-    def missing(self) -> int:
+    def _missing(self) -> int:
         """Number of answers that never came."""
         if self._sent is None:
             return max(0, self._missed)
@@ -242,7 +237,7 @@ class Measurement:
 
     @property
     def result(self) -> Ages:
-        return Ages(tuple(self.ages), self.missing, tuple(self._ticks))
+        return Ages(tuple(self._answers.by_tick.values()), self._missing, tuple(self._ticks))
 
     def _check_clock(self, state: State) -> None:
         assert self._first is not None
@@ -492,18 +487,15 @@ class EncoderNoise:
 
     def __init__(self, axes: int, T: float) -> None:
         self._recent = [deque[int](maxlen=max(8, round(_REST / T))) for _ in range(axes)]
-        self.range = [0] * axes  # [counts] least range of a full window; 0 before there is one
-        self._known = [False] * axes
+        self.range: list[int | None] = [None] * axes  # [counts] least range of a full window; None before there is one
 
     def note(self, counts: Sequence[int]) -> None:
         """Process the counts (m,) of a tick."""
-        for i, n in enumerate(counts):
-            recent = self._recent[i]
+        for i, (recent, n) in enumerate(zip(self._recent, counts, strict=True)):
             recent.append(n)
             if len(recent) == recent.maxlen:
-                least = max(recent) - min(recent)
-                self.range[i] = min(self.range[i], least) if self._known[i] else least
-                self._known[i] = True
+                own, least = max(recent) - min(recent), self.range[i]
+                self.range[i] = own if least is None else min(own, least)
 
     @property
     def still(self) -> tuple[int, ...]:
@@ -511,7 +503,7 @@ class EncoderNoise:
 
         In a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
         """
-        return tuple(1 if range_ <= 1 else 2 * range_ for range_ in self.range)
+        return tuple(2 * least if least and least > 1 else 1 for least in self.range)
 
 
 class Expected:
@@ -564,23 +556,20 @@ class EncoderTest:
 
     def __init__(
         self,
-        cap: Sequence[float],
+        limits: SafetyLimits,
         T: float,
         units: Units,
+        still: Sequence[int],
         expected: Expected,
-        still: Sequence[int] | None = None,
         at_once: bool = False,
-        lever: float = 1.0,
         alive: bool = False,
     ) -> None:
-        """Test within `cap` (m,) [N]; a motion within `still` (m,) [counts] is noise.
+        """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
         A STATE tells the force that acts after it, or with `at_once` (theta = 0) the one that acted before it.
-        `lever` [m] turns a force into the torque of a rotary device.
         """
-        self._at_once, self._strongest = at_once, [min(one, _TEST_FORCE * lever) for one in cap]
-        self._cap, self._T, self._units, self._expected, self._alive = cap, T, units, expected, alive
-        self._still = tuple(still or (1,) * len(cap))
+        self._at_once, self._strongest = at_once, [min(cap, _TEST_FORCE * limits.lever) for cap in limits.cap]
+        self._T, self._units, self._still, self._expected, self._alive = T, units, still, expected, alive
         self._axis, self._last = -1, None
         self._next_axis()
 
@@ -604,7 +593,7 @@ class EncoderTest:
         if self._ticks > before + 4 * half:
             if self._answered():
                 self._next_axis()
-                if self._axis == len(self._cap):
+                if self._axis == len(self._still):
                     return None
             elif self._block == _BLOCKS - 1:
                 raise SafetyStop(self._unanswered())
@@ -613,10 +602,10 @@ class EncoderTest:
                 self._pushed = 0.0
         since = self._ticks - before
         if since <= 0:
-            return (0.0,) * len(self._cap)
+            return (0.0,) * len(self._still)
         size = self._strongest[self._axis] * 2.0 ** (self._block + 1 - _BLOCKS)
         sign = -1 if (since + half // 2) // half % 2 else 1
-        return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
+        return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._still)))
 
     def _compare(self) -> tuple[Array, Array, float, float, bool]:
         """Compare all motions with the expected one.
@@ -649,7 +638,7 @@ class EncoderTest:
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
         axis, name, (size, fit, swing, late, free) = self._axis, f"axis {self._axis + 1}", self._compare()
-        moves = [self._counted(i) > self._still[i] for i in range(len(self._cap))]
+        moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
         loose = self._alive and not self._expected.held  # an unknown hand may hold it
@@ -693,32 +682,22 @@ class EncoderMonitor:
     than 0.3 N, no hand holds still for half a second: its tremor shows.
     """
 
-    def __init__(
-        self,
-        encoder_step: Sequence[float],
-        force_step: Sequence[float],
-        T: float,
-        still: Sequence[int] | None = None,
-        lever: float = 1.0,
-        cap: Sequence[float] = (),
-    ) -> None:
-        """Take `still` (m,) [counts] of noise, `lever` [m] of a rotary device, and `cap` (m,) [N]."""
-        self._lever = lever
+    def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
+        """Take `still` (m,) [counts], the encoders' noise."""
+        self._lever, self._T, self._units, self._still, m = limits.lever, T, units, still, len(still)
         #: (m,) [N] unit of force changes: 1 N, or half of the cap of a weak motor
-        self._newton = [min(lever, most / 2) for most in cap] or [lever] * len(force_step)
-        self._still = tuple(still or (1,) * len(force_step))
-        self._quiet = [0.0] * len(force_step)  # [s] time under a force without a motion
-        self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
+        self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]
         self._band: list[list[int]] | None = None
-        self._reference = [0.0] * len(force_step)  # [N] force at the last motion
-        self._impulse = [0.0] * len(force_step)  # [N s] changes of force over time since the last motion
+        self._quiet = [0.0] * m  # [s] time under a force without a motion
+        self._reference = [0.0] * m  # [N] force at the last motion
+        self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
         """Raise SafetyStop where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
         if self._band is None:
             self._band = [[n, n] for n in counts]
         for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
-            force, band, still = steps * self._force_step[i], self._band[i], self._still[i]
+            force, band, still = steps * self._units.force_step[i], self._band[i], self._still[i]
             if n > band[0] + still or n < band[1] - still:
                 band[:] = n, n
                 self._reference[i], self._impulse[i], self._quiet[i] = force, 0.0, 0.0
@@ -731,7 +710,7 @@ class EncoderMonitor:
             newton = self._newton[i]
             if change > _CHANGE * newton:
                 self._impulse[i] += change * ticks * self._T
-            q = self._encoder_step[i] * still
+            q = self._units.encoder_step[i] * still
             if self._impulse[i] > max(_IMPULSE * newton, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                 doing = f"it stands still while the force changes by {change:.3g} N"
                 raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")

@@ -83,7 +83,7 @@ class _Cable:
         since = self.emulator.since_armed(round(now))
         for frame in filter(None, data.split(b"\0")):
             for when, part in self.down.send(frame + b"\0", now + rehearsal.latency_us / 6, since):
-                rehearsal.at(when, partial(self._deliver, part))
+                rehearsal.at(when, lambda part=part: self.emulator.receive(part, round(rehearsal.now)))
         return len(data)
 
     def discard(self) -> None:
@@ -108,9 +108,6 @@ class _Cable:
 
     def _hear(self, data: bytes) -> None:
         self.data += data
-
-    def _deliver(self, data: bytes) -> None:
-        self.emulator.receive(data, round(self.rehearsal.now))
 
 
 @dataclass(frozen=True)
@@ -271,7 +268,7 @@ def _device_of(cables: Sequence[_Cable], session: Session) -> HapticDevice:
     serial = partial(SerialDevice, clock=lambda: 1e-6 * rehearsal.now)
     if len(cables) == 1:
         return serial(cables[0])
-    axes, behind = [cable.emulator.plant.channels for cable in cables], session.settings.behind
+    axes, behind = [cable.emulator.info.axes for cable in cables], session.settings.behind
     devices = [serial(cable, patience=0.0) for cable in cables]
     return Boards(devices, axes, behind, lambda: round(rehearsal.now), rehearsal.wait)
 

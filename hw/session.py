@@ -307,7 +307,7 @@ class Session:
             self._log(f"positions count from where the handles are: {places} mm")
         if self.stage != Stage.DISARMING and (late := self.link.too_late()):
             self._soften(late)
-        if self.stage != Stage.DISARMING and (dead := self.drive.dead):
+        if self.stage != Stage.DISARMING and (dead := self.drive.encoders.dead):
             self._ramp_out(Stage.STOPPED, dead)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
@@ -315,17 +315,18 @@ class Session:
             return self._ramped_out()
         return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
-    def _answer(self, state: wire.State, command: wire.Command, steps: tuple[int, ...] | None = None) -> Said:
-        """Return the FORCE for a STATE; it is zero where no `steps` are given."""
+    def _answer(
+        self, state: wire.State, command: wire.Command, steps: tuple[int, ...] = (), theta: int | None = None
+    ) -> Said:
+        """Return the FORCE for a STATE; it is zero without `steps`, and for the configured `theta` unless given."""
         assert self.config
-        apply_at = (state.tick + self.config.theta) & 0xFFFF
+        apply_at = (state.tick + (self.config.theta if theta is None else theta)) & 0xFFFF
         return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
 
     def _measure(self, state: wire.State) -> Said:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
-                apply_at = (state.tick + self.measurement.delay()) & 0xFFFF
-                return (wire.Force(wire.Command.IDLE, apply_at, state.tick, (0,) * state.axes),)
+                return self._answer(state, wire.Command.IDLE, theta=self.measurement.delay())
         except wire.SafetyStop as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result

@@ -51,7 +51,7 @@ class IncidentLog:
     def attach(self, session: Session) -> None:
         """Write a header, and from now on every change of the session's stage."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
-        session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
+        session.listen = lambda event: self._write(event._asdict())
 
     def update(self, session: Session) -> None:
         """Write the session's state, once a second."""
@@ -100,9 +100,9 @@ class _Link:
 
     @classmethod
     def of(cls, session: Session, recorder: Recorder, dropped: int) -> _Link:
-        measured, T = session.measurement, session.scenario.T
+        measured, T = session.measurement.result, session.scenario.T
         counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
-        ages, ticks = (_percentiles(np.array(times)) for times in (measured.ages, measured.result.ticks))
+        ages, ticks = (_percentiles(np.array(times)) for times in (measured.values, measured.ticks))
         figures = cls(ages, measured.missing, ticks, counters)
         if not (len(recorder) and session.config):
             return figures

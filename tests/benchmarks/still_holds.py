@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 
+from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.monitor import EncoderMonitor
 from haptic_loop.hw.protocol import SafetyStop
 
@@ -50,7 +51,7 @@ def still_holds(holds: int, seed: int = 0) -> tuple[int, int]:
 
 
 def _stopped(counts: list[int], applied: list[int], step: float) -> bool:
-    monitor = EncoderMonitor((step,), (FORCE_STEP,), T)
+    monitor = EncoderMonitor(SafetyLimits((12.0,)), T, Units((step,), (FORCE_STEP,), (10**6,)), (1,))
     try:
         for n, force in zip(counts, applied, strict=True):
             monitor.check((n,), (force,), 1)

@@ -102,7 +102,7 @@ def free_pair(mass=0.25):
 
 
 def arming_test(cap=12.0, alive=False):
-    return EncoderTest((cap, cap), T, UNITS, Expected(free_pair(), False), alive=alive)
+    return EncoderTest(SafetyLimits((cap, cap)), T, UNITS, (1, 1), Expected(free_pair(), False), alive=alive)
 
 
 def test_axes_are_tested_one_after_another():
@@ -279,9 +279,14 @@ def test_noise_is_the_least_short_range():
 # while forces act
 
 
+def monitor_of(encoder_step, force_step=STEP, **limits):
+    limits = SafetyLimits(**{"cap": (12.0,)} | limits)
+    return EncoderMonitor(limits, T, Units((encoder_step,), (force_step,), (10**6,)), (1,))
+
+
 @pytest.mark.parametrize(("newton", "found"), [(0.5, True), (-0.5, True), (0.2, False)])
 def test_still_encoders_under_force_are_dead(newton, found):
-    monitor = EncoderMonitor((1e-6,), (STEP,), T)
+    monitor = monitor_of(1e-6)
     for _ in range(round(0.45 / T)):
         monitor.check((0,), (round(newton / STEP),), 1)
     assert monitor.dead is None
@@ -314,7 +319,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_the_impulse_decides(axis, sign, newton, after):
     """1 N for 100 ms, 5 N for 20 ms: an impulse of 0.1 N s, since the last motion; less than 1 N never."""
-    monitor, applied = EncoderMonitor((1e-6, 1e-6), (STEP, STEP), T), [0, 0]
+    monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
 
@@ -332,7 +337,7 @@ def test_the_impulse_decides(axis, sign, newton, after):
 
 def test_coarse_encoders_get_more_time():
     """8 sqrt(q M F) with 0.1 mm, 2.5 kg and 5 N is 0.283 N s, 57 ms: 48 ticks."""
-    monitor = EncoderMonitor((1e-4,), (STEP,), T)
+    monitor = monitor_of(1e-4)
     monitor.check((0,), (0,), 1)
 
     def stand_still(ticks):
@@ -345,7 +350,7 @@ def test_coarse_encoders_get_more_time():
 
 
 def test_a_motion_of_two_counts_begins_anew():
-    monitor = EncoderMonitor((1e-6,), (STEP,), T)
+    monitor = monitor_of(1e-6)
     for k in range(2000):
         monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N up and down, two counts every 18 ms
 
@@ -387,6 +392,6 @@ def test_faults_of_missing_axes_are_refused(scenario):
 
 def test_weak_motors_have_smaller_thresholds():
     """A knob of 20 mN m at 20 mm: a dead encoder under 15 mN m is found as one under 3 N is at a strong motor."""
-    knob = EncoderMonitor((1e-4,), (1e-6,), T, None, 0.02, (0.02,))
+    knob = monitor_of(1e-4, 1e-6, cap=(0.02,), slew=40.0, lever=0.02)
     with pytest.raises(SafetyStop, match="axis 1 does not follow"):
         [knob.check((0,), (15_000,), 1) for _ in range(round(1.0 / T))]
