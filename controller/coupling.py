@@ -1,8 +1,9 @@
 """Virtual couplings, the controllers between the devices and the environment.
 
-V maps force to displacement (a compliance). It closes a negative feedback loop around Psi E, so that the environment
-sees u = x - V f. A coupling maps Psi E to G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack,
-Fractions, or sampled responses (controller.lti). The form of a coupling is its content in a file.
+V maps force to displacement (a compliance). In negative feedback around the delayed environment Psi E it turns the
+devices' displacements x into u = x - V f, which Psi E turns into the forces f. `around` returns this loop,
+G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems, Fractions, or sampled responses
+(controller.lti). A coupling is stored in a file as a `Form`.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from numpy.typing import ArrayLike, NDArray
 from haptic_loop.controller.arithmetic import Number, inverse, numbers, positive_definite, times
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 
-_LARGEST_COEFFICIENT = 1e12  # largest coefficient of a stored coupling, SI units
-_MOST_TERMS = 2000  # longest moving average; each term is a state
-_ROUNDING = 1e-12  # largest negative eigenvalue of a damping matrix, relative to its largest entry
-_LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in the sweep
+_LARGEST_COEFFICIENT = 1e12  # largest gain or coefficient, SI units; larger ones would overflow in a sweep
+_MOST_TERMS = 2000  # most terms of a moving average; each term after the first has a state
+_ROUNDING = 1e-12  # a damping matrix may have eigenvalues down to -1e-12 of its largest entry
+_LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in a sweep
 _Rows = tuple[tuple[float, ...], ...]
 
 
 class Coupling:
     """Base class of couplings, which close a loop around the delayed environment.
 
-    A subclass defines `compliance` and `form`. It overrides `around` if it is not a V in negative feedback.
+    A subclass defines `compliance`, and `form` if it can be stored. A coupling without a V overrides `around` instead.
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether couplings contain a linear environment model, which excludes walls
+    holds_model: ClassVar[bool] = False  # whether it contains a linear environment model, so that walls are excluded
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
@@ -68,7 +69,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return the V that is equivalent if the internal model is `model`; None for a coupling without a model."""
+        """Return the equivalent V for the internal model `model`; None for a coupling without a model."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -84,11 +85,11 @@ class Coupling:
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
     def in_series(self, T: Number) -> Lti | None:
-        """Return a block with the poles that a coupling in series adds to the environment, or None with feedback."""
+        """Return a block with the poles that a coupling in series adds to the environment; None for feedback."""
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
-        """Return the figures of a report: the order of V, Q or R, and the gains if there are any."""
+        """Return the entries of a report: the order of V, Q or R, and the gains if there are any."""
         V = self.compliance(T)
         return {"order": V.order if V else 0}
 
@@ -97,7 +98,7 @@ class Coupling:
         raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
     def __repr__(self) -> str:
-        """Name the class, with the order of its filter."""
+        """Return the class and the order of V, Q or R."""
         try:
             return f"{type(self).__name__}(order {self.figures(1.0)['order']})"
         except (ValueError, TypeError):  # a user's own class may have no compliance
@@ -210,10 +211,10 @@ class SpringDamper(ReadOnly, Coupling):
 
 @dataclass(frozen=True, eq=False)
 class _MatrixSpringDamper(ReadOnly, Coupling):
-    """V = [K + B (z-1)/(Tz)]^-1 with symmetric matrices, springs and dampers between the axes of devices (26).
+    """Springs and dampers between the axes of devices: V = [K + B (z-1)/(Tz)]^-1 (26) with symmetric K and B.
 
     Raises:
-        ValueError: K is not symmetric and positive definite, or B not symmetric and positive semidefinite.
+        ValueError: K is not symmetric and positive definite, or B is not symmetric and positive semidefinite.
     """
 
     K: Array  # (m, m) [N/m]
@@ -238,7 +239,7 @@ class _MatrixSpringDamper(ReadOnly, Coupling):
             raise ValueError(f"B is {self.B.tolist()}, expected a positive semidefinite matrix in N s/m")
 
     def compliance(self, T: Number) -> Lti:
-        """Return V(z), with a state per axis that has a damper."""
+        """Return V(z), with one state for each axis that has a damper."""
         step, at = numbers(self.B, T) / T, np.flatnonzero(self.B.any(axis=0))
         gain = inverse(numbers(self.K, T) + step)
         memory = times(gain, step[:, at])
@@ -255,7 +256,7 @@ class _MatrixSpringDamper(ReadOnly, Coupling):
 
 
 def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
-    """Return V = c b/(z - a) + d of one channel, or a stack if k and b have axes."""
+    """Return V(z) of one channel, or a stack of systems if k and b are arrays."""
     stiffness, step = numbers(k, T), numbers(b, T) * (1 - beta) / T
     gain = 1 / (stiffness + step)
     if not np.any(b):
@@ -340,7 +341,7 @@ class Compliance(Coupling):
         return Compliance(replace(self.V, T=T))
 
     def turned(self, Q: Array) -> Compliance:
-        """Return Q V Q', rounded to decimals with a V(1) that is exactly symmetric."""
+        """Return Q V Q', rounded to decimals such that V(1) is exactly symmetric."""
         static, R = self.V._rest
         A, B, R, static = (
             numbers(_decimals(part, digits), Fraction(1))
@@ -355,7 +356,7 @@ class Compliance(Coupling):
 
 
 def _decimals(M: Array, digits: int) -> Array:
-    """Return M, all entries rounded to the decimal place that leaves `digits` digits of the largest entry."""
+    """Round all entries of M to the decimal place that leaves `digits` digits of the largest entry."""
     return np.round(M, digits - 1 - int(np.floor(np.log10(np.abs(M).max(initial=1e-300)))))
 
 
@@ -363,9 +364,9 @@ def _decimals(M: Array, digits: int) -> Array:
 class _InternalModel(ReadOnly, Coupling):
     """Internal model control with a parameter Q(z): u = x - Q y, where y = Psi E x is the output of the model.
 
-    G = Psi E - Psi E Q Psi E equals V = Q (I - Psi E Q)^-1 in feedback. It is affine in Q, and stable if Q and the
-    environment are. Q(z) = sum_k Q_k b_k(z) with the functions of `basis`, which are 1 at z = 1, so that Q(1) is the
-    sum of the coefficients.
+    The loop G = Psi E - Psi E Q Psi E is that of V = Q (I - Psi E Q)^-1 in feedback. G is affine in Q, and stable if Q
+    and the environment are. Q(z) = sum_k Q_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, so that
+    Q(1) is the sum of the coefficients.
     """
 
     poles: Array  # (n,) in (-1, 1); if all are zero, Q is an FIR filter of n + 1 taps
@@ -416,12 +417,12 @@ class _InternalModel(ReadOnly, Coupling):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ForceFilter(ReadOnly, Coupling):
-    """A filter R(z) of the environment's forces: F = Theta R Psi E, with one copy of the environment.
+    """A filter R(z) of the environment's forces: F = Theta R Psi E.
 
     There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
-    coupling `_InternalModel`. R(z) = sum_k R_k b_k(z) with the functions of `basis`, which are 1 at z = 1. The decimals
-    of the coefficients give R(1) = g I exactly, so that F(1) = g E(1) is symmetric for all springs. R_k has one column
-    for the force of each channel, and optionally one more for the sum of all forces.
+    coupling `_InternalModel`. R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
+    coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric for all springs.
+    R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 
     Raises:
         ValueError: A pole is not stable, or the coefficients do not sum to g I with g >= 0.
@@ -553,7 +554,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
         after.append(a * state + through)
         through = (1 - a * a) * state - a * through
     for b1, b2 in pairs:
-        first, second = signals[len(after)], signals[len(after) + 1]  # z/den and 1/den times the earlier sections
+        first, second = signals[len(after)], signals[len(after) + 1]  # outputs with the numerators z and 1
         read[len(after) + 1] = read[len(after) + 2] = 1 + b1 + b2
         after += [through - b1 * first - b2 * second, first]
         through = b2 * through + b1 * (1 - b2) * first + (1 - b2 * b2) * second

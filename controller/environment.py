@@ -1,8 +1,9 @@
 """Virtual environments: spring-damper-mass networks, discretised by backward Euler.
 
 Nodes are contacts (whose displacements the devices impose), internal nodes (free) and the ground.
-The dynamic stiffness of the network is Z(s) = M s^2 + D s + K, at s = (z-1)/(Tz). The map from contact displacements
-to forces is E = Z_cc - Z_ci Z_ii^-1 Z_ic; the devices feel these forces with a minus sign.
+The dynamic stiffness of the network is Z(s) = M s^2 + D s + K, at s = (z-1)/(Tz). With the blocks of contacts (c) and
+internal nodes (i), the map from contact displacements to forces is E = Z_cc - Z_ci Z_ii^-1 Z_ic. The devices feel these
+forces with a minus sign.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or th
 
 #: largest amounts: far above those of any rendered object, and far below the largest float
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-_LEAST_AMOUNT = 1e-12  # far below the amounts that a person can feel; its square is far above the smallest float
+_LEAST_AMOUNT = 1e-12  # smallest amount but 0: a person cannot feel it, and its square is far above the smallest float
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can handle a few hundred states.
@@ -55,7 +56,7 @@ def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A spring and a damper in parallel between two nodes or two points with several coordinates.
 
-    Between points it acts on every coordinate, or along one direction.
+    Between points the spring acts on every coordinate, or in the direction `along` only.
     """
 
     between: tuple[str, str]
@@ -74,7 +75,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def amounts(self, number: Callable[[float], Any]) -> tuple[Any, Any, Any]:
-        """Return mass [kg], damping [N s/m] and stiffness [N/m] between the ends."""
+        """Return inertance [kg], damping [N s/m] and stiffness [N/m] between the ends."""
         return number(self.inertance or 0.0), number(self.damping), number(self.stiffness)
 
 
@@ -86,7 +87,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
-    damping: float = 0.0  # [N s/m], only while in contact, and never pulling
+    damping: float = 0.0  # [N s/m], acts only in contact; the wall never pulls
     gap: float = 0.0  # [m] distance from rest to contact; negative if the wall is compressed at rest
     normal: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # normalised to length 1
 
@@ -97,7 +98,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
             _check_amount(f"{name} of the wall between {ends}", getattr(self, name), unit)
         if self.stiffness == 0:
-            raise ValueError(f"stiffness of the wall between {ends} is 0, expected more (or no wall)")
+            raise ValueError(f"stiffness of the wall between {ends} is 0, expected above 0; or leave out the wall")
         if not abs(self.gap) < np.inf:
             raise ValueError(f"gap of the wall between {ends} is {self.gap}, expected a finite length in m")
         if self.between[0] == self.between[1]:
@@ -126,9 +127,9 @@ def _parts_of(element: Any) -> list[Spring | Wall]:
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
-    It is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and nonnegative.
-    If that holds within rounding only, a spring of at most 1e-6 of its mean gain is added to D. Raises ValueError for a
-    block that produces energy, or whose passivity cannot be decided.
+    A block is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and
+    nonnegative. If passivity holds within rounding only, a spring of at most 1e-6 of the block's mean gain is added to
+    D. Raises ValueError for a block that produces energy, or whose passivity cannot be decided.
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -171,7 +172,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return A, B, C, D
 
 
-_ROUNDING = 1e-9  # allowed asymmetry of E(1) and negative eigenvalue, relative to the mean gain
+_ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
 _ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # usual and largest spring that makes a block passive, relative to the mean gain
 
 
@@ -179,8 +180,9 @@ _ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # usual and largest spring that makes a block 
 def _correction(block: Block) -> Any:
     """Return the correction of D (m, m), Fractions, that makes the block provably passive. Raises ValueError.
 
-    Backward Euler takes the power f'(x - x_-)/T, so E is passive if E(1) is symmetric and nonnegative and
-    He [E z/(z-1)] >= 0. With the pole split off, that is He H >= 0 on the whole circle for
+    The block absorbs the power f'(x - x_-)/T, where x_- is the displacement x of the previous tick. So E is passive if
+    E(1) is symmetric and nonnegative and He [(1 - z) E] >= 0. On the circle this is |1 - z|^2 He [E z/(z-1)]. Without
+    the pole at z = 1 the condition is He H >= 0 on the whole circle for
     H = E(1)/2 - C (I-A)^-1 B - C (I-A)^-1 A (zI-A)^-1 B. A spring of l N/m beside the block adds l/2 to H.
     Objects at the edge of passivity, such as a free mass, get a spring that covers the error bound.
     """
@@ -237,7 +239,7 @@ class Environment:
         except ValueError as error:
             return f"environment {name}: {str(error).removeprefix('block: ')}"
         if lift.any():
-            return f"environment {name}: passive within rounding only; Network(contacts, block=Block.of(E)) mends that"
+            return f"environment {name}: passive within rounding only; Network(contacts, block=Block.of(E)) corrects it"
         return None
 
     def as_network(self) -> Network:
@@ -277,13 +279,13 @@ class RigidWall(Environment, enum.Enum):
     def check(self, psi: Sequence[int], T: float) -> None:
         if any(psi):
             shown = ", ".join(map(str, psi))
-            raise ValueError(f"psi is {shown}: behind a rigid wall no loop with a delayed environment is stable")
+            raise ValueError(f"psi is {shown}, expected 0: with a delay no loop around a rigid wall is stable")
 
     def active(self, T: float) -> None:
         return None
 
     def E(self, T: Number) -> Lti:
-        raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
+        raise ValueError("a rigid wall has no E(z): its force is that of the coupling in front of it")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
         """Return V^-1. Raises ValueError for a coupling without a V, SingularLoop if V has no inverse."""
@@ -322,7 +324,7 @@ class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
 class Network(
     msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True, repr_omit_defaults=True
 ):
-    """A passive mechanical network seen at its contacts, in the order of the channels."""
+    """A passive mechanical network that the devices touch at its contacts, in the order of the channels."""
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()
@@ -455,7 +457,7 @@ class Network(
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
-        """Return the lengths that a part acts on, as (node, coefficient) pairs: one, or one for each coordinate."""
+        """Return the elongations that a part resists, each as (node, coefficient) pairs: one, or one per coordinate."""
         direction = part.along if isinstance(part, Spring) else part.normal
         ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
         count = len(ends[0][0]) if ends else 0
@@ -465,7 +467,7 @@ class Network(
         return [[(node, c) for node, c in signed if c and node != GROUND]]
 
     def joined(self, part: Spring | Wall) -> list[list[str]]:
-        """Return the nodes that each length of a part joins, including ground."""
+        """Return the nodes that each elongation of a part joins, including ground."""
         free = [[node for node, _ in ends] for ends in self._lengths(part)]
         return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
 
@@ -520,9 +522,11 @@ class Networks(Environment):
 def environment(network: Network, T: Number) -> Lti:
     """Return E(z) from contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz), without walls.
 
-    Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v. Every tick solves
-    this equation for v. The states are q- and v- of the internal nodes, and past values for the contact dampers and
-    masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor connections.
+    The positions q and velocities v of the internal nodes obey
+    M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, where q- and v- are those of the
+    previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
+    dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor
+    connections.
     """
     adrift = _adrift(network, network.springs)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
@@ -532,8 +536,8 @@ def environment(network: Network, T: Number) -> Lti:
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:
     """Return the environment with ports for walls, from [x; p] to [f; y].
 
-    p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node has a port
-    from a force to its displacement, before the ports of the walls.
+    p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node also has a port
+    from a force on it to its displacement. These ports come before those of the walls.
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
@@ -550,8 +554,8 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
 def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
     """Return the bodies that no spring joins to a contact or to ground, as lists of indices of internal nodes.
 
-    Only dampers act on such a body, so that its position affects no force and would be an unobservable integrator. The
-    positions of its nodes are stored relative to that of the first one.
+    Only dampers act on such a body, so that its position affects no force and would be an unobservable integrator.
+    `_realise` stores the positions of its nodes relative to the first node.
     """
     names = network.nodes()
     body = {name: name for name in (*names, GROUND)}  # union-find: each node points towards its body's root
@@ -599,7 +603,7 @@ def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
         stiffness = np.linalg.eigvalsh(K[np.ix_(group, group)])
         if stiffness.size > free and stiffness[free] <= _SLACK * stiffness[-1]:
             shown = ", ".join(names[i] for i in group)
-            raise ValueError(f"springs hold {shown} in some directions only: add one `along` a direction without any")
+            raise ValueError(f"springs hold {shown} in some directions only: add a spring `along` each free direction")
 
 
 def _realise(
@@ -611,8 +615,8 @@ def _realise(
 ) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C, D of E(z) for the network (M, D, K) whose first `c` nodes are contacts.
 
-    With `across` (w, nodes) there are w more inputs, forces against the displacements `across q`, and w more outputs,
-    these displacements. The positions of internal nodes in a group of `adrift` are relative to that of its first node.
+    With `across` (w, nodes) E has w more inputs, the forces against the displacements `across q`, and w more outputs,
+    these displacements. The positions of internal nodes in a group of `adrift` are relative to the group's first node.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
@@ -666,7 +670,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """Return the network with two-sided springs in place of the touching walls (by default all), and no other wall."""
+    """Return the network with two-sided springs in place of the touching walls (by default all), without the others."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping, along=w.normal) for w, on in walls)
