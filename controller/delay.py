@@ -15,11 +15,11 @@ from haptic_loop.controller.arithmetic import Number
 from haptic_loop.controller.lti import Array, Lti, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
-# Constant delays are linear blocks, Theta (4), Psi (5) and Lambda (7). Varying delays are a line with a hold:
+# Constant delays are linear blocks, Theta (4), Psi (5) and Lambda (7). Varying delays are simulated by `HeldLine`:
 #
 #         tick k     packet k is sent with the force g[k]; it arrives after delays[k] ticks, or is LOST
 #                    the device applies the newest packet that has arrived: f[k] = g[j], j = max{j : j + delays[j] <= k}
-#                    without a newer packet it holds f[k] = f[k-1], and 0 before the first arrival
+#                    without a newer packet it holds f[k] = f[k-1]; before the first arrival f[k] = 0
 #
 # If no packet is lost, the age k - j of the force in use lies between the least and the largest delay, for any order of
 # arrival. The age grows by at most one per tick.
@@ -61,7 +61,7 @@ def packet_delays(values: ArrayLike) -> Ticks:
 
 
 def _newest(delays: Ticks) -> Ticks:
-    """Return the packet in use at every tick (ticks, m, nsim); -1 before the first arrival."""
+    """Return the number of the packet in use at every tick (ticks, m, nsim); -1 before the first arrival."""
     ticks = delays.shape[0]
     sent = np.arange(ticks)[:, None, None]
     there = np.full(delays.shape, -1)
@@ -80,8 +80,8 @@ def ages(delays: Ticks) -> Ticks:
 def realising(wanted: Ticks) -> Ticks:
     """Return packet delays (ticks, ..) with which the device uses forces of the `wanted` ages (ticks, ..).
 
-    A packet that the device never uses arrives together with the next newer one, so no delay exceeds the largest
-    wanted age. Raises ValueError if an age grows by more than one in a tick.
+    A packet that the device never uses arrives together with the next packet that it uses, so no delay exceeds the
+    largest wanted age. Raises ValueError if an age grows by more than one in a tick.
     """
     ticks = wanted.shape[0]
     packet = np.arange(ticks).reshape(-1, *(1,) * (wanted.ndim - 1)) - wanted
@@ -113,9 +113,9 @@ class HeldLine:
         self._held = np.zeros((m, nsim))
 
     def carry(self, k: int, force: Array) -> None:
-        """Replace the force (m, nsim) that is sent at tick k, in place, by the one that the devices apply at tick k."""
+        """Overwrite `force` (m, nsim), sent at tick k, with the force that the devices apply at tick k."""
         if k >= self._fresh.shape[0]:
-            raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, tick {k} needs one more")
+            raise ValueError(f"delays have {self._fresh.shape[0]} ticks, expected a row for tick {k} also")
         self._sent[k % self._sent.shape[0]] = force
         np.copyto(self._held, self._sent.take(self._place[k]), where=self._fresh[k])
         force[...] = self._held
@@ -127,7 +127,7 @@ _LONGEST = 1000  # [samples]
 
 
 class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Delays of the forces, lo to hi [samples] per channel, drawn anew for every packet."""
+    """Delays of the forces, lo to hi [samples] per channel, one for every packet."""
 
     lo: tuple[int, ...]  # (m,) [samples]
     hi: tuple[int, ...]  # (m,) [samples]
@@ -136,7 +136,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     playout: bool = False  # whether a buffer in the device applies every packet at age hi
     calm: float = 20.0  # bursty: mean number of successive packets with the delay lo
     burst: float = 5.0  # bursty: mean number of successive packets with longer delays
-    recorded: tuple[tuple[int, ...], ...] = ()  # delays of packets 0, 1, .. [samples] by channel, repeated; -1 is lost
+    recorded: tuple[tuple[int, ...], ...] = ()  # [samples] a row of delays (m,) per packet, repeated; -1: lost
 
     def __post_init__(self) -> None:
         if len(self.lo) != len(self.hi):
@@ -183,7 +183,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Draw the delays (ticks, m) of the packets of one run, in samples or LOST.
 
         The patterns "constant" and "adversarial" depend on the loop and repeat the delays `given` (rows, m): theta for
-        "constant", and the worst sequence of a search for "adversarial". Raises ValueError if they lack `given`.
+        "constant", and the worst sequence of a search for "adversarial". Raises ValueError if `given` is missing.
         """
         delays = self._delays(rng, ticks, given)
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
@@ -216,10 +216,10 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Times of ticks and forces that are not multiples of T. Tick k measures x[k] at its beginning and lasts T_k. The force
-# f_i[k], which is computed from x[k], acts from the time tau_i[k] after this beginning. Until then f_i[k-1] acts.
+# Periods may vary, and forces may latch late. Tick k measures x[k] at its beginning and lasts T_k. The force f_i[k] is
+# computed from x[k] and acts from the time tau_i[k] after this beginning. Until then f_i[k-1] acts.
 
-_PERIODS, _LATENCIES = 9, 3  # numbers of different values that are drawn from a range, so that few maps are needed
+_PERIODS, _LATENCIES = 9, 3  # few distinct values of a range, so that matrix exponentials can be cached
 
 
 class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -261,7 +261,7 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """Length and latch times of every tick; a longer run repeats them."""
+    """The length and the latch times of every tick; a longer run repeats them."""
 
     period: Array  # (ticks,) [s]
     late: Array | None  # (ticks, m) latch times [s] from the tick's beginning, below its period; None: all are 0
@@ -311,7 +311,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """Return a timing of `ticks` ticks; None if every period is T and forces latch at the beginning of their tick.
+    """Draw a timing of `ticks` ticks; None if every period is T and forces latch at the beginning of their tick.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -19,17 +19,16 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 # ----------------------------------------------------------------------------------------------------
 # Walls are springs that push and never pull, so that contacts begin and end.
 #
-# With the displacement y across a wall of stiffness K and damping B, the depth in it is d = y - gap. The wall pushes
-# with the force
+# Let y be the displacement across a wall of stiffness K and damping B, and d = y - gap the depth. The wall's force is
 #
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
-# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. It
+# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. The wall
 # dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall is the spring-damper
 # between the same nodes except for the constant force of its gap.
 #
 # The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
-# coupling respond within the tick, y = y_free - D p, so that the tick has an algebraic loop. It is the linear
+# coupling respond within the tick, y = y_free - D p, so that the tick has an algebraic loop. This loop is the linear
 # complementarity problem
 #
 #         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
@@ -46,8 +45,8 @@ State = tuple[bool, ...]  # which walls touch
 class Law(ReadOnly):
     """The map of a tick from positions to forces: the linear block of a loop, and walls that push.
 
-    `sent` is the block from [x; p] to [f_e; y] before Theta. The walls compute p from y. The state consists of the
-    state of the block with its delays, and of h [m], the depth in each wall at the previous tick.
+    `sent` is the block from [x; p] to [f_e; y], with the forces f_e before Theta. The walls compute p from y. The state
+    consists of the state of the block with its delays, and of h [m], the depth in each wall at the previous tick.
     Raises SingularLoop if the walls' forces are not unique.
     """
 
@@ -99,7 +98,7 @@ class Law(ReadOnly):
 
     @cached_property
     def _problem(self) -> Complementarity:
-        """The problem of a tick for the wall forces."""
+        """The complementarity problem of a tick, with the walls' forces p as unknowns."""
         m = self.channels
         return Complementarity(np.diag(1 / self.steepness) - self.sent.D[m:, m:])
 
@@ -156,7 +155,7 @@ class Law(ReadOnly):
         solve, depth = self._problem.solve, slice(G.order, F.order)
 
         def tick(before: Array, after: Array) -> None:
-            d = reach(before) - gap  # without the walls' forces
+            d = reach(before) - gap  # depth without the walls' forces
             force = solve(d - memory * before[depth])
             linear(before, after)
             after += kick(force)
@@ -195,7 +194,7 @@ def _one_by_one(laws: Sequence[Law]) -> Transition:
 
 
 def _one_wall(laws: Sequence[Law]) -> Transition:
-    """Return the function of one tick for several laws with one wall each, where p = max(0, q)/M."""
+    """Return the function of one tick for several laws with one wall each, whose problems are scalar."""
     m, blocks = laws[0].channels, [law._block for law in laws]
     linear, order = _side_by_side(laws), blocks[0].order
     reach = _last_axis([np.concatenate([G.C[m], [0.0], G.D[m, :m]]) for G in blocks])
@@ -220,20 +219,21 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The limiter sends forces f_e with |f_e,i| <= L_i, because the contact slips by e.
+# The limiter sends forces f_e with |f_e,i| <= L_i by letting the contact slip by e (e_- at the previous tick):
 #
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
-# The limiter acts before Theta, so that delayed forces are limited forces. While no force reaches its limit, e = 0.
+# The limiter acts before Theta, so that delayed forces are limited, too. While no force reaches its limit, e = 0.
 # Let f_free be the forces without slip, and D_G the feedthrough of G. The limiter solves
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
-# together with the walls, whose forces are further unknowns over the box (-inf, 0]. This is a box problem.
+# together with the walls: their forces p are further unknowns in the normal cone of a box (-inf, 0]. Both together are
+# one box problem (controller.complementarity).
 
 
 def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
-    """Return limits (m,) [N] of the channels that imply the limits of the vectors."""
+    """Return limits (m,) [N] of the channels within which no vector exceeds its limit."""
     return limit / np.sqrt(np.repeat(sizes, sizes)) if sizes else limit
 
 
@@ -246,7 +246,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
-    rho: Array  # (m,) [N/m] lag of the slip: 0 with any-environment, beta delta/T with this-environment
+    rho: Array  # (m,) [N/m] resists changes of the slip: any-environment 0, this-environment beta delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold
@@ -277,12 +277,12 @@ class Limiter(Law):
             if len(set(self.limit[ball].tolist())) != 1:
                 raise ValueError(f"limit is {self.limit.tolist()}, expected one value for all axes of a vector")
         if self.balls and self.walls:
-            raise ValueError("walls: forces that are limited as vectors are not solved together with walls: limit axes")
+            raise ValueError("walls cannot be combined with forces that are limited as vectors: limit each axis")
         _ = self.problem
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
-        """The number of channels of each limited vector; () if none has several."""
+        """The number of channels of each force that is limited as a vector or alone; () if `balls` is empty."""
         sizes, at = [], 0
         while self.balls and at < self.channels:
             end = next((ball.stop for ball in self.balls if ball.start == at), at + 1)
@@ -303,7 +303,7 @@ class Limiter(Law):
         return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self.sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Return whether each contact slipped, at the tick that sends the force."""
+        """Return whether the contact slipped at the tick that sent each force."""
         return self.slips(z) != 0
 
     @cached_property
@@ -323,7 +323,7 @@ class Limiter(Law):
 
     @cached_property
     def problem(self) -> BoxProblem | BallProblem:
-        """The problem of a tick for [e; p], with all limits in N."""
+        """The problem of a tick with the unknowns [e; p]. The walls' rows are scaled to N."""
         m, w = self.channels, len(self.walls)
         if self.balls:
             return BallProblem(-self._step.D[:, m:], self.limit, self.sizes)
@@ -374,7 +374,7 @@ class Limiter(Law):
         upper, lower = self.problem.upper[:, None], self.problem.lower[:, None]
 
         def walled_tick(before: Array, after: Array) -> None:
-            d = d_of(before) - gap  # without wall forces and slip
+            d = d_of(before) - gap  # depth without wall forces and slip
             linear(before, after)
             right = np.vstack([after.take(sent, axis=0), steep * d - memory * before[depth]])
             touched = ((right > upper) | (right[: m + w] < lower)).any(axis=0)

@@ -1,12 +1,12 @@
-"""The loop of designs, checks, maps and the bridge: devices, delays and environment.
+"""The loop that designs, checks, maps and the bridge use: devices, delays and environment.
 
                  x  sampled                                     Delta_D  damping that the devices guarantee
     devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-A loop holds the damping of every device and, if guaranteed, bounds of motor and transmission. It holds nothing about
-the humans. controller.tick simulates the loop.
+A `Loop` contains the damping of every device and, if guaranteed, bounds of its motor and transmission. It contains
+nothing about the humans. controller.tick simulates the loop.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_l
 from haptic_loop.controller.ranges import Member, Ranges, members
 from haptic_loop.controller.units import PositionUnit, in_unit
 
-MOST_SAMPLES = 1000  # longest delay of a channel, which has a state for each sample
+MOST_SAMPLES = 1000  # [samples] longest delay of a channel; every sample adds a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
-_LEAST_DAMPING = 1e-12  # [N s/m] far below that of any device, without overflow in squares of its inverse
+_LEAST_DAMPING = 1e-12  # [N s/m] far below that of any device; the square of its inverse does not overflow
 Rows = tuple[tuple[float, ...], ...]  # rows of a matrix
 
 
@@ -93,15 +93,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     psi: _Steps  # (m,) environment delays [samples]
     lam: _Steps  # (m,) delays of the reference [samples], for transparency only
     delta: tuple[_Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
-    environment: Network | RigidWall  # or an object of a user's own class, which cannot be stored
+    environment: Network | RigidWall  # or an `Environment` of a user's own class, which cannot be stored
     ranges: Ranges | None = None  # ranges of the environment's parameters
-    varying_delay: DelayRange | None = None  # delays of the forces that may switch at every tick
+    varying_delay: DelayRange | None = None  # the forces' delays, if they may change at every tick
     T_max: _Positive | None = None  # [s] longest period if periods vary; None: T
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and largest latency of forces after kT
     T_min: _Positive | None = None  # [s] shortest period, for the known-device condition
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
     axes: tuple[int, ...] | None = None  # number of channels of each device; None: one each
-    levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
+    levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], with diagonals as in delta; None: diag(delta)
     unit: PositionUnit = "m"  # unit of positions; with "rad" N m, N m s/rad and kg m2 replace N, N s/m and kg
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
         for member in self.members():
             try:
-                member.network.check(self.psi, self.T)  # raises ValueError if nothing holds an internal node
+                member.network.check(self.psi, self.T)  # for example, nothing holds an internal node
             except ValueError as error:
                 raise ValueError(f"{member.name}: {error}" if self.ranges else str(error)) from None
         if self.varying_delay:
@@ -134,7 +134,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         self._check_axes()
 
     def _check_axes(self) -> None:
-        """Raise ValueError unless axes and levels fit the channels; replace defaults by None."""
+        """Raise ValueError unless axes, levels and values per device fit the channels; replace defaults by None."""
         m, axes = self.channels, (1,) * self.channels if self.axes is None else self.axes
         if sum(axes) != m or min(axes) < 1:
             raise ValueError(f"axes is {list(axes)}, expected numbers of axes >= 1 with the sum {m}, one per contact")
@@ -197,7 +197,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
 
     def per_device(self, values: ArrayLike) -> Array:
-        """Return the least of the values (m,) over each device's channels."""
+        """Return, for each device, the least of the values (m,) of its channels."""
         return np.minimum.reduceat(np.asarray(values, dtype=float), [own.start for own in self.devices])
 
     def per_channel(self, values: Sequence[Any]) -> tuple[Any, ...]:
@@ -328,7 +328,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return msgspec.structs.replace(self, theta=theta, lam=lam, varying_delay=None)
 
     def switching(self, span: DelayRange | None) -> Loop:
-        """Return the loop with delays that may switch within a range, or with the constant theta."""
+        """Return the loop with delays that may change within `span`, or with the constant theta if `span` is None."""
         return msgspec.structs.replace(self, varying_delay=span)
 
     @property
@@ -337,10 +337,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.varying_delay or DelayRange(self.theta, self.theta)
 
 
-#: The key and the value of the last G over Fractions. A proof reads G three times, and computing G is most of its work.
+#: The key and the value of the last G over Fractions. A proof uses G three times, and most of the work is to compute G.
 _exactly: list[Any] = [(None,) * 4, None]
 
 
 def forget_exact() -> None:
-    """Clear the stored G of an earlier proof, so that the counted work of a proof does not depend on it."""
+    """Clear the stored G, so that the counted work of a proof does not depend on earlier proofs."""
     _exactly[:] = (None,) * 4, None

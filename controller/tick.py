@@ -38,7 +38,7 @@ _CALM = 1 - 1e-9  # forces above this multiple of their limit may need the limit
 
 
 class Net(Protocol):
-    """A nonlinear step with memory between the forces of F and the devices. Every record has its own net.
+    """A nonlinear step with memory between the forces of F and the devices. Every `StepBuffer` has its own net.
 
     At every tick `send` changes forces (m, nsim) [N] in place before the delays, and `apply` after them.
     """
@@ -155,7 +155,7 @@ class StepBuffer:
         plant_states: int,
         outside: int = 0,
         nsim: int = 1,
-        transition: Transition | None = None,  # replaces the process's own
+        transition: Transition | None = None,  # None: that of the process's law
     ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
@@ -233,7 +233,7 @@ class StepBuffer:
         return ticks
 
     def tick(self, k: int) -> None:
-        """Write f[k] and z[k + 1] from the plant state of row k, by steps 1, 2, 3 and 5."""
+        """Write f[k] and z[k + 1] from the plant state of row k: all steps of a tick but the plant's."""
         seen = self.seen(k)
         self._transition(seen, self.law_output[k])
         if self.net is not None:
@@ -262,9 +262,9 @@ class StepBuffer:
 
 
 class FusedTicks:
-    """One matrix product for the plant's step and the law of the next tick, with the result [f; z+; s].
+    """Compute the plant's step and the law of the next tick as one matrix product with the result [f; z+; s].
 
-    A row of the memory is [w, f, z+, s, a] of a tick, where the engine sets the entries a. The next s is
+    A row of the memory contains [w, f, z+, s, a] of one tick. The engine sets the entries a, and the next s is
     A s + B [w; f] + G a. Without B the product uses only [z+, s, a].
     """
 
