@@ -53,7 +53,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
+    """Audit a coupling. Return 0 if it is safe in this environment and at every vertex of its ranges, 1 if not."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.audit import audit
     from haptic_loop.design.certificate import named
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     if args.devices:
         extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
         if extra:
-            raise InputError(f"--devices with --{extra[0]}: the list is of the whole catalogue, give one of them")
+            raise InputError(f"--devices with --{extra[0]}: the list is always the whole catalogue, give one of them")
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
@@ -108,24 +108,24 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    what = "Say whether a coupling is safe for every passive human, and how far."
+    what = "Say whether a coupling is safe for every passive human, and with what margin."
     parser = options.Parser("design.audit", what, *_EXAMPLES, first="K B rigid device scenario json")
     coupling = parser.add_argument_group("the coupling")
-    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, like the damping below
-    coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
+    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # These limits prevent overflow, as those of B do.
+    coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m], or one for all")
     damping = options.several(float, 0, 1e6, "N s/m")
-    coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
+    coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m], or one for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
-    parser.add_condition("the condition that must hold, of your own beside the two that are always asked", to=coupling)
-    device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
-    coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
+    parser.add_condition("the condition that must hold, your own in addition to the two standard ones", to=coupling)
+    device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
+    coupling.add_argument("--device", metavar="NAME", help=f"from the catalogue: {device}; other options override it")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     parser.add_loop()
     parser.add_rigid()
     scene = "a MuJoCo scene as the environment, touched at its named bodies without a joint, along x"
     parser.add_argument("--world", metavar="FILE.xml", help=scene)
-    switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
+    switching = "also judge any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
     parser.add_varying_delay(switching)
     parser.add_details()
     parser.add_output()
@@ -135,7 +135,7 @@ def _parser() -> options.Parser:
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
     """Return the options, completed by the catalogue's numbers. Raises InputError.
 
-    `source` cites the source of the catalogue's gains, or is None where they are not used.
+    `source` is the source of the catalogue's gains, or None if they are not used.
     """
     if not args.device:
         return args
@@ -173,9 +173,9 @@ def _list_devices(args: argparse.Namespace) -> int:
 
     heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
     rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]
-    title = "what is published: the last column is the stiffness that CHAI3D allows"
+    title = "published figures; the last column is the stiffness that CHAI3D allows"
     lines = [f"[{i}] {source}" for source, i in numbered.items()]
-    lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
+    lines.append("Give unknown figures beside `device` in a scenario, or with --delta; hw.identify measures them.")
     render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)
     return options.DONE
 
@@ -292,7 +292,7 @@ def _stiffest(K: Sequence[float | None]) -> str:
     return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
 
 
-#: name of a row -> function from the requirement and the margins of one condition to its cell
+#: row name -> function that formats the cell from the requirement and the margins of one condition
 _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
     "needs damping": lambda r, _: f"{r.amounts()}: {render.certified(r, proof=False)}",
     "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),
@@ -333,7 +333,7 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
     """Yield the changes that certify the coupling, the one with the least required damping first."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
-        yield "What helps: no single change of delay, damper or period was found to; a design finds other gains."
+        yield "What helps: no single change of delay, damper or period was found to help; a design finds other gains."
     for each in enough:
         needs = f"{each.condition} then needs {listed(each.required_damping)} N s/m, certified"
         yield f"What helps: {each.change} ({needs})."

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    """Design, prove and store. 0: certified, 1: not."""
+    """Design, prove and store a coupling. Return 0 if it is certified, 1 if not."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.api import store
 
@@ -74,15 +74,15 @@ def _parser() -> options.Parser:
     default = "default spring-damper; moving-average in a world"
     kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own ({default})"
     parser.add_argument("--coupling", metavar="NAME", help=kinds)
-    around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
+    around = "certify for every stiffness and mass within PERCENT of the nominal one, like [ranges] of a scenario"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")
-    ratio = "softer, until every mode of the loop with the scenario's hands has at least this damping ratio"
+    ratio = "soften the coupling until every mode of the loop with the scenario's hands has this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
-    varying = "safe under any switching of the forces' delays in this range too [samples]; with --condition "
+    varying = "certify any switching of the forces' delays in this range, too [samples]; with --condition "
     varying += "this-environment or known-device"
     parser.add_varying_delay(varying)
-    limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
+    limiter = "with this-environment: fail unless the proof covers limited forces (default: a spring-damper tries)"
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
@@ -98,9 +98,9 @@ def _add_optimal_options(parser: options.Parser, title: str) -> None:
     group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     parser.add_band(to=group)
-    gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
+    gain = "limit of |F|/|E| above 100 Hz (default none: the design only reduces the force there)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
-    limit = "end the growth of the basis after S seconds, and the search of ranges with it (default: no clock ends it)"
+    limit = "stop enlarging the basis and searching the ranges after S seconds (default: no time limit)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
 
 
@@ -184,7 +184,7 @@ def _that_decays(
 ) -> tuple[Design, Ringing | None]:
     """Design for less and less damping, which gives softer couplings, until every mode has this damping ratio.
 
-    A coupling that is certified for less damping is certified for the available damping.
+    A coupling certified for less damping is also certified for the available damping.
     """
     from haptic_loop.sim.run import assemble
     from haptic_loop.sim.stability import ringing
@@ -196,7 +196,7 @@ def _that_decays(
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
         decay = ringing(assemble(scenario, design.coupling))
-        assert decay  # None for worlds only, which `main` refuses
+        assert decay  # `ringing` returns None for worlds only, which `main` refuses.
         return design, decay
 
     tried: list[Ringing] = []
@@ -247,17 +247,17 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 def _bound_and_robustness(
     args: argparse.Namespace, loop: Loop, design: Design, file: str
 ) -> tuple[BoundBeside | None, Robustness | None, bool]:
-    """Return the bound of an optimal coupling, the robustness, and whether Ctrl-C left out one of them."""
+    """Return the bound of an optimal coupling, the robustness, and whether Ctrl-C skipped one of them."""
     from haptic_loop.design.bound import BoundBeside
     from haptic_loop.design.optimal import Optimal
 
-    limit, note = None, f"{file} is stored (Ctrl-C leaves out what follows)"
+    limit, note = None, f"{file} is stored (Ctrl-C skips the rest)"
     try:
         if isinstance(design, Optimal):
-            with render.progress(f"{note}: working out the bound"):
+            with render.progress(f"{note}: computing the bound"):
                 band, chosen = args.band_hz or BAND_HZ, Options(**_options_of(args, "optimal"))
                 limit = BoundBeside.of(loop, design, design.figures.rms_mismatch_db, band, chosen)
-        with render.progress(f"{note}: working out robustness"):
+        with render.progress(f"{note}: computing robustness"):
             return limit, robustness_nearby(loop, design.coupling, named(design.asked)), False
     except KeyboardInterrupt:
         return limit, None, True
@@ -305,7 +305,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # convex designs go below it
+        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # convex designs may be softer still
         yield "", f"{SOFTEST:g} N/m is the softest that the search tries" if searched else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
@@ -403,7 +403,7 @@ def _tables(scenario: Scenario, report: _Report) -> list[render.Table]:
 
 
 def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
-    """Return the cell of a figure: nominal environment / worst of the ranges."""
+    """Return the function that formats a figure: nominal environment / worst of the ranges."""
 
     def cell(row: coverage.OverRanges) -> str:
         figures: coverage.NominalWorst = getattr(row, name)
@@ -414,7 +414,7 @@ def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
 
 _OVER_RANGES: dict[str, str | Callable[[coverage.OverRanges], str]] = {
     "coupling": "{r.coupling}",
-    "needs of its damping": _both("required_over_available", "{:.4f}"),
+    "required/available": _both("required_over_available", "{:.4f}"),
     "vertices violated": "{r.violated}",
     "rms error": lambda row: _both("rms_mismatch_db", "{:z.2f}")(row) + " dB",
     "largest error": lambda row: _both("relative_mismatch_db", "{:z.2f}")(row) + " dB",

@@ -1,4 +1,4 @@
-"""Options of several commands with their types, exit codes, and one line for bad input.
+"""Options that several commands share, the types of their values, exit codes, and one-line errors for bad input.
 
 A type parses the text of one option; its error names the value and the allowed values, and `Parser` adds the option's
 name. Values that depend on the scenario, such as one number per channel, are checked by `per_channel`.
@@ -65,7 +65,7 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse the options `names` if `acts` is false for the parsed arguments, because they would be ignored."""
+        """Refuse the options `names`, which would have no effect, if `acts` is false for the parsed arguments."""
         self._only.append((where, acts, names))
 
     def format_help(self) -> str:
@@ -88,7 +88,7 @@ class Parser(argparse.ArgumentParser):
         text.add_text(self.epilog)
         return text.format_help()
 
-    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # parse_args calls it
+    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # argparse's parse_args calls this
         """Parse as argparse does; refuse empty values, and a --json file that cannot be written."""
         self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
@@ -119,7 +119,7 @@ class Parser(argparse.ArgumentParser):
         return did_you_mean(word.partition("=")[0], known)
 
     def error(self, message: str) -> NoReturn:
-        """Raise InputError, with the units of the scenario that the options name."""
+        """Raise InputError; its message has the units of the scenario that the options name."""
         scenarios = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         scenarios.add_argument("--scenario", default=DEFAULT)
         with suppress(argparse.ArgumentError, InputError):
@@ -137,19 +137,19 @@ class Parser(argparse.ArgumentParser):
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)
-        paper = "the paper's spelling: I or II is that reference, none is --coupling none"
+        paper = "the paper's name for the reference (I, II) or for --coupling none (none)"
         loop.add_argument("--case", choices=CASES, help=paper)
         names = ", ".join(built_in())
-        loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
+        loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"a file, or one of: {names}")
         own = "your own environment in place of the scenario's: a Network, or a class with contacts and E(T) or parts()"
         loop.add_argument("--environment", metavar="FILE.py:NAME", help=own)
         for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
-            what = f"{what} delay of each device [samples]; one is for all"
+            what = f"{what} delay of each device [samples], or one for all"
             loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
-        damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
+        damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m], or one for all"
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
-        longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
+        longest = "longest period [s], if periods vary from tick to tick: certificates then cover all up to this one"
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
         known = (
             "guaranteed motor mass [kg], largest stiffness [N/m], least and largest damping [N s/m] of the transmission"
@@ -161,7 +161,7 @@ class Parser(argparse.ArgumentParser):
             metavar="MASS,K_MAX,B_MIN,B_MAX",
             help=f"{known}; once for all channels, or once per channel",
         )
-        late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
+        late = "time from a tick until its force latches [s], less than T: at most S or LO:HI, per device or for all"
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
@@ -192,7 +192,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_energy_budget(self) -> None:
         """Add --energy-budget."""
-        what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"
+        what = "scale forces so that no passive hand receives more than W0 [J]; store at most CAP [J] of users' energy"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:
@@ -207,20 +207,20 @@ class Parser(argparse.ArgumentParser):
     def add_varying_delays(self) -> None:
         """Add --period, --varying-delay, --pattern, --loss and --playout."""
         group = self.add_argument_group("delays and periods that vary")
-        periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
+        periods = "periods [s]: random between MIN and MAX at every tick, or a file of recorded periods"
         group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
         span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
         self.add_varying_delay(span, group)
         pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
         group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
-        loss = "probability that a force is lost and the last one held"
+        loss = "probability that a force is lost; the device then holds the last one"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)
-        group.add_argument("--playout", action="store_true", help="a buffer that makes every delay the largest one")
+        group.add_argument("--playout", action="store_true", help="a buffer that gives every force the largest delay")
 
     def add_output(
         self,
         out: str = "DIR",
-        what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>[-<coupling>])",
+        what: str = "folder for files, created if missing (default out/<command>-<case or scenario>[-<coupling>])",
         picture: bool = False,
         seed: bool = True,
     ) -> None:
@@ -231,7 +231,7 @@ class Parser(argparse.ArgumentParser):
         self.add_json(output)
         output.add_argument("--out", metavar=out, help=what)
         if seed:
-            drawn = "for random draws; recorded (default 0)"
+            drawn = "seed of random draws, stored in the report (default 0)"
             output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=drawn)
 
     def add_details(self) -> None:
@@ -386,7 +386,7 @@ def given(value: Any) -> bool:
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
     """Turn a ValueError raised within into InputError, with `name` in front of its message.
 
-    A message that begins with the name of an argument begins with the name of the option in `args` instead.
+    If the message begins with the name of an argument that is an option in `args`, the option's name replaces it.
     """
     try:
         yield
@@ -414,9 +414,9 @@ def per_channel(
 
 
 def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> DelayRange:
-    """Return the range of --varying-delay for every channel; `pairs` has one, one per device or one per channel.
+    """Return the range of --varying-delay for every channel. Raises InputError.
 
-    Raises InputError.
+    `pairs` holds a single range, one range per device, or one per channel.
     """
     if loop.axes and len(pairs) == len(loop.axes):
         pairs = loop.per_channel(pairs)
@@ -498,10 +498,10 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 
 
 def place(args: argparse.Namespace) -> str:
-    """Return the case or scenario, and the coupling and condition where options name them, for names of files.
+    """Return the part of a file name that states case or scenario, and coupling and condition if options name them.
 
-    The name of a file loses its suffix: `run-I-stiff` for `--coupling stiff.json`. A file of another folder also gets a
-    digest of that folder, so that results of files with equal names in two folders stay apart.
+    Suffixes of files are left out: `run-I-stiff` for `--coupling stiff.json`. For a file of another folder a digest of
+    that folder is appended, so that results of files with equal names in two folders stay apart.
     """
     if args.scenario == DEFAULT:
         loop = args.case
@@ -519,11 +519,11 @@ def name_of(file: str) -> str:
     return f"{path.stem}-{sha256(str(path.parent.resolve()).encode()).hexdigest()[:6]}"
 
 
-_LONGEST = 80  # most characters of a coupling or a condition in a file name, which may have 255 characters
+_LONGEST = 80  # most characters of a coupling or a condition in a file name; file systems allow 255 in all
 
 
 def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:
-    """Return couplings or a condition as a part of a file name; a digest replaces the end of a long one."""
+    """Return couplings or a condition as a part of a file name; a digest replaces the end of a long part."""
     names = value if isinstance(value, tuple) else (value if isinstance(value, str) else value.name,)
     words = [part for name in names for part in name.split(":")]
     parts = (name_of(word) if word.endswith((".json", ".py")) else word for word in words)
@@ -574,7 +574,7 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
 
 
 def _periods(text: str) -> Periods:
-    """Parse two numbers, or a file of one column [s]. Raises InputError."""
+    """Parse --period: two numbers [s], or a file with one column of periods. Raises InputError."""
     with refused("--period: "):
         if "," in text and not Path(text).is_file():
             least, most = numbers("--period", text, float, 2)
@@ -595,9 +595,9 @@ def _pattern(name: str, channels: int) -> dict[str, Any]:
 def _rows(
     option: str, path: str, kind: Callable[[str], _Number], columns: int, hint: str
 ) -> tuple[tuple[_Number, ...], ...]:
-    """Read numbers of a file, separated by commas or blanks; one column is repeated; # begins a comment.
+    """Read rows of numbers, separated by commas or blanks, from a file; # begins a comment. Raises InputError.
 
-    Raises InputError.
+    A single column is repeated for all columns.
     """
     rows = []
     for n, line in enumerate(read_text(path, f"{option} {path}", hint).splitlines(), start=1):

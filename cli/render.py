@@ -86,7 +86,7 @@ def progress(description: str) -> Iterator[Move]:
 
 @contextmanager
 def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Progress]:
-    """Show the progress bar of a design; yields the `progress` of `choose` and `design_by_kind`.
+    """Show the progress bar of a design; yields the function that a design calls as its `progress`.
 
     If the design of this `kind` (by default the spring-damper) fails for `loop`, the error names alternatives.
     """
@@ -143,7 +143,7 @@ def announce(args: argparse.Namespace, verdict: str) -> None:
 
 
 def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> bool:
-    """Return whether a picture is to be drawn: not with --no-plot, nor without content.
+    """Return whether a picture is to be drawn: False with --no-plot or without content.
 
     An older picture that is not drawn again is removed, so that it does not stand beside new results. Raises InputError
     if it cannot be removed.
@@ -160,7 +160,10 @@ def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> b
 def pictures(
     args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str], content: bool = True
 ) -> list[Path]:
-    """Draw the pictures of a report: file -> function of sim.plots. With --no-plot matplotlib is not loaded."""
+    """Draw the pictures of a report: `drawn` maps file names to functions of sim.plots.
+
+    With --no-plot matplotlib is not loaded.
+    """
     drawn_files = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
     if not drawn_files:
         return []
@@ -203,7 +206,7 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 
 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
-    """Return a table of records. `cells` maps the head of a column to a format of the record `r` or a function of it.
+    """Return a table of records; `cells` maps column heads to functions of a record, or to format strings with `r`.
 
     If two columns have the same head, one key of `cells` has a blank at its end.
     """
@@ -270,7 +273,7 @@ def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, p
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """Return the row of the contacts' names, in the order of all lists; its text is None for a single contact."""
+    """Return the row of the contacts' names, in the order of all lists; the text is None for a single contact."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 
@@ -289,7 +292,7 @@ _MUCH = 2.0  # ratio of required to available damping nearby, above which the re
 
 
 def robustness_rows(there: Robustness | None) -> Rows:
-    """Yield the rows on a wrong model of the environment: the required damping, and how to design for it."""
+    """Yield rows on the damping required if the environment's model is wrong, and on how to design for such errors."""
     if there:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"

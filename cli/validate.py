@@ -40,7 +40,7 @@ _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Test random humans. 0: all claims hold, 1: a claim does not, 3: workers were lost, 130: interrupted."""
+    """Test random humans. Return 0 if all claims hold, 1 if not, 3 if workers were lost, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     args.humans = args.humans or (_IN_A_WORLD if is_world(scenario) else _HUMANS)
@@ -87,21 +87,21 @@ def _parser() -> options.Parser:
     many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
     add("--humans", type=whole_number(1, 1_000_000), metavar="N", help=many)
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
-    add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
-    seconds = "length of the traces (default 2; 0 for none)"
+    add("--engine", choices=ENGINES, default="both", help="the engine that decides (default both)")
+    seconds = "length of the traces [s] (default 2; 0: no traces)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
-    traced = "hands that MuJoCo simulates, too: sampled (default: nearest to the limit, lossless, 64 others) or all"
+    traced = "hands that MuJoCo also simulates: all, or sampled (default): nearest to the limit, lossless, 64 random"
     add("--traces", choices=("sampled", "all"), default="sampled", help=traced)
     add(
         "--shards",
         type=whole_number(1, 256),
         default=1,
         metavar="K",
-        help="local processes, for the same result (default 1)",
+        help="number of processes; the result is the same (default 1)",
     )
     add("--adversary", action="store_true", help="also search for the worst passive human")
-    add("--generations", type=whole_number(1, 10_000), metavar="N", help="length of that search (default 150)")
-    met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
+    add("--generations", type=whole_number(1, 10_000), metavar="N", help="generations of --adversary (default 150)")
+    met = "nominal (default), or ranges: the vertices of the scenario's ranges in turn, and as many points inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")
@@ -133,7 +133,7 @@ def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tupl
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:
     """Return the loop, the humans and the engines of the validation. Raises InputError."""
-    # A population of the user's own has no links.
+    # A user's own population need not have `links`.
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
     lag, every = assessment.force_limits.rho, args.traces == "all"
@@ -141,7 +141,7 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
 
 
 def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
-    """Return the findings on all humans, and the time that they took [s]."""
+    """Return the findings on all humans, and the computing time [s]."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         findings = validate(question, args.shards, move)
@@ -159,7 +159,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search for the worst humans in the environment that needs the most damping. Ctrl-C ends the search."""
+    """Search for the worst humans in the environment that requires the most damping. Ctrl-C ends the search."""
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
@@ -174,7 +174,8 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
             with render.progress("searching the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
-                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # touching walls that need most damping
+                # Among all sets of touched walls take the one that requires most damping.
+                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)
                 worst.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
         return _Searched(*worst, ratio=ratio, interrupted=True)
@@ -213,7 +214,7 @@ def _save(
 # The report and its parts.
 
 
-_NOTHING = "no batch of humans was done"
+_NOTHING = "no batch of humans was finished"
 
 
 @dataclass(frozen=True)
@@ -255,7 +256,7 @@ class _Report:
     disagreeing: list[verdicts.DrawnHumans]
     worst: verdicts.WorstDrawn | None = render.figure("worst human")
     own_humans: _Own = render.several(_Own.rows)
-    largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
+    largest_difference_per_s: float | None = render.figure("difference of growth rates", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
     assessment: Assessment = render.several(_assessment_rows)
     settled: str | None = render.figure("handles come to rest", json="left out")
@@ -297,7 +298,7 @@ def _varying(
 
 
 class _Tests(NamedTuple):
-    """Parts of a report that each say whether a claim holds, under the names that they have in it."""
+    """Tests of the claims; each field has the name that it has in the report."""
 
     own_humans: _Own
     energy_audit: verdicts.EnergyAudit | None
