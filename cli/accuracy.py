@@ -1,4 +1,4 @@
-"""python -m sim.accuracy: cost and error of each engine, from the same run."""
+"""python -m sim.accuracy: measure cost and error of each engine on the same run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Measure every engine and step. 0: the defaults judge stability right, 1: not, 130: interrupted."""
+    """Measure every engine and step. Return 0 if the defaults judge stability right, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.accuracy")
@@ -79,7 +79,7 @@ def _parser() -> options.Parser:
     two = "python -m sim.accuracy --scenario three-rigid --coupling none"
     parser = options.Parser(
         "sim.accuracy",
-        "Speed against error, engine by engine.",
+        "Compare speed and error of the engines.",
         "python -m sim.accuracy --duration 5",
         two,
         first="scenario coupling condition reference duration json",
@@ -87,7 +87,7 @@ def _parser() -> options.Parser:
     parser.add_loop()
     parser.add_coupling(", ".join(NAMES))
     parser.add_limiter()
-    duration = "of each run (default: the scenario's)"
+    duration = "length of each run (default: the scenario's)"
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help=duration)
     parser.add_output(picture=True, seed=False)
     return parser

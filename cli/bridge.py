@@ -35,11 +35,12 @@ _LONGEST = 3600.0  # [s] longest session, because the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
-    """Run a session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
+    """Run a session. Return 0 if it ended as planned, 130 if interrupted (after a ramp), 1 for any other end."""
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
-    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # A device without a clock applies at once.
+    # A device without a clock applies forces at once.
+    at_once = args.latch == "arrival" or session_cli.host_clocked(args)
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
         args.energy_budget = None  # In a world, each contact has an energy budget of its own (`world_start`).
@@ -60,7 +61,7 @@ def main(argv: list[str]) -> int:
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
-            note = "· delta is a full matrix, of which a device states one number per axis below it"
+            note = "· delta is a full matrix; a device states one lower bound per axis"
             render.console(args).print(f"{note}: {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
         return programs
 
@@ -90,18 +91,20 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
-        raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
+        raise InputError(
+            "--energy-budget is 0 J: arming tests the encoders with a small force, give for example 0.01 J"
+        )
     counted = ("--latch arrival", args.latch == "arrival"), ("a world", is_world(scenario))
     for feature, present in (*counted, ("--energy-budget", args.energy_budget)):
         if several_boards and present:
-            by_one = f"{feature} counts forces by one clock, several boards have several"
+            by_one = f"{feature} counts forces by one clock, but each board has its own"
             raise InputError(f"--port is {args.port}: {by_one}")
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = options.Parser(
         "hw.bridge",
-        "Drive a device over a serial port with a coupling that is certified for the delay measured.",
+        "Drive a device over a serial port with a coupling that is certified for the measured delay.",
         "python -m hw.bridge --rehearse --duration 2",
         "python -m hw.bridge --port /dev/ttyACM0 --coupling coupling.json",
         first="port rehearse scenario coupling arm duration",
@@ -112,11 +115,11 @@ def _parser() -> argparse.ArgumentParser:
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_condition()
-    latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
+    latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the measured latency"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     parser.add_energy_budget()
     parser.add_limiter()
-    seconds, most = "of forces at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
+    seconds, most = "time at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
     parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
     parser.add_details()
     parser.add_output(picture=True)
@@ -135,7 +138,7 @@ def _print_certificate(
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
-    title = "certified for the delay measured, and in reserve for longer ones"
+    title = "certified for the measured delay, and reserves for longer delays"
     console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
     remarks = [(program.assessment.force_limits.within(caps).words, *program.remarks()) for program in programs]
     shared = set(remarks[0]).intersection(*remarks) if len(programs) > 1 else set()
@@ -146,7 +149,7 @@ def _print_certificate(
         console.print(f"[dim]·[/] {remark}", highlight=False)
     if len(programs) == 1:
         console.print(
-            "no reserve: nothing that is no stiffer is certified for a longer delay, so late answers end the session"
+            "no reserve: no coupling this soft is certified for a longer delay, so late answers end the session"
         )
 
 
@@ -186,7 +189,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """Bound the power [W] that a hand may take during a tick longer than T_max: sum f^2/(4 delta)."""
+    """Bound the power [W] that a hand may receive during a tick longer than T_max: sum f^2/(4 delta)."""
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 

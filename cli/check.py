@@ -66,7 +66,7 @@ class _Checked:
 
 
 def main(argv: list[str]) -> int:
-    """Prove a stored coupling again. 0: proved, 1: not."""
+    """Prove a stored coupling again. Return 0 if it is proved, 1 if not."""
     args = _parser().parse_args(argv)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
@@ -136,7 +136,7 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
 
 
 def _guarantee(loop: Loop, condition: Condition) -> str:
-    """Return the environments of a condition in words, with the devices if the condition is for known ones only."""
+    """Return the environments of a condition in words, with the devices if it is for known devices only."""
     devices = f"; every passive hand, on {described(loop)}" if condition.name in KNOWN_CONDITIONS else ""
     return f"{condition.words(loop)}{devices}"
 

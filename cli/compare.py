@@ -30,7 +30,7 @@ _MOST = 6  # curves that can be told apart in one panel
 
 
 def main(argv: list[str]) -> int:
-    """Compare couplings. 0: done, 1: a coupling could not be designed, 130: interrupted, with the finished parts."""
+    """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "design.compare")
@@ -44,9 +44,9 @@ def _parser() -> options.Parser:
         "design.compare", what, "python -m design.compare", two, first="scenario coupling condition reference out json"
     )
     parser.add_loop()
-    names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
+    names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("of designs that name none; one of your own judges all couplings")
+    parser.add_condition("the condition of designs that name none; your own condition judges all couplings")
     parser.add_output(picture=True)
     return parser
 
@@ -66,7 +66,7 @@ class _Alternatives:
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     if isinstance(args.condition, str):
-        raise InputError("--condition is for the designs of --coupling; without it every coupling is a row")
+        raise InputError("--condition is for the designs of --coupling; give --coupling or leave out --condition")
     out = options.out_folder(args, "compare")
     with render.progress("running every coupling") as move:
         rows = alternatives(scenario, args.case, move, args.condition)
@@ -91,7 +91,7 @@ def _nearest(couplings: Sequence[Alternative]) -> str:
 
     best = min(guaranteed, key=distance)
     if best.force_error_percent is None and best.dc_ratio is None:
-        return "No force error was measured, and the object has no static stiffness: nothing tells which is nearest."
+        return "No force error was measured, and the object has no static stiffness: the nearest coupling is not known."
     error = render.optional(best.force_error_percent, "{:.3g} % force error", "no force error was measured")
     static = "no static stiffness" if best.dc_ratio is None else f"{_share(best.dc_ratio, '-')} of the stiffness"
     return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {static}, {error}."
@@ -168,7 +168,7 @@ def _names(text: str) -> tuple[str, ...]:
     if "" in names:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas" if text else "is empty")
     if len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"is {text!r}: a name stands there twice")
+        raise argparse.ArgumentTypeError(f"is {text!r}: a name is repeated")
     if len(names) > _MOST:
         raise argparse.ArgumentTypeError(f"has {len(names)} entries, allowed are 1 to {_MOST}")
     return names

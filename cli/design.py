@@ -414,7 +414,7 @@ def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
 
 _OVER_RANGES: dict[str, str | Callable[[coverage.OverRanges], str]] = {
     "coupling": "{r.coupling}",
-    "required/available": _both("required_over_available", "{:.4f}"),
+    "share of the damping": _both("required_over_available", "{:.4f}"),
     "vertices violated": "{r.violated}",
     "rms error": lambda row: _both("rms_mismatch_db", "{:z.2f}")(row) + " dB",
     "largest error": lambda row: _both("relative_mismatch_db", "{:z.2f}")(row) + " dB",

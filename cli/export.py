@@ -1,6 +1,6 @@
 """python -m design.export coupling.json: export a stored coupling, or its discrete process, as C.
 
-The loop is that of the file, so that the exported process is the certified one.
+The loop is read from the file, so that the exported process is the certified one.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class _Exported:
 
 
 def main(argv: list[str]) -> int:
-    """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
+    """Export a stored coupling. Return 0, or 1 if the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
     stored = read_coupling(args.coupling)
     speak(stored.loop.unit)
@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
     test = trial(block)
     write(path, comments_in_unit(c_source(block, test, path.name)))
 
-    forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
+    forces = "not limited in this file: the proof holds below the motors' limits (--force-limit adds the limiter)"
     if block.limiter:
         limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
         forces = (
@@ -120,14 +120,14 @@ def _parser() -> options.Parser:
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
-    link = "leave out Theta, where the link to the devices is that delay"
+    link = "leave out Theta, if the link to the devices has this delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
-    limit = "with the limiter that the certificate covers, for forces of up to so much [N]: one for all, one for each "
-    limit += "device (the length of the vector of its axes) or one for each axis"
+    limit = "add the limiter that the certificate covers, with these largest forces [N]: one for all, one for each "
+    limit += "device (length of its force vector) or one for each axis"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     single = "compute in single precision, for processors without double; its error is printed"
     parser.add_argument("--float", action="store_true", help=single)
-    parser.add_condition("the condition of the file's certificate, where that is one of your own")
+    parser.add_condition("the condition of the file's certificate, if it is your own")
     parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)", seed=False)
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
     parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")

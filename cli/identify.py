@@ -1,9 +1,9 @@
 """python -m hw.identify: measure the damping that a device guarantees, by a chirp of a small force and a free release.
 
 Two sittings are recorded with the handles at different places, and nobody may hold them. If a hand damps a handle in
-one sitting, the other sitting reveals it. The chirp is played in a session of the bridge with all its limits, whose
-force cap is the excitation's largest force. With --transmission two sittings with clamped handles follow. They bound
-the mass of the motor and the transmission (hw/transmission.py), which the known-device conditions need.
+one sitting, the other sitting reveals it. The chirp is played in a bridge session with all of its limits; the force cap
+is the excitation's largest force. With --transmission two sittings with clamped handles follow. They bound the mass of
+the motor and the transmission (hw/transmission.py), because the known-device conditions use these bounds.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
 from haptic_loop.models.device import Device, RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
 
-_LEVELS = 1.0, 0.5  # shares of the force in the sittings with clamped handles; play shows as a difference
+# Shares of the force in the sittings with clamped handles; a difference between these sittings shows backlash.
+_LEVELS = 1.0, 0.5
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 
 
@@ -73,8 +74,8 @@ class _Report:
     bounded: bool = off_table()
     warnings: list[str] = off_table()
     reason: str | None = off_table("if given")
-    transmissions: list[TransmissionBounds] | None = off_table("if given", None)  # of every axis, by --transmission
-    no_transmissions: str | None = off_table("if given", None)  # why there are none, where they were requested
+    transmissions: list[TransmissionBounds] | None = off_table("if given", None)  # one per axis, with --transmission
+    no_transmissions: str | None = off_table("if given", None)  # why --transmission gave none
 
     @property
     def verdict(self) -> str:
@@ -92,7 +93,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
+    """Identify every axis. Return 0 if all requested bounds were found, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario, settings = steady_scenario(args, "hw.identify"), check_link(args)
     if boards_behind(args, scenario):
@@ -144,11 +145,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of the chirp (default 2.5)")
     rub = "dry friction of an emulated device (default 0)"
     add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
-    fast = "speed that a slow swing reaches, and up to which the bound holds (default 0.5)"
+    fast = "largest speed of a slow swing; the bound holds up to it (default 0.5)"
     add("--speed", type=number(0.05, 1.5), default=0.5, metavar="M/S", help=fast)
-    far = "amplitude of that swing (default 30)"
+    far = "amplitude of the slow swing (default 30)"
     add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)
-    count = "records of every axis, each with the handles at another place; two have to agree (default 2)"
+    count = "sittings; each records every axis with the handles at another place, and two must agree (default 2)"
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
     stay = "leave the handles where they are between sittings (an emulator has nobody to move them)"
     add("--same-place", action="store_true", help=stay)
@@ -251,14 +252,14 @@ def _with_transmissions(
 
 
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Write a device's [[device]] table for a scenario file, with its own transmission if none was identified.
+    """Write a device's [[device]] table for a scenario file, with the declared transmission if none was identified.
 
     `axes` and `bounds` have one entry per free axis. Masses and transmission of several axes are their means.
     """
 
     def listed(figures: Sequence[str]) -> str:
         by_axis = dict(zip(device.free, figures, strict=True))
-        each = [by_axis.get(k, figures[0]) for k in range(device.axes)]  # a clamped axis has some number, too
+        each = [by_axis.get(k, figures[0]) for k in range(device.axes)]  # the list has a number for clamped axes, too
         return f"[{', '.join(each)}]" if device.axes > 1 else figures[0]
 
     def mean(figures: Iterable[float]) -> float:
@@ -267,7 +268,7 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
     mass, speed = mean(e.friction.mass for e in axes), min(e.viscosity.speed for e in axes)
     lines = ["[[device]]", f"damping = {listed([f'{e.viscous:.6g}' for e in axes])}"]
     lines.append(f"delta = {listed([_floored(e.delta, 6) for e in axes])}")
-    comment = in_unit("# [m/s] of the record: delta is not known beyond it")
+    comment = in_unit("# [m/s] largest speed of the record; delta is not known above it")
     lines.append(f"credible_speed = {_floored(speed, 3)}  {comment}")
     if device.axes > 1:
         lines += [f"axes = {device.axes}", f"clamped = {list(device.clamped)}"]
@@ -288,7 +289,7 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
         motor, handle = mean(each.motor_mass for each in known), mean(each.handle_mass for each in known)
         stiffness = mean(each.stiffness for each in known)
     else:
-        lines.insert(0, "# no transmission explained the record: its stiffness and how masses are shared are declared")
+        lines.insert(0, "# no transmission explained the record: the stiffness and the mass ratio are declared values")
         motor = mass * device.motor_mass / (device.motor_mass + device.handle_mass)
         handle, stiffness = mass - motor, device.transmission_stiffness
     masses = [f"motor_mass = {motor:.6g}", f"handle_mass = {handle:.6g}"]
@@ -296,7 +297,7 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
 
 
 def _floored(value: float, decimals: int) -> str:
-    """Return a number that is never above `value`, with `decimals` or, where it is small, four digits."""
+    """Return `value` rounded down to `decimals`, or to four digits if it is small."""
     decimals = max(decimals, 3 - math.floor(math.log10(abs(value)))) if value else decimals
     return f"{math.floor(value * 10**decimals) / 10**decimals:.{decimals}f}"
 

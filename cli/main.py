@@ -28,20 +28,20 @@ from haptic_loop.sim.scenario import InputError
 
 #: command -> (module of python -m, purpose); the file of the same name in this folder has the code
 COMMANDS = {
-    "audit": ("design.audit", "are these gains safe, and how far"),
+    "audit": ("design.audit", "judge whether gains are safe, and with what margin"),
     "design": ("design", "design a coupling, prove its certificate and store both"),
     "run": ("sim.run", "close the loop once: stability, transparency and error"),
-    "validate": ("sim.validate", "random passive humans in both engines, and a search for the worst"),
+    "validate": ("sim.validate", "test with random passive humans in both engines, and search for the worst"),
     "bridge": ("hw.bridge", "drive a device over a serial port"),
-    "zwidth": ("sim.zwidth", "the Z-width map: which springs and dampers are safe"),
+    "zwidth": ("sim.zwidth", "draw the Z-width map: which springs and dampers are safe"),
     "view": ("sim.view", "feel the loop in a window, or film it"),
-    "trace": ("sim.trace", "what grows in a stored trace"),
-    "accuracy": ("sim.accuracy", "speed against error, engine by engine"),
+    "trace": ("sim.trace", "measure how oscillations grow in a stored trace"),
+    "accuracy": ("sim.accuracy", "compare speed and error of the engines"),
     "check": ("design.check", "prove a stored coupling again, from its file alone"),
-    "compare": ("design.compare", "the same devices and hands with every coupling"),
-    "export": ("design.export", "a stored coupling as C99"),
-    "identify": ("hw.identify", "mass, damping and transmission of a device from a measurement"),
-    "replay": ("hw.replay", "a recorded session through the controller again"),
+    "compare": ("design.compare", "compare couplings with the same devices and hands"),
+    "export": ("design.export", "write a stored coupling as C99"),
+    "identify": ("hw.identify", "measure mass, damping and transmission of a device"),
+    "replay": ("hw.replay", "feed a recorded session through the controller again"),
 }
 
 

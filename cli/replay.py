@@ -18,16 +18,16 @@ class _Compared:
 
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
-    filled_in: int = render.figure("without an answer")
-    asked_differ: int = render.figure("other forces asked for")
-    sent_differ: int = render.figure("other forces sent")
+    filled_in: int = render.figure("ticks without an answer")
+    asked_differ: int = render.figure("requested forces that differ")
+    sent_differ: int = render.figure("sent forces that differ")
     largest_difference_n: float = render.figure("largest difference [N]")
     first_difference_s: float | None = render.figure("first difference [s]")
     identical: bool = render.figure("identical", lambda same: "yes, bit by bit" if same else "no")
 
 
 def main(argv: list[str]) -> int:
-    """Replay a trace. 0: every force equals the recorded one bit by bit, 1: not."""
+    """Replay a trace. Return 0 if every force equals the recorded one bit by bit, 1 if not."""
     parser = options.Parser(
         "hw.replay",
         "Feed a recorded session through the controller again and compare the forces bit by bit.",

@@ -1,4 +1,4 @@
-"""The terminal of reports, which never cuts numbers in tables and prints names literally."""
+"""A terminal for reports that never cuts numbers in tables and prints names literally."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Screen(Console):
     """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print as rich does, but widen until no table loses a character."""
+        """Print as rich does, but widen the console until no table loses a character."""
         own, objects = self._width, tuple(map(_in_unit, objects))
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
@@ -52,7 +52,7 @@ class Screen(Console):
         return super().render_str(text, **how)
 
     def on_broken_pipe(self) -> None:  # rich would exit with 1, which means that a claim does not hold
-        """Continue without output after its reader has left (`| head -1`), with the same exit code."""
+        """Continue without output after the reader of the output has left (`| head -1`); keep the exit code."""
         self.quiet = True
         nobody_reads()
 

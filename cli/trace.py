@@ -25,7 +25,7 @@ class _Traced:
 
 
 def main(argv: list[str]) -> int:
-    """Analyse a trace. 0: done, whatever the result."""
+    """Analyse a trace. Return 0, whatever the result."""
     args = _parser().parse_args(argv)
     if args.plot is not None:
         check_file("--plot", Path(args.plot))
@@ -60,7 +60,7 @@ def _verdict(growths: list[Growth]) -> str:
 def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.trace",
-        "Growth of the oscillations in a stored trace, from its displacements alone, and its picture.",
+        "Measure how oscillations grow in a stored trace, from its displacements alone, or draw the trace.",
         "python -m sim.trace out/bridge-I/trace.npz",
         "python -m sim.trace out/bridge-I/trace.npz --plot figure.png",
     )

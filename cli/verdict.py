@@ -34,7 +34,7 @@ def assessment_of(
     environment: Environment | None = None,
     energy_budget: float | None = None,
 ) -> Assessment:
-    """Assess the coupling in the scenario's loop; `environment` is the one of its ranges that is simulated."""
+    """Assess the coupling in the scenario's loop; `environment` is the member of the ranges that is simulated."""
     ranges = scenario.loop(args.case).ranges
     with render.progress("searching the ranges" if ranges else "assessing the coupling") as move:
         return assessed(

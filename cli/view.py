@@ -1,4 +1,4 @@
-"""python -m sim.view: the loop in real time in MuJoCo's viewer, or as a film without a display."""
+"""python -m sim.view: show the loop in real time in MuJoCo's viewer, or film it without a display."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _LONGEST = 3600  # [s] longest video
 
 
 def main(argv: list[str]) -> int:
-    """Show the loop until the window is closed or the film is full. 0: shown; 130: interrupted."""
+    """Show the loop until the window is closed or the film is complete. Return 0, or 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.sim.view.stage import check_film
 
@@ -151,7 +151,7 @@ class _Report:
         if torques := self.events[0].assessment.held_torques:
             yield f"Held torques: {torques}."
         if clock := self.ended.clock:
-            yield f"The clock was missed {clock.overruns} times: {clock.lost_s:.2f} s lost."
+            yield f"The loop fell behind the clock {clock.overruns} times: {clock.lost_s:.2f} s lost."
         if film := self.ended.video:
             yield f"{film.file}: {film.pictures} pictures"
 
@@ -166,24 +166,24 @@ def _parser() -> options.Parser:
     )
     add = parser.add_argument
     parser.add_loop()
-    what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
+    what = f"the first coupling: {', '.join(_names())} or FILE.json; designed is spring-damper"
     add("--coupling", metavar="NAME|FILE", help=what)
     parser.add_condition("the condition of designs")
     parser.add_limiter()
-    add("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{_SCRIPT}')")
-    until = "default: a window until it is closed, a video until after its script"
+    add("--script", metavar="EVENTS", help=f"events with their times [s] (default of a video: '{_SCRIPT}')")
+    until = "length (default: a window until it is closed, a video until after its script)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
     parser.add_json()
     add = parser.add_argument_group("without a display").add_argument
     add("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
-    rate = "pictures per second (default 10); for a .gif what divides 100"
+    rate = "pictures per second (default 10); for a .gif a divisor of 100"
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     parser.only("with --video", lambda args: args.video, "fps")
     return parser
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
-    """Return the first coupling by the user's name, and the script after it. Raises InputError."""
+    """Return the user's name of the first coupling, and the script after it. Raises InputError."""
     label = _label(args)
     usual = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else _SCRIPT if usual else None
@@ -215,7 +215,7 @@ def _names() -> list[str]:
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """Film the session by its own clock, so that the film is reproducible; Ctrl-C makes it shorter."""
+    """Film the session in simulated time, so that the film is reproducible; Ctrl-C makes it shorter."""
     from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)

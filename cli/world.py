@@ -86,12 +86,12 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """Return W0 [J] of --energy-budget. Raises InputError for a cap, because the account of a world has none."""
+    """Return W0 [J] of --energy-budget. Raises InputError for a cap, because a world's account has no cap."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget
     if cap and np.isfinite(cap[0]):
-        raise InputError("--energy-budget: the account of a world has no cap, give W0 alone")
+        raise InputError("--energy-budget: the energy account of a world has no cap, give W0 alone")
     return float(start)
 
 
@@ -125,11 +125,11 @@ def _energy(joules: float) -> str:
 # ----------------------------------------------------------------------------------------------------
 # sim.run
 
-_WRITTEN = ("scene.xml", "world.xml")  # files of the devices, and of the scene with its springs
+_WRITTEN = ("scene.xml", "world.xml")  # the model of the devices, and that of the scene with its springs
 
 
 def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Run a scenario with a world and report it. 0: the run was completed, 130: interrupted."""
+    """Run a scenario with a world and report it. Return 0 if the run was completed, 130 if interrupted."""
     for name in ("paper", "cross_check", "error", "vertex"):
         if getattr(args, name, None):
             shown = name.replace("_", "-")
@@ -193,11 +193,11 @@ def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Ite
 
 
 def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Throw random and lossless hands at a world. 0: the energy account holds for all, 1: not."""
+    """Run a world with random and lossless hands. Return 0 if the energy account holds for all, 1 if not."""
     if args.adversary:
-        raise InputError("--adversary: of a world, `design.audit` reports what adversaries reached")
+        raise InputError("--adversary: for a world, `design.audit` reports the energy that adversaries gained")
     if args.duration == 0:
-        raise InputError("--duration 0: a world has no eigenvalues, give the seconds of the traces")
+        raise InputError("--duration 0: a world has no eigenvalues, give the length of the traces [s]")
     began, chosen = time.perf_counter(), _chosen(args, scenario)
     report = _reported(args, scenario, chosen, START_J)
     with render.progress("validating") as move:
@@ -234,7 +234,7 @@ def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[st
 
 
 def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Design a coupling for a world and store it. 0: certified for any environment, 1: not."""
+    """Design a coupling for a world and store it. Return 0 if it is certified for any environment, 1 if not."""
     loop, kind = scenario.loop(args.case), args.coupling
     condition = args.condition or ANY_ENVIRONMENT.name
     with options.refused(args=args), render.designing(loop, kind, condition) as progress:
@@ -247,7 +247,7 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
 
 
 def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Path) -> int:
-    """Report the parts of a scene and the energy that adversaries gained. 0: the run is guaranteed, 1: not."""
+    """Report a scene's parts and the energy that adversaries gained. Return 0 if runs have a guarantee, 1 if not."""
     began = time.perf_counter()
     report = _reported(args, scenario, chosen, START_J)
     with render.progress("attacking"):

@@ -1,4 +1,4 @@
-"""python -m sim.zwidth: the Z-width map (K-B plane): certified, exact for random humans, simulated.
+"""python -m sim.zwidth: map which K and B are certified, stable with random humans, and stable in MuJoCo (Z-width).
 
 options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> files
 """
@@ -33,17 +33,17 @@ _PRESS = 3.0  # [N] steady force of a hand in maps of couplings; soft environmen
 
 
 def main(argv: list[str]) -> int:
-    """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
+    """Draw a map. Return 0 if nothing contradicts it and every mark is certified, else 1; 130 if interrupted."""
     args = _parser().parse_args(argv)
     of_coupling = args.coupling is None
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.zwidth")
     require_constant_delay(scenario, "sim.zwidth")
     if scenario.period is not None:
-        raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
+        raise InputError("period: a map simulates constant periods; give T_max alone, its certificates cover all below")
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
-        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
+        raise InputError(f"--case none has no coupling, so there is nothing to map: {instead}")
     chosen = chosen_by(args, scenario) if args.coupling else None  # one coupling for the whole map
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -82,29 +82,31 @@ def _parser() -> options.Parser:
     parser.add_loop()
     parser.add_rigid()
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
-    fixed = "this coupling, fixed, and K and B of the environment's contact springs on the axes"
+    fixed = "keep this coupling and vary K and B of the environment's contact springs"
     names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
-    parser.add_condition("that such a coupling is designed for; one of your own is drawn in every map", to=of_map)
+    parser.add_condition("the condition of the fixed coupling's design; your own is drawn in every map", to=of_map)
     rows = "rows and columns (default 60; 24 with --coupling, and before walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
     of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
-    mark = "where does this coupling lie? (repeatable)"
+    mark = "also judge and mark this point (repeatable)"
     of_map.add_argument("--mark", type=_mark, action="append", default=[], metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
     points = parser.add_argument_group("the points simulated in MuJoCo")
-    rows = "rows and columns of them (default 10, 0 for none)"
+    rows = "rows and columns of simulated points (default 10; 0: none)"
     points.add_argument("--points", type=options.whole(0, 400), metavar="N", default=10, help=rows)
-    points.add_argument("--duration", type=options.number(), metavar="SECONDS", default=3.0, help="of each (default 3)")
+    points.add_argument(
+        "--duration", type=options.number(), metavar="SECONDS", default=3.0, help="length of each run (default 3)"
+    )
     parser.add_output(picture=True)
     parser.set_defaults(limiter=None)  # the simulated motors never clip
     parser.only("about simulated points: --points 0 has none", lambda args: args.points, "duration")
-    designed = "with --coupling, or of your own: nothing else is designed"
+    designed = "with --coupling, or for a condition of your own"
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
-    gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
+    gains = "for a map of spring-dampers: with --coupling the map varies the environment"
     parser.only(gains, lambda args: args.coupling is None, "rigid")
     return parser
 
@@ -216,7 +218,7 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """Return the text of the damping that the worst channel needs."""
+    """Return the text of the damping that the worst channel requires."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
@@ -243,22 +245,22 @@ def _remarks(report: MapReport) -> Iterator[str]:
         )
     if simulation.points:
         yield (
-            f"A simulated point oscillates if, at the end of {simulation.duration_s:g} s, an octave above "
-            f"{simulation.from_hz:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude, over "
-            f"{simulation.threshold_m:g} m; {UNDECIDED} where the linear loop is within {DECIDED:g} 1/s of the edge."
+            f"A simulated point oscillates if, at the end of {simulation.duration_s:g} s, some octave above "
+            f"{simulation.from_hz:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude and exceeds "
+            f"{simulation.threshold_m:g} m; {UNDECIDED}: the linear loop is within {DECIDED:g} 1/s of the edge."
         )
     if report.interrupted:
-        yield "Interrupted: the map has what was finished."
+        yield "Interrupted: the map shows the finished parts."
 
 
 def _about(conditions: Sequence[str]) -> str:
     """Return the words for the axes and for the guarantee of a certified cell."""
-    line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
+    line = "K and B are those of every contact spring; a sweep certifies each cell for its own environment only"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
         f"{line}: this-environment, the population and MuJoCo with the coupling's model set to the cell's environment, "
-        f"{zwidth.MODEL_KEPT} with the model left at what the coupling was designed for."
+        f"{zwidth.MODEL_KEPT} with the model of the coupling's design."
     )
 
 
