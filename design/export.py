@@ -1,4 +1,4 @@
-"""A stored coupling, or its discrete process, as C99 with its own test."""
+"""Write a stored coupling, or its discrete process, as C99 with a test."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 # can keep this order, so that an exported block repeats its test vector to the last bit. In single precision
 # coefficients, inputs and every operation are rounded to 24 bits.
 #
-# If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity. The tick
-# switches the first wrong limit until none is wrong; the switching ends (docs/theory.md). The elimination keeps the
-# order of the channels and needs no pivots, because all principal minors are positive. The tick then adds KICK e to
-# [y; z+] and sets the sent forces to f.
+# If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, with unlimited
+# forces q, limited forces f and slips e. The tick makes the first wrong limit active or inactive until none is wrong.
+# This takes finitely many switches (docs/theory.md). The elimination keeps the order of the channels and needs no
+# pivots, because all principal minors are positive. The tick then adds KICK e to [y; z+] and sets the sent forces to f.
 #
 # If the force of a device is limited as a vector, the tick first tries a step of Newton's method in u = f + tau e. If
 # this step does not halve the residual, the tick replaces the step by one of the Douglas-Rachford iteration, which
@@ -43,8 +43,8 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 
 _TICKS = 64  # length of a test vector, longer than the delays and the fast modes of a loop
 _MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
-_SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 170 units in the last place
-_RESIDUAL = 1e-12  # allowed residual of a force vector, relative to the limit, or its rounding if that is larger
+_SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
+_RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, if rounding allows it
 _BALL_ROUNDING = 16  # allowed rounding of a residual, in units in the last place of its largest terms
 _MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
@@ -91,7 +91,7 @@ class _Trial:
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """Return V(z), force to displacement. Raises ValueError if the coupling is not a V in feedback around Psi E."""
+    """Return V(z), which maps forces to displacements. Raises ValueError for a coupling that has no V around Psi E."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         reason = "this coupling is no V in feedback around the environment; --process exports the process with it"
@@ -106,11 +106,11 @@ def process_block(
     force_limit: Sequence[float] | None = None,
     balls: Sequence[slice] = (),
 ) -> ExportedBlock:
-    """Return F(z) (6), displacements to forces.
+    """Return F(z) of (6), which maps displacements to forces.
 
     Args:
         stored: The coupling with its loop.
-        with_theta: Whether the block contains Theta; False if the link to the devices is this delay.
+        with_theta: Whether the block contains the delays Theta; False if the link to the devices has them.
         force_limit: (m,) [N] limits of the certificate's limiter; None for a block without a limiter.
         balls: Channels whose forces the limiter limits as one vector.
 
@@ -220,7 +220,7 @@ def _sequential(
 
 
 def _box_matrix(limiter: Limiter) -> Array:
-    """Return M of the box problem (m, m), made regular if the environment floats."""
+    """Return M of the box problem (m, m). If the environment floats, M is singular and GROUNDED is added."""
     problem = limiter.problem
     assert isinstance(problem, BoxProblem)
     M = problem.M
@@ -233,7 +233,7 @@ def _turns(m: int) -> int:
 
 
 def _rounding(single: bool) -> float:
-    """Return the rounding error of a residual, relative to the terms of its difference."""
+    """Return the largest rounding error of a residual, relative to the sum of the sizes of its terms."""
     return float(np.float32(_SINGLE_ROUNDING)) if single else PIVOT_ROUNDING
 
 
@@ -351,7 +351,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             u[i] = asked[i]
         for _ in range(_MOST_STEPS):
             size, worst = zero, zero
-            for i in rows:  # g is u within the limits, and v the rest over tau
+            for i in rows:  # g is u, shortened to the limits, and v is (u - g)/tau.
                 square = zero
                 for k in range(first[i], last[i]):
                     square += u[k] * u[k]
@@ -373,7 +373,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
             if worst <= one:
                 solved = True
                 break
-            if tried and two * worst > best:  # Newton's step is replaced by the other one.
+            if tried and two * worst > best:  # Newton's step is replaced by that of Douglas and Rachford.
                 for i in rows:
                     u[i] = back[i]
                 tried = False
@@ -429,7 +429,7 @@ def _delays(loop: Loop, with_theta: bool) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A block as a C file, with its test.
+# The C file of a block, with its test.
 
 
 _SOURCE_C = Template("""\
@@ -438,11 +438,11 @@ $about
  *
  * One tick:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that starts at 0.0 and adds the
  * states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s (FLT_EVAL_METHOD 0),
- * without contraction of a*b + c and without -ffast-math, it repeats Python's test vector to the last bit:
+ * without contraction of a*b + c and without -ffast-math, the code repeats Python's test vector to the last bit:
  *
  *     cc -std=c99 -O2 -ffp-contract=off -DHAPTIC_LOOP_TEST $file -o test$libm && ./test
  *
- * For its declarations alone: #define HAPTIC_LOOP_DECLARATIONS_ONLY, then #include "$file".
+ * To include only the declarations: #define HAPTIC_LOOP_DECLARATIONS_ONLY, then #include "$file".
  */
 #ifndef HAPTIC_LOOP_$NAME
 #define HAPTIC_LOOP_$NAME
@@ -455,7 +455,7 @@ typedef struct {
     ${real} z[${NAME}_STATES];
 $more_state} ${name}_state;
 
-/* To rest. */
+/* Sets the state to rest. */
 void ${name}_reset(${name}_state *state);
 
 /* One tick: $input in, $output out. */
@@ -510,7 +510,7 @@ int main(void)
     ${name}_state state;
     ${real} out[${NAME}_CHANNELS];
     int run, k, i, wrong = 0;
-    for (run = 0; run < 2; run++) { /* twice: a reset brings back the start */
+    for (run = 0; run < 2; run++) { /* The second run tests the reset. */
         ${name}_reset(&state);
         for (k = 0; k < $ticks; k++) {
             ${name}_step(&state, test_input[k], out);
@@ -532,7 +532,7 @@ int main(void)
 
 #: The user closes the feedback loop around an exported coupling and needs D and the free output to solve the loop.
 _FREE_DECLARED = """
-/* $y = free + D $u: the free part, before this tick's $u is known, and D, for solving u = x - $y, $u = E(u). */
+/* $y = free + D $u. The free part does not depend on this tick's $u. Use it with D to solve u = x - $y, $u = E(u). */
 void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS]);
 extern const ${real} ${name}_D[${NAME}_CHANNELS][${NAME}_CHANNELS];
 """
@@ -556,7 +556,8 @@ static ${real} ${name}_size(${real} a)
     return a < 0.0${f} ? -a : a;
 }
 
-/* f = q - M e within the limits, e of the sign of the limit that is reached: the first wrong limit is switched. */
+/* Solves f = q - M e with f within the limits; e is 0 or has the sign of the reached limit. Every turn switches the
+ * first wrong limit. */
 static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
 {
     ${real} sign[${NAME}_CHANNELS] = {0.0${f}}, a[${NAME}_CHANNELS][${NAME}_CHANNELS], v[${NAME}_CHANNELS];
@@ -615,7 +616,7 @@ static ${real} ${name}_size(${real} a)
     return a < 0.0${f} ? -a : a;
 }
 
-/* The solution x of the rows [A, b] from begin to end, with b in column end. */
+/* Solves A x = b for the rows from begin to end; b is in column end. */
 static void ${name}_eliminate(${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1], int begin, int end, ${real} *x)
 {
     int i, j, k, pivot;
@@ -643,8 +644,9 @@ static void ${name}_eliminate(${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1],
     }
 }
 
-/* f = q - M e, every device's vector f within its limit, and e along it where it is at the limit: by Newton's steps in
- * u = f + tau e while these halve the residual, else by those of Douglas and Rachford. Where neither ends, f is 0. */
+/* Solves f = q - M e with every device's vector f within its limit; e is 0, or parallel to f at the limit. A step of
+ * Newton in u = f + tau e that does not halve the residual is replaced by one of Douglas and Rachford. If the steps do
+ * not converge, f is 0. */
 static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
 {
     ${real} u[${NAME}_CHANNELS], g[${NAME}_CHANNELS], v[${NAME}_CHANNELS], r[${NAME}_CHANNELS], x[${NAME}_CHANNELS];
@@ -888,7 +890,7 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     delays = f"; {switching_guarantee(stored.loop.varying_delay)}" if stored.loop.varying_delay else ""
     how = f"{claim.condition}, proof: {claim.proof}"
     if claim.guarantee == RANGES:
-        how += "; at the vertices, between them nothing is proved: design.check searches there"
+        how += "; proved at the vertices only: design.check searches between them"
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
         "also while forces are limited." if limited else "linear forces only."
     )

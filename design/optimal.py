@@ -2,7 +2,7 @@
 
 The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
 solution until a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
-proves. With R(1) = g I the static stiffness F(1) = g E(1) is symmetric for all springs of the environment.
+proves. Since R(1) = g I, the static stiffness is F(1) = g E(1): every spring of the environment is scaled by g.
 """
 
 from __future__ import annotations
@@ -35,13 +35,18 @@ from haptic_loop.design.worst_member import Searched, search_ranges
 _SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
-_FEWEST_TAPS = {True: 22, False: 14}  # taps from which a small gain ends the search; the key is `_Search.simply`
-_KEPT_STIFFNESS = 0.5  # A solution is rejected if it renders less than this share of an earlier best one's stiffness.
-_FELT_STIFFNESS = 0.02  # No such floor applies below this share of the environment's static stiffness.
-_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # Starting (beta, c) of a limiter; only the first if psi = 0.
+_FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
+_KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below this share of an accepted solution's.
+_FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's is dropped.
+_LAGS = (
+    (BETA, 0.05),
+    (0.1, 0.5),
+    (0.5, 2.0),
+)  # Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
 _HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
-_RESERVES = (0.95, 2.5, 50.0)  # shares of the margin that stay unused; the next is taken if the proof fails
-# An environment enters the program if it needs more than 1 + _TOLERATED times the damping; scaling covers less.
+_RESERVES = (0.95, 2.5, 50.0)  # unused damping in units of MARGIN; if a proof fails, the next value is tried
+# An environment that requires more than 1 + _TOLERATED times the damping is added to the program. Scaling the forces
+# removes smaller excesses.
 _TOLERATED = 0.02
 _SEARCHED = 0.2  # least share of --seconds for the search between the vertices of ranges
 
@@ -55,7 +60,7 @@ class _BasisResult:
     states: int  # order of the loop
     mismatch_db: float  # objective
     g: float  # rendered share of the static stiffness
-    reason: str | None  # reason why a sweep, or with a limiter the proof, does not certify the coupling, or None
+    reason: str | None  # why the sweep (with a limiter: the proof) does not certify the coupling, or None
     seconds: float  # time since the design began
     rejected: str | None = None  # reason why the coupling is rejected although it is certified, or None
 
@@ -73,7 +78,7 @@ class Optimal(Design):
     """Best proved coupling, with the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
-    g: float = field(kw_only=True)  # F(1) = g E(1); the ratio of the norms if the coupling is not a force filter
+    g: float = field(kw_only=True)  # F(1) = g E(1); if the coupling is not a force filter, the ratio of their norms
     states: int = field(kw_only=True)  # order of the loop
     certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
     bases: tuple[_BasisResult, ...] = field(kw_only=True, default=())
@@ -115,8 +120,8 @@ def design(
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
-    Raises ValueError for a loop with walls, and for an environment that is unsafe with any damping because it is not
-    passive.
+    Raises ValueError for a loop with walls, for a delta that is not positive, and for an environment that is unsafe
+    with any damping because it is not passive.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
@@ -190,11 +195,11 @@ def _for_known_devices(
     """Return the best coupling under known-device, or under this-environment if that is better.
 
     For fixed beta and fixed multipliers of the facts the block is affine in the forces. The filter over the smallest
-    basis is designed for three values of beta. For larger bases beta is the minimum of a parabola through their merits,
-    and the multipliers are those of the last accepted filter. The beta with which that filter requires the least
-    damping would be no better, because the program would return the same filter.
+    basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola through the three
+    merits, and the multipliers of the last accepted filter. Its best beta is not used, because with that beta the
+    program would return the same filter again.
 
-    Raises ValueError as `design`, and for a loop that known-device does not cover.
+    Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise ValueError(f"{KNOWN_DEVICE.name}: {reason}")
@@ -302,11 +307,11 @@ class _Search:
 
     @property
     def proves_last(self) -> bool:
-        """Whether only the best coupling of all bases is proved. A limiter is solved for with proved multipliers."""
+        """Whether proofs follow the last basis. With a limiter each basis uses the multipliers of an earlier proof."""
         return not self.options.limiter
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
-        """Return the limiters to solve for: that of the solution `before` with its certified multiplier, or the starts.
+        """Return the limiters to design with: the certified limiter of the solution `before`, or those of _LAGS.
 
         Without `options.limiter` return (None,).
         """
@@ -366,9 +371,9 @@ class _Search:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
-        """Return whether a basis is small enough to be tried, and larger than `before` [states].
+        """Return whether a basis is small enough to be tried and its loop has more than `before` states.
 
-        The decision depends on numbers of states and unknowns only, so that it is the same on a busy machine.
+        The decision depends only on the numbers of states and unknowns, so that it is the same on a busy machine.
         """
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
@@ -385,8 +390,8 @@ class _Search:
     ) -> tuple[Optimal, _BasisResult]:
         """Return the optimum over a basis, scaled until every sweep passes. With a limiter it is also proved.
 
-        If the optimum renders less than the share `floor` of the static stiffness, it is solved again with a larger
-        weight of the stiffness.
+        If the optimum renders less than the share `floor` of the static stiffness, the program is solved again with a
+        larger weight of the stiffness.
         """
         for heavier in (1.0, 2.5, 6.0):
             tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
@@ -458,7 +463,7 @@ class _Search:
             active = active + missed[:2]
 
     def between(self, candidate: Optimal) -> Optimal:
-        """Return the coupling for ranges after the search between the vertices, with a proof at each vertex.
+        """Search between the vertices of the ranges, and return the coupling with a proof at each vertex.
 
         If the worst environment of the search needs more damping than the devices have, the forces are scaled down.
         """
@@ -473,7 +478,8 @@ class _Search:
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
             coupling = _scaled(unscaled, share)
-            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # Needs scale with forces.
+            # The required damping is proportional to the forces.
+            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)
             last = self._proved(self._assessed(coupling, coupling.g), None)
             last = replace(last, searched=replace(searched, worst=lower))
             if last.proved:
@@ -481,7 +487,7 @@ class _Search:
         return last
 
     def _between_with_multipliers(self, candidate: Optimal, coupling: ForceFilter, over: Callable[[], bool]) -> Optimal:
-        """Return `between` for a condition whose multipliers serve all environments."""
+        """Do the work of `between` for a condition that has the same multipliers in all environments."""
         last = candidate
         for _ in range(_SCALINGS):
             needs = required_damping(self.loop, coupling, self.condition)
@@ -514,7 +520,7 @@ class _Search:
         return candidate
 
     def spring_damper(self) -> Optimal | None:
-        """Return the best spring-damper under this-environment, or None with other constraints or without a result."""
+        """Return the best spring-damper under this-environment; None with further constraints or if there is none."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
@@ -525,7 +531,7 @@ class _Search:
 
     @property
     def known(self) -> KnownDevice:
-        """The condition for known devices, with limited forces where the options ask for them."""
+        """The condition for known devices, with limited forces if the options include the limiter."""
         return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
 
     def proved_elsewhere(self, plain: Optimal) -> Optimal:
@@ -534,7 +540,7 @@ class _Search:
         return candidate if candidate.proved else plain
 
     def multipliers(self, coupling: Coupling) -> tuple[float, ...]:
-        """Return the facts' multipliers with which known-device requires the least damping, or the default ones."""
+        """Return the facts' multipliers with which known-device requires the least damping, or their start values."""
         found = self.known.required(self.loop, coupling).multiplier
         usual = [value for each in self.known.unknowns(self.loop) for value in each.start or each.units]
         return tuple(found[3 * self.loop.channels :] if found else usual)
@@ -542,7 +548,7 @@ class _Search:
     def over_known(self, eta: float, multipliers: Sequence[float], error: float, taps: int, poles: int) -> Optimal:
         """Return the optimum over a basis for beta = `eta` times the largest beta and these facts' multipliers."""
         loop = self.loop
-        largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # Axes of a device have one beta.
+        largest = loop.per_device(largest_beta(loop, 1 - program.MARGIN))  # All axes of a device share beta.
         beta = np.array(loop.per_channel((eta * largest).tolist()))
         own = multipliers[: sum(len(each.units) for each in KNOWN_DEVICE.unknowns(loop))]
         whole = (*beta.tolist(), *(0.0,) * 2 * beta.size, *own)
@@ -560,7 +566,7 @@ class _Search:
         return self._assessed(coupling, coupling.g, whole)
 
     def scaled_and_proved(self, candidate: Optimal) -> Optimal:
-        """Return the coupling with its forces scaled down until known-device proves it, with the best beta."""
+        """Scale the forces down until known-device is proved with the best beta, at most _SCALINGS times."""
         coupling = candidate.coupling
         assert isinstance(coupling, ForceFilter)
         for _ in range(_SCALINGS):
@@ -571,10 +577,11 @@ class _Search:
         return candidate
 
     def _start(self, problem: program.Problem) -> Array:
-        """Return the unknowns of R = kappa I that satisfy every constraint strictly.
+        """Return unknowns of R = kappa I that satisfy every constraint strictly.
 
-        They exist because zero force satisfies each constraint strictly. For F = 0 the Schur complement of the
-        limiter's block is 2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
+        They exist because zero force satisfies each constraint strictly. For F = 0 and the limiter's multiplier M, the
+        Schur complement of its block is 2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is
+        at least 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:
@@ -584,8 +591,8 @@ class _Search:
     def _assessed(self, coupling: Coupling, g: float, multiplier: Sequence[float] | None = None) -> Optimal:
         """Return the coupling with its figures and its swept requirement, without a proof.
 
-        For known-device `multiplier` has beta, zeros for the bounds of q, and the facts' multipliers. With None they
-        are searched.
+        For known-device, `multiplier` holds beta, zeros in place of the bounds of q (`known_device._q_bounds`), and
+        the facts' multipliers. If it is None, they are searched.
         """
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)
@@ -632,7 +639,7 @@ class _Search:
 
 
 def _felt(g: float) -> float:
-    """Return g as least share of the static stiffness, or 0 if g is below _FELT_STIFFNESS."""
+    """Return the floor g of the static stiffness, or 0 if g is below _FELT_STIFFNESS."""
     return g if g >= _FELT_STIFFNESS else 0.0
 
 

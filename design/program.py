@@ -34,24 +34,24 @@ OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
 _BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
-_FASTER = 0.25  # Modes of smaller radius are only in the filter of the sum of all forces.
+_FASTER = 0.25  # With many channels, modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
-_SLOWER = 0.999  # Modes of larger radius get no section.
-_RICH = 8  # largest number of channels for which the basis has sections at the band's end
+_SLOWER = 0.999  # Modes of larger radius are left out of the basis.
+_RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
 _EDGED = {1: 20, 2: 20}  # number of channels: least number of taps for these sections
 _EDGED_OF_MANY = 6  # least number of taps for these sections with more than two channels
-_EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; they are small because the error may jump at the end
+_EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; small, because the error may jump at the band's end
 # Up to FULL channels every force has a filter to every device. With further constraints the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the relative mismatch, up to _RICH channels and above
-HIGH_HZ = 100.0  # Above this frequency a soft row or a cap keeps the force low.
-SOFT = 0.05, 0.3  # The soft row's weight is SOFT[0] min(mismatch so far, SOFT[1]).
+HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.
+SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch so far, SOFT[1]).
 _EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
-_LEAST_FORCE = 0.01  # floor of this force, as a share of the largest force
-_SMALL = 1e-5  # weight of the coefficients; some have no other effect if the environment has no inverse
+_LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
+_SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10
-_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or to its gain over zero force
-_FORGIVEN = 5e-4  # allowed violation of an inequality between its frequencies; scaling removes it
+_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or its gain over zero force, if less
+_FORGIVEN = 5e-4  # allowed violation of an inequality between the frequencies of its grid; scaling removes it
 _STEEPER = 3.0  # factor between successive weights of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency
 _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]; the matrices are constant below it
@@ -63,7 +63,7 @@ class Options:
 
     objective: Literal["rms", "sup"] = "rms"  # norm of the mismatch relative to the environment, over the band
     band_hz: tuple[float, float] = BAND_HZ
-    high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: a soft row keeps the force low instead
+    high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: only the soft rows keep the force low
     limiter: bool = False  # whether the coupling is also safe while forces are limited
     seconds: float | None = None  # time [s] after which no larger basis is tried; None: no time limit
     bases: tuple[tuple[int, int], ...] = _BASES  # (taps, real poles)
@@ -87,14 +87,15 @@ DEFAULT = Options()
 class _Constraint:
     """Linear matrix inequality for the forces G = R Psi E before their delay Theta, at every frequency.
 
-    The inequality is He[block(G, x)] > 0. The block is jointly affine in G and in the constraint's own unknowns x.
+    The inequality is He[block(G, x)] > 0, where He is the Hermitian part. The block is jointly affine in G and in the
+    constraint's own unknowns x.
     """
 
     name: str
     block: Callable[[Sampled, Array], Sampled]
     unit: Array  # (r,) scale of the block's rows and columns, so that its eigenvalues have one unit
-    low: float = _SMALLEST  # [rad/sample]
-    high: float = np.pi
+    low: float = _SMALLEST  # [rad/sample] least frequency
+    high: float = np.pi  # [rad/sample] largest frequency
     start: tuple[float, ...] = ()  # own unknowns with which R = kappa I is strictly feasible for a small kappa
     cost: tuple[float, ...] = ()  # coefficients of the own unknowns in the objective
     through: bool = False  # whether the block is a constant plus L(z) G, with one row for each force
@@ -119,7 +120,10 @@ def this_environment(loop: Loop) -> _Constraint:
 
 
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
-    """Return SWITCHING as a constraint for delays that switch within the span; its own unknowns are alpha T/Delta."""
+    """Return SWITCHING as a constraint for delays that switch within the span.
+
+    Its own unknowns are alpha T/Delta, the scaled multipliers of the channels that switch.
+    """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
@@ -214,8 +218,8 @@ def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
 class Span:
     """Basis functions of R, and the entries of R_1, R_2, .. that are unknowns; the first unknown is g."""
 
-    poles: Array  # (n,)
-    pairs: Array  # (p, 2)
+    poles: Array  # (n,) real poles
+    pairs: Array  # (p, 2) coefficients a, b of z^2 + a z + b
     used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1)
 
     @property
@@ -227,7 +231,7 @@ class Span:
         return basis(self.poles, z, self.pairs)[:, 1:] - 1
 
     def sources(self) -> Array:
-        """Return the filtered signals as rows over the forces, (m or m + 1, m): each force, then perhaps their sum."""
+        """Return the filtered signals as rows over the forces, (m or m + 1, m): each force; row m + 1 is their sum."""
         m, columns = self.used.shape[1:]
         return np.vstack([np.eye(m), np.ones((columns - m, m))])
 
@@ -284,7 +288,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
     fast += [0.0] * (len(fast) % 2)
     pairs += [
         (-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)
-    ]  # These are last because the filters of own forces end before them.
+    ]  # The fast modes come last, because the filters of the devices' own forces end before them.
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
     used = np.ones((count, m, m), dtype=bool)
@@ -302,7 +306,7 @@ def _zeros(E: Lti) -> Complex:
 
 
 def _separate(modes: Complex) -> list[complex]:
-    """Return modes that lie apart by 5 % of their distance to the circle or more, for a basis or a coarse grid."""
+    """Return the modes without those nearer to an earlier mode than 5 % of its distance to the unit circle."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
@@ -418,7 +422,7 @@ class Problem:
         return np.vstack([slope.real, slope.imag])
 
     def _slopes(self, case: Case, z: Complex) -> Sampled:
-        """Return the derivatives of the forces G = R Psi E by g and the entries of R_1, .., (unknowns, k, m, m)."""
+        """Return the derivatives of G = R Psi E with respect to g and the entries of R_1, .., (unknowns, k, m, m)."""
         delayed = case.delayed(z).G[0]
         signals = self.span.sources() @ delayed  # (k, sources, m)
         functions = self.span.responses(z)
@@ -430,7 +434,7 @@ class Problem:
         return Sampled(z[None], G, case.loop.T)
 
     def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> MatrixInequality:
-        """Return the inequality of a constraint at the frequencies w, from the block's value for each unit unknown."""
+        """Return the inequality of a constraint at the frequencies w, from the block at each unit vector."""
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
         none = np.zeros(len(units))
@@ -453,7 +457,7 @@ class Problem:
     ) -> _Posed:
         """Return (program in well-conditioned coordinates y, feasible start y, map from y to x).
 
-        The start is x, or if x is infeasible a feasible point between `start` and x.
+        The start is x. If x is infeasible, the start is a feasible point between `start` and x.
         """
         import scipy
 
@@ -472,7 +476,7 @@ class Problem:
     def _by_entries(
         self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
-        """Return (program, feasible start y, map from y to x) like `_dense`, with y ordered by entries of R, then g.
+        """Return (program, feasible start y, map from y to x), with y ordered by entries of R, then g.
 
         The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
         """
@@ -565,7 +569,7 @@ class Problem:
         nothing = float(b @ b) + float(c.any())  # objective of zero force, for which tau is 1
         demanding = any(
             len(case.constraints) > 1 for case in self.cases
-        )  # Otherwise exact scaling ensures feasibility.
+        )  # With this-environment alone, scaling the forces ensures feasibility.
         lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(budgets.PROGRAM_SWEEPS):
             program, y, back = posed(A, b, c, pairs, imposed, start, x)
@@ -587,9 +591,9 @@ class Problem:
         return self._kept(inner, start, x) if demanding else x
 
     def _kept(self, inner: Array, start: Array, x: Array) -> Array:
-        """Return a point between x and an interior point at which no constraint fails on the dense sweep.
+        """Return a point on the line from x to an interior point that satisfies the constraints on the dense sweep.
 
-        The violation is bounded because the least eigenvalue is concave along the line.
+        The least eigenvalue is concave along this line, so its values at both ends give the length of the step.
         """
         _, worst = self.missed(x)
         for base in (inner, start):
