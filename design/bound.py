@@ -1,25 +1,25 @@
 """A lower bound on the transparency error of all linear couplings that this-environment certifies.
 
-The bound follows from weak duality: every feasible point of the dual problem gives one.
+The bound follows from weak duality: every feasible point of the dual problem gives a lower bound.
 
 The coupling may have any order. The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is
 analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the
 circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
 no force has arrived yet).
 Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mean square relative mismatch
-J = <M, w M>, M = F - Lambda E. For every H with support in the band |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
+J = <M, w M>, M = F - Lambda E. If the support of H lies in the band, |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
-F's coefficients are differences of the s_k. Choose C_k that weigh only combinations that are zero, such that
+F's coefficients are differences of the s_k. Choose C_k that weigh only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
 Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h
 this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
-from below between any two frequencies (`dual_matrix`). If this lower bound is negative, C_0 is increased until D >= 0,
-which lowers the bound on J. The bound is then proved.
+from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
+D >= 0, which lowers the bound on J. The bound on J is then proved.
 The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero,
-or unequal psi make the zero combinations known up to rounding only. The integrals over the band are computed by Gauss's
-rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
+or the psi differ, so that the zero combinations are known up to rounding only. The integrals over the band are computed
+by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
-_GRID = 250  # points of the grid: so many with equal steps, and so many with equal ratios. H is linear between them.
+_GRID = 250  # points of the grid with equal steps, and as many with equal ratios. H is linear between them.
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
-_NO_BOUND = f"no bound for more than {MOST} channels: half a minute for one that is 1 dB off"
-_NEAR_END = (0.22, 0.5)  # further knots near the band's ends, in steps, because h falls to zero there
+_NO_BOUND = f"no bound for more than {MOST} channels: it would take half a minute and be 1 dB off"
+_NEAR_END = (0.22, 0.5)  # distances of further knots from the band's ends, in steps; h falls to zero there
 _NEAR_MODE = 1.0  # distance of further knots from a mode, in widths of the mode
 _CLOSEST = 0.1  # least distance of two knots, in steps
 _MOST_ADDED = 96  # largest number of frequencies that a sweep adds
@@ -63,10 +63,10 @@ _GAP = 0.004  # gap that the barrier leaves, relative to the bound
 _LEAST = 1e-9  # mean square below which a bound is useless
 _WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative to the bound
 _QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimate's rule has no error bound
-_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the proved bound
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # Gauss's rule in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53
-_LARGEST_CHARGE = 0.005  # share of the bound that the shortage of D may cost when the search ends
+_LARGEST_CHARGE = 0.005  # The search ends if the proved bound is below the estimate by less than this share.
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,15 @@ class _Bound:
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
     """Return a lower bound of the rms mismatch of the couplings that this-environment certifies.
 
-    The loop has up to MOST channels. Periods up to T_max count as less damping in even periods, as in the condition.
+    The loop has up to MOST channels. Periods up to T_max are replaced by even periods with less damping, as in the
+    condition.
     """
     started = time.perf_counter()
     even = tuple(even_damping(loop).tolist())
     loop = msgspec.structs.replace(loop, delta=even, T_max=None)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     sampled, charged = (float(np.sqrt(max(square - _QUADRATURE, 0.0))) for square in dual.best())
-    proved = charged > 0 or sampled == 0  # no mismatch is below zero
+    proved = charged > 0 or sampled == 0  # A bound of zero needs no proof.
     return _Bound(charged if proved else sampled, proved, sampled, time.perf_counter() - started)
 
 
@@ -107,7 +108,7 @@ class _Dual:
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner) scalar functions that make up H, on the grid; over the band those of h are orthonormal
+    heights: Array  # (k, inner) basis functions of H on the grid; over the band, those of h are orthonormal
     target: Array  # (2 inner, m^2) coefficients of -Lambda E/|E| in the functions of h, real and then imaginary parts
     knots: Array
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
@@ -174,7 +175,7 @@ class _Dual:
         return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
-        """Return the slopes of D in the unknowns of C_0 and the C_k, (k, unknowns, m, m), before the Hermitian part."""
+        """Return D's slopes in the unknowns of C_0 and the C_k, (k, unknowns, m, m), before the Hermitian part."""
         m, z = self.loop.channels, on_circle(w)
         triangle = _triangle(m)
         slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
@@ -186,14 +187,14 @@ class _Dual:
         return slope
 
     def block(self, w: Array) -> EntryInequality:
-        """Return the block D > 0 at these frequencies, scaled by root(delta) from both sides."""
+        """Return the inequality D > 0 at the frequencies w, scaled by root(delta) from both sides."""
         further = np.swapaxes(packed(hermitian(self.further(w))), 1, 2)
         functions = 4 / self.loop.T * _causal(self.grid, self.heights, w)
         root = np.tile(np.diag(np.sqrt(self.loop.delta)).astype(complex), (w.size, 1, 1))
         return EntryInequality(np.zeros(further.shape[:2]), functions, root, root, np.ascontiguousarray(further))
 
     def matrix(self, x: Array) -> DualMatrix:
-        """Return D of a point in a form that can be bounded between frequencies."""
+        """Return D at the point x in a form that can be bounded between frequencies."""
         m, root = self.loop.channels, np.sqrt(np.asarray(self.loop.delta))
         own, triangle = x[m * m * len(self.target) :], _triangle(m)
         sums = np.zeros((1 + max((len(weights) for _, weights in self.forbidden), default=0), m, m))
@@ -204,7 +205,7 @@ class _Dual:
         return DualMatrix.of(self.grid, self.h(x), 4 / self.loop.T * np.outer(root, root), sums)
 
     def h(self, x: Array) -> Complex:
-        """Return H of a point at the grid (k, m, m)."""
+        """Return H at the point x, on the grid (k, m, m)."""
         m, inner = self.loop.channels, self.heights.shape[1]
         parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
         return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
@@ -236,7 +237,7 @@ class _Dual:
         return middle, half, response, bounds
 
     def objective_again(self, x: Array) -> tuple[float, float]:
-        """Return (the bound of a point by Gauss's rule, computed from H itself; its largest error).
+        """Return (the bound on J from the point x, by Gauss's rule and from H itself; its largest error).
 
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
         linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
@@ -263,9 +264,9 @@ class _Dual:
         return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
-        """Return (a point's bound less the shortage of D, frequencies at which D was evaluated, its least eigenvalues).
+        """Return (the bound on J from x with C_0 increased, frequencies at which D was evaluated, least eigenvalues).
 
-        The bound is zero if the forbidden sums are zero up to rounding only.
+        The bound on J is 0 if the forbidden sums are zero up to rounding only.
         """
         if not self.exact:
             return 0.0, swept, np.zeros(swept.size)
@@ -274,9 +275,9 @@ class _Dual:
         return again - error + m * min(lower, 0.0), where, least
 
     def best(self) -> tuple[float, float]:
-        """Return two bounds on the mean square: an estimate with D at samples, and one with D on the whole circle.
+        """Return two bounds on J: an estimate with D >= 0 at samples, and one with D >= 0 on the whole circle.
 
-        The points are taken from the barrier's path. After each round, frequencies at which D fails are added.
+        The points are taken from the barrier's path. After each round, frequencies are added at which D is negative.
         """
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
@@ -325,7 +326,7 @@ def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
-    """Return the point nearest to x on the way from `inner` at which no least eigenvalue is negative, or None.
+    """Return the point nearest to x, on the line to `inner`, at which no least eigenvalue is negative, or None.
 
     `room` and `lacking` are the least eigenvalues at `inner` and at x; least eigenvalues are concave in between.
     """
@@ -426,9 +427,9 @@ def _worst(lacking: Array, w: Array) -> Array:
 
 @dataclass(frozen=True)
 class BoundBeside:
-    """The bound of every linear coupling, and the gap of the designed one; or the reason why there is no bound.
+    """A bound on every linear coupling, and the gap from it to a design; or the reason why there is no bound.
 
-    The gap is left out if the design had further requirements, because the bound is for this-environment alone.
+    The gap is None if the design has further requirements, because the bound is for this-environment alone.
     """
 
     rms_mismatch_db: float | None = None
@@ -446,12 +447,12 @@ class BoundBeside:
         if loop.channels > MOST:
             return cls(reason=_NO_BOUND)
         if best.condition == "known-device":
-            return cls(reason="no bound is known of couplings for known devices")
+            return cls(reason="no bound is known for couplings of known devices")
         if best.objective == 0:
             return cls(reason="the mismatch is zero: there is nothing to bound")
         least = bound(loop, band_hz)
         if not least.rms:
-            return cls(reason="the bound is zero: nothing is known to be lost")
+            return cls(reason="the bound is zero, so it does not limit the design")
         more = {
             "latency": any(map(any, loop.latency or ())),
             "switching delays": loop.varying_delay is not None,

@@ -1,4 +1,4 @@
-"""Linear matrix inequalities: minimise c'x where every block constant + sum_a x_a slope_a is positive semidefinite.
+"""Minimise c'x under linear matrix inequalities: each block constant + sum_a x_a slope_a is positive semidefinite.
 
 The status of a solver is not trusted. A result is used only if it is finite, if its blocks are semidefinite when they
 are evaluated again, and if the caller's `accept` agrees. Otherwise the next of several solver settings is tried.
@@ -33,7 +33,7 @@ class _Settings:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-#: The blocks are dense. To look for a decomposition costs a third of the time and finds none.
+#: The blocks are dense. A search for a chordal decomposition takes a third of the time and finds none.
 _DENSE = {"chordal_decomposition_enable": False}
 _TIGHT = {**_DENSE, "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {**_DENSE, "tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
@@ -53,7 +53,7 @@ class _Attempt:
 
     settings: str
     status: str
-    value: float | None  # the objective, None for a refused attempt
+    value: float | None  # the objective; None if the result is refused
     wall_s: float
     reason: str | None = None  # reason of the refusal
 
@@ -208,14 +208,14 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
 _ENOUGH = 1e-6  # if rounding stops the iteration, its best point counts as solved below this error
 _KEPT = 0.98  # largest step, relative to the distance to the boundary
-_SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
+_SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by one towards S Z = _CENTRING mu I.
 
 
 _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 
 def _interior(problem: ConeProgram) -> tuple[Array, str]:
-    """Solve the problem by a primal-dual method; return x and a status named as by Clarabel."""
+    """Solve the problem by a primal-dual method; return x and one of Clarabel's status names."""
     blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
     size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
@@ -238,7 +238,7 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
         gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
         left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
         dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
-        if min(of_S, of_Z) < _SHORT:  # The point is too near the boundary, so the step goes to the centre.
+        if min(of_S, of_Z) < _SHORT:  # The point is too near the boundary, so the step goes towards the central path.
             dx, dS, dZ, of_S, of_Z = newton.direction(_CENTRING * mu, [0.0] * len(S))
         x = x + of_S * dx
         S = [hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
@@ -269,7 +269,7 @@ class _Newton:
         self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
-        """Return dx, dS, dZ towards S Z = mu I with dZ dS = `left`, and the longest steps in S and Z, up to 1."""
+        """Return (dx, dS, dZ, longest step in S, in Z), steps at most 1, towards S Z = mu I with dZ dS = `left`."""
         import scipy
 
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
@@ -280,7 +280,7 @@ class _Newton:
         return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
 
     def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
-        """Return dZ for a given dS."""
+        """Return dZ for dS from the linearised equation S Z = mu I, with dZ dS = `left`."""
         parts = zip(self._Z, dS, left, self._inverse, strict=True)
         return [hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 

@@ -31,10 +31,11 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 # can keep this order, so that an exported block repeats its test vector to the last bit. In single precision
 # coefficients, inputs and every operation are rounded to 24 bits.
 #
-# If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, with unlimited
-# forces q, limited forces f and slips e. The tick makes the first wrong limit active or inactive until none is wrong.
-# This takes finitely many switches (docs/theory.md). The elimination keeps the order of the channels and needs no
-# pivots, because all principal minors are positive. The tick then adds KICK e to [y; z+] and sets the sent forces to f.
+# If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, where q are
+# the unlimited forces, f the limited forces and e the slips. The tick makes the first wrong limit active or inactive
+# until none is wrong. This takes finitely many switches (docs/theory.md). The elimination keeps the order of the
+# channels and needs no pivots, because all principal minors are positive. The tick then adds KICK e to [y; z+] and sets
+# the sent forces to f.
 #
 # If the force of a device is limited as a vector, the tick first tries a step of Newton's method in u = f + tau e. If
 # this step does not halve the residual, the tick replaces the step by one of the Douglas-Rachford iteration, which

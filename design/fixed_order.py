@@ -1,10 +1,9 @@
-"""Design of state-space couplings whose order is given, so that they satisfy Theorem 4 (Remark 5 of the paper).
+"""Design state-space couplings of a given order that satisfy Theorem 4 (Remark 5 of the paper).
 
-Each step solves a convex problem whose solutions all satisfy the condition.
-
-The descent starts from the structured spring-damper design and minimises ||W1 L W2||_inf (23). The returned coupling
-satisfies Theorem 4 on a refined sweep, which is computed from the coupling alone. The cone complementarity that
-Remark 5 prints is not offered, because its bisection on mu stalls near its start.
+A descent minimises ||W1 L W2||_inf (23) from the structured spring-damper design. Each step solves a convex problem
+whose solutions all satisfy the condition. The returned coupling satisfies Theorem 4 on a refined sweep, which is
+computed from the coupling alone. The cone complementarity algorithm of Remark 5 is not offered, because its bisection
+on mu stalls near its start.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import ANY_ENVIRONMENT, least_phi
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
-_MOST_STATES = 10  # per channel; each adds a row and a column to every cone
-_SPARE_POLE = 0.5  # initial pole of further states
+_MOST_STATES = 10  # largest order per channel; each state adds a row and a column to every cone
+_SPARE_POLE = 0.5  # The initial poles of the states after the first are powers of this number.
 
 
 class _Units:
@@ -55,17 +54,17 @@ class _Units:
 
 
 # ----------------------------------------------------------------------------------------------------
-# State-space couplings of fixed order, in a realisation where both conditions are affine.
+# State-space couplings of fixed order, in a realisation where Theorem 4 and the loop (22) are affine.
 #
-# V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`) has the static compliance V1 and the quotient -F (zI - A)^-1 B of
-# Theorem 4. With a fixed F, V, this quotient and the loop (22) are all affine in (A, B, V1). A fixed F of full row rank
-# loses no generality, because a change of state leads to any such F.
+# V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`) has the static compliance V1, and Theorem 4 uses the quotient
+# (V - V1)/(z - 1) = -F (zI - A)^-1 B. If F is fixed, the state matrices of V, of this quotient and of the loop (22) are
+# affine in (A, B, V1). To fix an F of full row rank loses no generality: a change of state leads to any such F.
 
 
 class _FixedOrder:
-    """The couplings with `order` states per channel; unknowns are the free entries p of A, B and V1.
+    """The couplings with `order` states per channel; the unknowns p are the free entries of A, B and V1.
 
-    phi (N,) [N s/m] is the multiplier that psi >= 1 needs.
+    phi (N,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay.
     """
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
@@ -159,7 +158,7 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
 
 
 class _Lemmas:
-    """Lemmas 2 and 3 of a family around the coupling `at`, in coordinates where its Q and U are I and its norm is 1."""
+    """Lemmas 2 and 3 for couplings near `at`, in coordinates in which Q and U of `at` are I and its norm is 1."""
 
     def __init__(self, family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
         self.at, self.LQ, self.LU, self.norm = at, np.linalg.cholesky(Q), np.linalg.cholesky(U), norm
@@ -206,21 +205,22 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # Fixed-order couplings by inner convex approximation: descent on ||W1 L W2||_inf in which every step is feasible.
 #
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
-# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y the set
-# shrinks to a convex part of itself that still contains the current coupling. Each SDP therefore improves on the last
-# one, mu^2 enters linearly, and there is no bisection. In state coordinates with Q0 = I the tangent is 2I - Q.
+# positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
+# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. Each SDP therefore
+# improves on the last one, mu^2 enters linearly, and there is no bisection. In state coordinates with Q0 = I the
+# tangent is 2I - Q.
 
 
 _Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu
 _SETTLED = 1e-4  # The descent ends after a step that improves the norm by less than this share.
 _FIRST_ROOM = 0.05  # relative room above the initial norm for the first certificate
-_LEAST, _MOST = 0.1, 1.99  # bounds of Q and U, which were I before the step; unexcited states may degenerate
+_LEAST, _MOST = 0.1, 1.99  # bounds of Q and U in a step that starts at I, so that unexcited states do not degenerate
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
     """Yield the couplings p of successive steps from a strictly feasible one with the given norm.
 
-    The descent ends where a certificate is singular to rounding: the coupling is then on the boundary.
+    The descent ends when Q or U is singular to rounding, because the coupling is then on the boundary.
     """
     Q = np.linalg.inv(_passivity_storage(family, p))
     U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
@@ -274,7 +274,7 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
     return lemmas.at + p, lemmas.LQ @ Q @ lemmas.LQ.T, lemmas.LU @ U @ lemmas.LU.T
 
 
-_START_ROOM = 1e-3  # The first point is found for damping that is less by this share, so that it is strictly feasible.
+_START_ROOM = 1e-3  # The start is designed for damping reduced by this share, so that it is strictly feasible.
 
 
 def design(

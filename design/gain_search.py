@@ -1,11 +1,11 @@
 """Spring-damper gains for one environment, by a local search from several starts.
 
-The set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by sequential
-quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a violation
-are added, until the gains pass the sweep.
+The feasible set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by
+sequential quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a
+violation are added, until the gains pass the sweep.
 
-The block of a condition is evaluated at G = 0 and G = I, and with its multiplier 0 and 1. For each channel the block is
-affine in G and affine in the multiplier, so these responses determine all its values and slopes.
+The block of a condition is evaluated at G = 0 and G = I, each with the multipliers 0 and 1. For each channel the block
+is affine in G and affine in the multiplier, so these responses determine all values and slopes of the block.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
 _STUCK = 1e-3  # A search that ends with a larger violation than this has no feasible point nearby.
 FEW = 12  # largest number of channels for which steps are cheap
-_ROUGH = 0.01  # largest violation that further steps can remove
+_ROUGH = 0.01  # Starts with a larger violation than this are sorted last.
 _DIFFERENCE = 1e-7  # step of finite differences in x
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
-    """Return (z-1)/(Tz) [1/s] in the shape of z, the stiffness of a damper of 1 N s/m."""
+    """Return (z-1)/(Tz) [1/s], the stiffness of a damper of 1 N s/m, in the shape of z."""
     return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
 
 
@@ -56,7 +56,7 @@ class _Around:
 
     x: Array
     G: Complex  # (k, m, m)
-    by: Array | Complex  # (2, k, m) the derivative of G by log K or B/delta of channel i is G[:, i] by[., i] G[i, :]
+    by: Array | Complex  # (2, k, m) dG/d(log K_i) is G[:, i] by[0, :, i] G[i, :]; by[1] is for B_i/delta_i
 
 
 class SampledLoop:
@@ -65,7 +65,7 @@ class SampledLoop:
     The first 2m entries are the gains; the rest are the unknowns of the condition's multiplier.
     """
 
-    #: channels with a second row in the block and an unknown multiplier, and the bounds of the multiplier in x
+    #: channels with a second row in the block and an unknown multiplier, and the bounds of this multiplier's entry in x
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     bounds = (0.0, 0.0)
 
@@ -83,12 +83,12 @@ class SampledLoop:
         self.target = delay(loop.lam, loop.T).at(E.z[0]) @ E.G[0]
         self._known: dict[str, _Around] = {}
         self._delayed: dict[str, Sampled] = {}
-        self._rate: dict[str, Complex] = {}  # derivative of 1/V by B/delta
+        self._rate: dict[str, Complex] = {}  # derivative of 1/V with respect to B/delta
         self._sample("band", self.band)
         self._impose(frequencies(self.E, low=1e-3, points=80))
 
     def fresh(self) -> Self:
-        """Return a copy to which another search may add frequencies; shared responses are sampled once."""
+        """Return a copy to which another search may add frequencies. The copy shares the sampled responses."""
         other = copy(self)
         other._known, other._delayed, other._rate = {}, dict(self._delayed), dict(self._rate)
         return other
@@ -112,14 +112,14 @@ class SampledLoop:
         return this_environment_demand(self.loop.late(G), self.loop)
 
     def block(self, G: Sampled, mu: Array) -> Sampled:
-        """Return the block at the damping that a design may use."""
+        """Return the block at the damping less _SAMPLED_RESERVE."""
         demand = self.demand(G, mu)
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """Return the multiplier (active,) at x, and its derivative by the unknowns.
+        """Return the multiplier (active,) at x, and its derivative with respect to the unknowns after the gains.
 
-        The derivative is symmetric, (active, active). A diagonal one is given by its diagonal, (active,).
+        The derivative is the diagonal (active,) of a diagonal matrix, or a matrix (active, active).
         """
         return np.zeros(0), np.zeros(0)
 
@@ -128,11 +128,11 @@ class SampledLoop:
         return None
 
     def add(self, w: float) -> None:
-        """Impose the condition also at the frequency w [rad/sample]."""
+        """Add the frequency w [rad/sample] to those of the condition."""
         self._impose(np.append(self.conditions, w))
 
     def _impose(self, w: Array) -> None:
-        """Sample loop and condition at w (k,): the entries of the block for G and mu of 0 and 1, and their slopes."""
+        """Sample loop and condition at w (k,): the block's entries at G = mu = 0, their slopes in G, mu and G mu."""
         self.conditions, m = w, self.loop.channels
         self._sample("conditions", w)
         self._known.clear()
@@ -168,7 +168,7 @@ class SampledLoop:
         return known
 
     def square_mismatch(self, x: Array) -> float:
-        """Return the logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
+        """Return the logarithm of the mean square mismatch ||M||_F^2/||E||_F^2 over log frequency."""
         log_w = np.log(self.band)
         return float(np.log(self._mean(x) / (log_w[-1] - log_w[0])))
 
@@ -177,7 +177,7 @@ class SampledLoop:
         return float(np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, np.log(self.band)))
 
     def square_mismatch_slope(self, x: Array) -> Array:
-        """Return the gradient of `square_mismatch`, which is 0 for the unknowns after the gains."""
+        """Return the gradient of `square_mismatch`; its entries after those of the gains are 0."""
         around = self._around(x, "band")
         F = self.late * around.G
         back = np.einsum("kij,kji->ki", around.G @ (F - self.target).conj().swapaxes(1, 2), F)
@@ -186,10 +186,10 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency; (k,) or (k + 1,).
+        """Return the least eigenvalue of the Schur complement of `_least` at each frequency; (k,) or (k + 1,).
 
-        With delay in the environment the loop can be unstable although the sampled condition holds. The last entry is
-        then the distance of its poles from the unit circle.
+        The unit is Delta_D/T. With delay in the environment the loop can be unstable although the sampled condition
+        holds, so that a last entry is added: the distance of the loop's poles from the unit circle.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
@@ -236,9 +236,9 @@ class SampledLoop:
         return first, below, fixed[:, m + 2 * p :].real
 
     def _least(self, x: Array) -> tuple[Array, Complex]:
-        """Return the block's least eigenvalue (k,) and its eigenvector v (k, m + active), cached for the last x.
+        """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
 
-        They are those of the Schur complement of the lower right part, which is diagonal and positive.
+        The Schur complement is that of the lower right part, which is diagonal and positive.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -251,12 +251,12 @@ class SampledLoop:
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
-        """Return the distance of the poles from the unit circle, less _CLOSEST_POLE."""
+        """Return the distance of the loop's poles from the unit circle, less _CLOSEST_POLE."""
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
     def search(self, x: Array, most: int) -> Array:
-        """Return the local optimum from x, by at most `most` steps."""
+        """Return x after at most `most` steps towards a local optimum."""
         m = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
         condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
@@ -266,9 +266,9 @@ class SampledLoop:
 
 @cache
 def _slsqp() -> Callable[..., Any]:
-    """Return the SLSQP of scipy.optimize, without its other solvers, whose import takes half as long as a design.
+    """Import SLSQP without the other solvers of scipy.optimize, whose import takes half as long as a design.
 
-    The module that has it is private: where a release of SciPy names it differently, the public function is used.
+    The module of SLSQP is private. If a release of SciPy has no such module, return the public function.
     """
     name = "scipy.optimize"
     spec = None if name in sys.modules else find_spec(name)
@@ -285,16 +285,16 @@ def _slsqp() -> Callable[..., Any]:
 
 
 def _public_slsqp(f: Any, x: Array, *, maxiter: int, ftol: float, **problem: Any) -> Any:
-    """Return the result of `scipy.optimize.minimize` for the arguments of its private function."""
+    """Call `scipy.optimize.minimize` with the arguments of the private SLSQP function."""
     from scipy.optimize import minimize
 
     return minimize(f, x, method="SLSQP", options={"maxiter": maxiter, "ftol": ftol}, **problem)
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """Return the first channel of each device, and the matrix (m, m) of the mean over its axes, which share c or alpha.
+    """Return the first channel of each device, and a matrix (m, m) of means over the axes of each device.
 
-    The matrix maps one number per channel to the mean over the device of that channel.
+    The matrix maps one number per channel to the mean over the channel's device, because its axes share c or alpha.
     """
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
@@ -303,7 +303,7 @@ def _shared(loop: Loop) -> tuple[list[int], Array]:
 class SwitchingLoop(SampledLoop):
     """The loop under any switching of delays: x = (log K, B/delta, log alpha T/delta of the channels that switch).
 
-    The result passes the sweep of `SWITCHING`, which searches its own multiplier.
+    `judged` searches its own multiplier alpha in the sweep of `SWITCHING`.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
@@ -311,14 +311,14 @@ class SwitchingLoop(SampledLoop):
 
     def __init__(self, loop: Loop) -> None:
         if loop.environment.walls or loop.latency:
-            raise ValueError("gains for delays that switch are designed in linear environments and without a latency")
+            raise ValueError("gains for switching delays are designed for linear environments without latency only")
         self.active = np.flatnonzero(np.subtract(loop.delays.hi, loop.delays.lo))
         self.lead, self.shared = _shared(loop)
         self.unit = np.array(loop.per_channel(loop.per_device(even_damping(loop)).tolist())) / loop.T
         super().__init__(loop)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """Return x of the gains with their best multiplier."""
+        """Return x of the gains and their best multiplier alpha."""
         multiplier = SWITCHING.required(self.loop, coupling).multiplier
         alpha = np.array(self.loop.per_channel(multiplier)) if multiplier else self._first * self.unit
         a = (alpha / self.unit)[self.active]
@@ -342,7 +342,7 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """The loop with limited forces: x = (log K, B/delta, c) with one weight c per channel, of the lag 1."""
+    """The loop with limited forces: x = (log K, B/delta, c), where c is the weight of lag 1 for each channel."""
 
     bounds = (0.0, 5.0)
     _first = 0.5  # first value of the weight
@@ -353,7 +353,7 @@ class LimiterLoop(SampledLoop):
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """Return x of the gains with the first multiplier."""
+        """Return x of the gains and the first value of c."""
         return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:
@@ -373,7 +373,8 @@ class LimiterLoop(SampledLoop):
 class KnownDeviceLoop(SampledLoop):
     """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each device).
 
-    The condition is the Schur complement of the row of v, with M = -beta F/z + l21: He[F/(z-1)] + l11 - M*M/(4 l22).
+    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 and l11, l21, l22 of `device_rows`.
+    It is the Schur complement of the speeds' rows in the block of known-device.
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
@@ -406,7 +407,7 @@ class KnownDeviceLoop(SampledLoop):
         self._z = z
 
     def _complement(self, x: Array) -> tuple[Array, Complex, Complex]:
-        """Return the least eigenvalue (k,) in units of Delta_D/T, its vector v (k, m), and M v/(4 l22) (k, m)."""
+        """Return the least eigenvalue (k,) in units of Delta_D/T, its eigenvector v (k, m), and M v/(4 l22) (k, m)."""
         beta, z = self.beta(x), self._z
         F = self._lines * self._around(x, "conditions").G
         cost = period_cost(self.loop, np.full(z.size, self.share), beta)
@@ -452,7 +453,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
         stuck = sampled.room(x).min() < -_STUCK
-        if stuck or requirement.frequency_hz is None:  # None: unstable, without a frequency to add
+        if stuck or requirement.frequency_hz is None:  # An unstable loop has no frequency to add.
             return None, searches
         sampled.add(max(2 * np.pi * sampled.loop.T * requirement.frequency_hz, 1e-6))
     return None, budgets.GAIN_ROUNDS
@@ -463,8 +464,8 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop, and every start gets a copy. For more than FEW channels the first optimum is returned,
-    because steps are expensive and the start hardly matters; `likeliest_first` sorts the starts.
+    `sampled` makes the loop, and each search from a start has a copy. For more than FEW channels the first optimum is
+    returned, because steps are expensive and the start hardly matters. `likeliest_first` sorts the starts.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None

@@ -1,4 +1,4 @@
-"""The paper's matrix inequalities, one function per equation, with remedies for two that no matrix can satisfy.
+"""The paper's matrix inequalities, one function per equation, with remedies for two that cannot be satisfied.
 
 Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every function returns a symmetric matrix that must
 be positive (semi)definite; its arguments are numbers or cvxpy expressions.
@@ -45,7 +45,7 @@ def _low_pass(channels: int, T: float) -> Lti:
 
 def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     if W1.inputs != channels or (W2.inputs, W2.outputs) != (channels, channels):
-        raise ValueError(f"W1 and W2 must fit the {channels} channels on the inside, W2 also on the outside")
+        raise ValueError(f"expected W1 and a square W2 with as many inputs as the loop has channels, {channels}")
     for name, W in (("W1", W1), ("W2", W2)):
         if not W.is_stable():
             raise ValueError(f"{name} has a pole on or outside the unit circle, so no norm is finite")
@@ -60,10 +60,10 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
 
 
 class Shaping:
-    """L (22) of a loop, evaluated fast for many couplings.
+    """The weighted L (22) of a loop, W1 L W2, for fast evaluation with many couplings.
 
-    L is multiplied by W1 from the left and by the diagonal W2 from the right. The defaults are the identity and
-    `_low_pass`. Raises ValueError for weights that do not fit, and for an active environment.
+    W2 is diagonal. The defaults of W1 and W2 are the identity and `_low_pass`. Raises ValueError for weights of wrong
+    size, unstable weights, and an active environment.
     """
 
     def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
