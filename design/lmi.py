@@ -45,7 +45,7 @@ def _low_pass(channels: int, T: float) -> Lti:
 
 def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     if W1.inputs != channels or (W2.inputs, W2.outputs) != (channels, channels):
-        raise ValueError(f"expected W1 and a square W2 with as many inputs as the loop has channels, {channels}")
+        raise ValueError(f"W1 and W2 must fit the {channels} channels: W1 in its inputs, W2 in its inputs and outputs")
     for name, W in (("W1", W1), ("W2", W2)):
         if not W.is_stable():
             raise ValueError(f"{name} has a pole on or outside the unit circle, so no norm is finite")
