@@ -30,7 +30,7 @@ class TooLong(ValueError):
 
 # ----------------------------------------------------------------------------------------------------
 # Counted work. Searches and exact arithmetic count their operations from the sizes of their matrices and numbers, and
-# end when a budget is spent. They read no clock, so that a busy or slow machine gets the same result as an idle one.
+# end when a budget is spent. They read no clock, so that a busy or slow machine gets the same result as a fast one.
 #
 # One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured there.
 
@@ -81,12 +81,11 @@ def within(
 ) -> Iterator[None]:
     """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
 
-    Work beyond this limit raises TooLong. So does any work after `clock` returns True, because the user's time limit is
-    over.
+    Work beyond this limit raises TooLong, as does any work once `clock` returns True: the user's time limit is over.
     """
     before = _counter.most, _counter.message, _counter.over
     if units < math.inf and spent_after(units) < _counter.most:
-        message = f"{what} was given up after the work of {units:g} s: these are {why}"
+        message = f"{what} was given up after the work of {units:g} s: {why}"
         _counter.most, _counter.message = spent_after(units), message
     _counter.over = clock or _counter.over
     try:
@@ -132,7 +131,8 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 def _blas() -> ThreadpoolController:
     """Return a controller of the BLAS libraries of NumPy and of SciPy.
 
-    SciPy is loaded here, unless its library will have one thread anyway because of the environment.
+    SciPy is loaded here, because only loaded libraries are controlled. With OPENBLAS_NUM_THREADS=1 its library uses one
+    thread anyway.
     """
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         import scipy.linalg  # noqa: F401
@@ -161,7 +161,7 @@ def numbers(values: ArrayLike, T: Number) -> Any:
 
 
 def fractions(value: Any) -> Any:
-    """Return a read-only array of Fractions; `value` itself if it is one."""
+    """Return `value` as a read-only array of Fractions, without a copy if it is one already."""
     array = np.asarray(value, dtype=object)
     known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
     if known and all(type(v) is Fraction for v in value.ravel()):
@@ -187,14 +187,14 @@ def inverse(M: Array) -> Array:
         return solve(M, fractions(np.eye(M.shape[-1])))
     try:
         result = np.linalg.inv(M)
-        # The product of the Frobenius norms is at least the condition, whose singular values take far longer.
-        with np.errstate(over="ignore", invalid="ignore"):  # a product that overflows is not below
+        # The product of the Frobenius norms is an upper bound of the condition number, which takes far longer.
+        with np.errstate(over="ignore", invalid="ignore"):  # a product that overflows is inf or nan, not below
             below = _square_norm(M) * _square_norm(result) <= 1e24
     except np.linalg.LinAlgError:
         result, below = None, np.False_
     if M.size and (result is None or (not below.all() and np.max(np.linalg.cond(M)) > 1e12)):
         solved = "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12)"
-        raise SingularLoop(f"{solved}: soften the environment or the coupling, or give psi a sample")
+        raise SingularLoop(f"{solved}: soften the environment or the coupling, or add a sample to psi")
     return result
 
 

@@ -12,8 +12,8 @@ from haptic_loop.controller.lti import Array, Lti
 _FIRST = 64  # number of intervals of [0, pi] at the start
 _EVALUATIONS = 1 << 15  # largest number of intervals for up to 8 states, about half a second; fewer for more states
 _REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|R|
-_UNIT = 2.0**-53
-_NOISE = 1e-4  # covariance of a noise in every state, relative to that of the noise at the inputs
+_UNIT = 2.0**-53  # largest relative error of one rounding
+_NOISE = 1e-4  # covariance of the noise in every state, relative to that of the noise at the inputs
 _INFLATED = 1.001  # factor on norms against rounding
 _TOGETHER = 2**18  # largest number of entries of resolvents in memory
 
@@ -23,12 +23,12 @@ def hermitian_floor(G: Lti, enough: float, unwanted: float, rounding: float = 1.
 
     R = (zI - A)^-1 at the middle of an interval bounds |G'| and |G''| on it. Near a narrow resonance |R| is large and
     the intervals become short, so that no resonance is missed. On an interval of half-width h around w0,
-    He G >= He [G(w0) + t G'(w0)] - h^2 M/2 for |t| <= h, M >= |G''|. The least eigenvalue of the right side is concave
+    He G(w0 + t) >= He [G(w0) + t G'(w0)] - h^2 M/2 with M >= |G''|. The least eigenvalue of the right side is concave
     in t, so it is evaluated at both ends only. An a-priori bound on the rounding errors is subtracted.
 
     Args:
         G: A stable block of floats. It is real, so that the interval [0, pi] is enough.
-        enough: The lower bound at which an interval is not halved any more.
+        enough: An interval with at least this lower bound is not halved any more.
         unwanted: The search ends at a frequency whose least eigenvalue is below this number.
         rounding: A factor on the bound of the rounding errors, above 1 if A and B were computed with a larger error.
 
@@ -77,9 +77,9 @@ _Lost = tuple[float, float, float]
 def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
     """Return Q'GQ, where an orthonormal Q omits the directions in which G is zero at every frequency.
 
-    He G is zero in these directions, an example of which is the difference of two contacts with the same motion. No
-    finite number of intervals could decide the sign of zero. The second value holds the norms of the omitted parts of
-    B, C and D, or None if Q omits no direction.
+    He G is zero in these directions, such as the difference of two contacts with the same motion, and no finite number
+    of intervals could decide the sign of zero. The second result contains the norms of the omitted parts of B, C and D,
+    or is None if Q omits no direction.
     """
     rows = [part / max(float(np.linalg.norm(part)), 1e-300) for part in (G.B, G.C.T, G.D, G.D.T)]
     _, sizes, V = np.linalg.svd(np.vstack(rows))
@@ -94,10 +94,10 @@ def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
 
 
 def _norms(G: Lti) -> list[tuple[Array, Array]]:
-    """Return pairs L, L^-1 (n, n) of coordinates L^-1 x of the states in which the resolvent's norm is computed.
+    """Return pairs L, L^-1 (n, n). The resolvent's norm is computed in the coordinates L^-1 x of the states x.
 
-    Every L gives a valid bound, and the best bound is used. The first L is I. The second L is a root of the states'
-    covariance under noise; in its coordinates the norm is often smaller.
+    Every L gives a valid bound, and the best bound is used. The first L is I. The second L is a square root of the
+    states' covariance under noise; in its coordinates the norm is often smaller.
     """
     import scipy.linalg  # slow to load
 
@@ -115,7 +115,7 @@ def _norms(G: Lti) -> list[tuple[Array, Array]]:
 def _bounded(
     G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array, rounding: float
 ) -> tuple[Array, Array]:
-    """Return lower bounds (k,) for |w' - w| <= half, and the least eigenvalues (k,) at w."""
+    """Return lower bounds (k,) of the least eigenvalue of He G on w - half to w + half, and its values (k,) at w."""
     A, B, C, D = G.A, G.B, G.C, G.D
     n, m = B.shape
     if not n:
@@ -145,7 +145,8 @@ def _bounded(
 def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
     """Bound |G(e^jv)| for all complex v with |v - w| <= radius, and the rounding error of G(e^jv) for real v.
 
-    With R0 at the middle and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0 has |R| <= |R0|/(1 - d |R0|).
+    With R0 = R(z0) at z0 = e^jw and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0 satisfies
+    |R| <= |R0|/(1 - d |R0|).
 
     Args:
         G: A stable block of floats.
@@ -153,7 +154,7 @@ def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
         radius: (k,) radii [rad/sample].
 
     Returns:
-        (the bounds, the rounding errors), (k,) each, as Frobenius norms; inf if d exceeds half of 1/|R0|, near a pole.
+        (the bounds, the rounding errors), (k,) each, as Frobenius norms; inf near a pole, if d > 1/(2 |R0|).
     """
     G = _balanced(G)
     n, m = G.B.shape

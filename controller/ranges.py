@@ -82,11 +82,11 @@ def number_of_vertices(network: Network, ranges: Ranges) -> int:
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Return the corner of every part: all combinations, or 128 that contain every combination of any three ends.
+    """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that form an orthogonal array.
 
-    The 128 combinations are the words of a linear code. Each bit of a corner's number is the parity of the bitwise AND
-    of the word's number and a mask. All masks have the highest bit, so that the sum of two masks is never a mask. Any
-    three masks are therefore independent.
+    In the 128 vertices, the words of a linear code, any three pairs of ends meet in every combination. Each bit of a
+    corner's number is the parity of the bitwise AND of the word's number and a mask. All masks have the highest bit, so
+    that the sum of two masks is never a mask. Any three masks are therefore independent.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -115,8 +115,7 @@ def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
     """Draw `count` environments uniformly from the ranges.
 
-    A contact that may be absent is absent with probability 1/2. A larger count adds environments to the same first
-    ones.
+    A contact that may be absent is absent with probability 1/2. A larger `count` only adds environments at the end.
     """
     parts, rng = _parts(network, ranges), np.random.default_rng(seed)
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
@@ -127,15 +126,15 @@ class _State:
     """One state of an uncertain part, present or absent, with the ranges of this state."""
 
     ranges: tuple[_Range, ...]  # the ranges whose width is not 0
-    value: Callable[[Sequence[float]], Spring | float]  # one number in each range -> the part
+    value: Callable[[Sequence[float]], Spring | float]  # a number within each range -> the part
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One uncertain part, a spring or a mass: its values at its corners and between them."""
+    """One uncertain part, a spring or a mass, with its values at the ends of its ranges and between them."""
 
     place: str  # a spring's ends, or a node
-    corners: tuple[Spring | float, ...]
+    corners: tuple[Spring | float, ...]  # the part at every combination of ends, and absent if it may be
     own: Spring | float  # the part as it is in the environment
     draw: Callable[[np.random.Generator], Spring | float]
     states: tuple[_State, ...]  # present, and absent if it may be
@@ -150,7 +149,7 @@ class _Part:
 
 def _parts(network: Network, ranges: Ranges) -> list[_Part]:
     if network.block:
-        raise ValueError("ranges and environment.block: ranges are of springs, dampers and masses")
+        raise ValueError("ranges and environment.block: only springs, dampers and masses can have ranges")
     if not (ranges.springs or ranges.masses):
         raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")
     named = [frozenset(one.between) for one in ranges.springs]
@@ -172,7 +171,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
             raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(names)}, ground")
     springs = [spring for spring in network.springs if set(spring.between) == {a, b}]
     if any(spring.inertance for spring in springs):
-        raise ValueError(f"{field}: the spring there has an inertance, and ranges are of stiffness and damping")
+        raise ValueError(f"{field}: the spring there has an inertance; give ranges to springs without inertance")
     if len(springs) > 1:
         raise ValueError(f"{field}: the environment has {len(springs)} springs there, expected one")
     nothing = Spring((a, b), 0.0, 0.0)
@@ -182,7 +181,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
     elif uncertain.absent and uncertain.stiffness:
         own, present = nothing, nothing
     else:
-        raise ValueError(f"{field}: no spring is there; one that may come to be needs a stiffness and absent = true")
+        raise ValueError(f"{field}: no spring is there; for a contact that may arise give stiffness and absent = true")
     stiffness = uncertain.stiffness or (present.stiffness, present.stiffness)
     damping = uncertain.damping or (present.damping, present.damping)
     if not uncertain.absent and stiffness[0] == stiffness[1] and damping[0] == damping[1]:

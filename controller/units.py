@@ -1,6 +1,6 @@
 """The unit of positions: m, or rad for rotary devices, with N m, N m s/rad and kg m2 in place of N, N s/m and kg.
 
-The equations are the same for both. The program's texts use metres. `in_unit` converts them for radians when they are
+The equations are the same for both. The program's texts use metres. `in_unit` converts a text to radians before it is
 printed, drawn, or written to a file's header or keys.
 """
 
@@ -40,7 +40,7 @@ def spoken() -> PositionUnit:
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
-    """Return a text with metres in `unit`, by default that of this command's output. A converted text is unchanged."""
+    """Return a text with metres in `unit`, by default that of this command's output. Converting twice does no harm."""
     return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
 
 

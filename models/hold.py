@@ -63,7 +63,7 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return rows (..., m, entries) that map a tick's [s; held forces; w; f] to each position at its force's latch."""
+    """Return rows (..., m, entries) from a tick's [s; held forces; w; f] to each position when its force latches."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -79,9 +79,9 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
 def exponential_step(J: _Array, h: float, n: int, felt: _Array | None = None) -> _Array:
     """Return the matrix (nsim, states, states + n) that maps [s; a] to s + h phi1(h J) s', for a step of h seconds.
 
-    J is (nsim, states, states). The state s = [q; v; states of impedances] has n joints, and s' = [v; a; 0] + felt s.
-    The accelerations a (n,) [m/s^2] are those of the bodies, and `felt` (nsim, states, states) is the contribution of
-    the impedances.
+    J (nsim, states, states) is the Jacobian of s' = [v; a; 0] + felt s with the state s = [q; v; states of impedances]
+    of n joints. The accelerations a (n,) [m/s^2] are those of the bodies, and `felt` (nsim, states, states) is the
+    contribution of the impedances.
     phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
     """
     nsim, states, _ = J.shape
@@ -121,9 +121,9 @@ def expm_each(matrices: _Array) -> _Array:
 def _units(A: _Array, h: float) -> _Array:
     """Return units (nsim, 2n) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    Velocities are measured in units of a rate near that of the fastest mode. The norm of a stiff plant is then at most
-    that rate times h, and its exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two,
-    so that scaling is exact.
+    The unit of velocities is a rate near that of the fastest mode. For a stiff plant the norm of h A is then about this
+    rate times h, and the exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two, so
+    that scaling is exact.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
@@ -138,7 +138,7 @@ def _expm_in_units(matrices: _Array, unit: _Array) -> _Array:
 
 
 _ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
-_LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
+_LARGEST = 5.37  # largest 1-norm for which this order has the accuracy of double precision
 _PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
 
 Product = Callable[[_Array, _Array], object]  # reads a slab (columns, nsim) and writes the product (rows, nsim)

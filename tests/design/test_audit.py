@@ -424,7 +424,7 @@ def test_long_computations_are_refused_or_ended(monkeypatch):
     part = report(PAIR, SOFT)["margins"]["this-environment"]
     assert part["stiffest"] == {
         "K": [None, None],
-        "reason": "a search by sweeps was given up after the work of 0.001 s: these are many states or channels",
+        "reason": "a search by sweeps was given up after the work of 0.001 s: many states or channels",
     }
     monkeypatch.setattr(budgets, "SWEEPS", 1e-5)
     assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason

@@ -434,7 +434,7 @@ def test_any_environment_ignores_the_realisation_and_walls():
 def test_too_long_exact_arithmetic_ends_in_one_line(monkeypatch):
     stored = certified(PAIR, STIFF, "this-environment")
     monkeypatch.setattr(budgets, "EXACT", 0.0)
-    words = "exact arithmetic was given up after the work of 0 s: these are too many digits over many states"
+    words = "exact arithmetic was given up after the work of 0 s: too many digits over many states"
     with pytest.raises(NotProved, match=words):
         prove(PAIR, STIFF, "this-environment")
     assert verify(stored) == Verdict(False, words)
