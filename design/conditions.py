@@ -3,7 +3,7 @@
 A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.facts) holds it
 as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
 `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
-(an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
+(an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives the conditions.
 
 A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
 states whether periods vary and forces have a latency. A `Fact` is a wall, delays that switch, or the limiter. `compose`
@@ -11,15 +11,15 @@ stacks their inputs and adds their forms, as design.facts describes. design.envi
 conditions, and design.certificate has one exact proof and one file format.
 
 To add a hands' side, derive a class from `HandsSide` and state
-  `inputs`   one `Input` per scalar input. `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
-             that f[k] multiplies. dx has (1,). xa of a latency, which f[k-1] multiplies, has (0, 1). The speed v of a
-             known device in f'(dx + beta dv) has (-beta, beta) and `follows=0`. `slips` says whether the limiter's slip
-             is subtracted from the input;
+  `inputs`   one `Input` per scalar input. Its `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
+             that f[k] multiplies: (1,) for dx; (0, 1) for xa of a latency, which f[k-1] multiplies; (-beta, beta) for
+             the speed v of a known device in f'(dx + beta dv), with `follows=0`. `slips` says whether the limiter's
+             slip is subtracted from the input;
   `damping`  the matrix over its inputs that is proportional to Delta_D;
   `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
   `unknowns` its multipliers, by name.
-Let `hands_side(loop)` return the class for its loops. `compose` then makes the rows and adds walls, limiter and
-switching without further code.
+Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
+adds walls, limiter and switching without further code.
 
 any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`_v_hat`,
 `any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
@@ -63,11 +63,11 @@ from haptic_loop.design.result import Environments, Requirement, from_ratio, ref
 
 
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
-    """Return He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces, in any arithmetic.
+    """Return the block of He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces.
 
-    In a tick the damping dissipates at least Delta_D dx^2/T, and the force map supplies the energy -F dx. With
-    F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that latch later than at the tick have a block
-    of twice the size (design.facts.Latency).
+    In a tick the damping dissipates at least dx' Delta_D dx/T_max, and the force map supplies the energy -f'dx. With
+    F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T_max, in any arithmetic. For forces that latch later than
+    at the tick the block has up to twice the size (design.facts.Latency).
     """
     return compose(F, loop, late=False)
 
@@ -94,8 +94,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. After the
-    division by |1 - 1/z|^2 (see `_v_hat`) this is T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat. A Schur
-    complement gives He[[T _v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
+    division by |1 - 1/z|^2 this is T He R >= H* Delta_V H for H = V - Theta-hat and the second result R of `_v_hat`. A
+    Schur complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
     Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a
     multiplier.
     """
@@ -206,9 +206,9 @@ def _least_multiple(free: Complex, gain: Complex) -> Array:
 
 
 def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
-    """Return `_least_multiple` of 2 x 2 matrices with det(gain) = room, by a quadratic equation.
+    """Return the least s (...,) with free + s gain >= 0 for 2 x 2 matrices with det(gain) = room, or inf.
 
-    The closed form is 20 times as fast as LAPACK.
+    Solving the quadratic equation is 20 times as fast as LAPACK.
     """
     (a, b, d), (p, q, r) = ((M[..., 0, 0].real, M[..., 0, 1], M[..., 1, 1].real) for M in (free, gain))
     twice, last = a * r + d * p - 2 * (b.real * q.real + b.imag * q.imag), a * d - b.real**2 - b.imag**2
@@ -232,7 +232,7 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     return needed
 
 
-#: fields of a loop that go beyond even ticks, constant delays of its forces and one linear environment
+#: properties of a loop that a condition covers only if it names them in `covers`
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 #: facts of the environment's side that a certificate may cover, in the order of reports and files
 FACTS = ("latency", "walls", "limiter", "switching", "ranges")
@@ -241,11 +241,11 @@ FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 class Condition(ABC):
     """A block that must be strictly positive real. A user's own condition needs a name and `demand`.
 
-    `design.certificate` proves and verifies it like every condition. Its author claims that the block keeps a loop
-    safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
+    `design.certificate` proves and verifies the block like that of every condition. Its author claims that it keeps a
+    loop safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
     """
 
-    name: str  # in requirements, certificates and reports
+    name: str  # name in requirements, certificates and reports
     covers: tuple[str, ...] = ()  # items of `BEYOND` that the block covers; a subclass does not inherit them
     source: str | None = None  # reference for a report
     separable: bool = False  # whether channels are judged one by one for a coupling without cross terms
@@ -269,7 +269,7 @@ class Condition(ABC):
         return max(shares, key=lambda requirement: requirement.ratio)
 
     def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with its guarantee; infinite for a loop that is not covered or has no solution."""
+        """Return the requirement with its guarantee; infinite for a loop that is not covered or is singular."""
         reason = self.beyond(loop)
         try:
             requirement = (
@@ -291,7 +291,7 @@ class Condition(ABC):
         return partial(least_scale, self.demand(loop, coupling, **more))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return required over available damping (n,) for a stack; None if the condition judges one loop at a time."""
+        """Return required over available damping (n,) for a stack of n couplings, or None if stacks are not covered."""
         return None
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
@@ -332,7 +332,7 @@ class Condition(ABC):
         return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
-        """Return the numbers that a run must use and a certificate stores with the multipliers: rho [N/m]."""
+        """Return the numbers that a run must use and that a certificate stores with the multipliers, such as rho."""
         return {}
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
@@ -344,7 +344,7 @@ class Condition(ABC):
         return {}
 
     def by_name(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, tuple[float, ...]]:
-        """Return the concatenated multipliers as one tuple for each name."""
+        """Split the concatenated multipliers into one tuple for each name."""
         named_values, start = dict[str, tuple[float, ...]](), 0
         for name, count in self.multiplier_sizes(loop).items():
             named_values[name] = tuple(float(v) for v in multiplier[start : start + count])
@@ -375,7 +375,7 @@ class Condition(ABC):
 
     @property
     def claim(self) -> str:
-        """The sentence of reports for a user's own condition that holds."""
+        """The sentence that reports print if a user's own condition holds."""
         return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
@@ -389,13 +389,13 @@ class Condition(ABC):
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
-    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` is as in `unsound`."""
+    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` has its block's poles."""
     available = tuple(delta)
     if reason := unsound(system, available):
         return refusal(name, available, reason)
     try:
         needed = demand()
-    except SingularLoop as error:  # rounding has kept the largest pole inside the unit circle
+    except SingularLoop as error:  # The map has a pole at z = 1, which rounding has moved inside the circle.
         return refusal(name, available, f"the force map is singular in floating point: {error}")
     if reason := unsound_static(system, needed, available):
         return refusal(name, available, reason)
@@ -457,7 +457,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """Return `ratio_in` from the states of the force map, or inf if the map is not stable."""
+    """Return required over available damping of this-environment from the states of the force map; inf if unstable."""
     try:
         F = loop.F(coupling)
         if thin == 1:
@@ -468,7 +468,7 @@ def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
     return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
 
 
-_LOWEST = 1e-6  # [rad/sample] responses are constant below it
+_LOWEST = 1e-6  # [rad/sample] Responses are constant below this frequency.
 _W_ZERO = 1e-10  # [rad/sample] replaces w = 0 in stacks, where the response of a network may be 0/0
 _STATIC = 1e-9  # allowed relative asymmetry and negativity of F(1)
 
@@ -485,7 +485,7 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
 
 
 def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
-    """Return the damping that any-environment requires for V before any passive environment.
+    """Return the damping that any-environment requires for the coupling V with any passive environment.
 
     With phi (m,) [N s/m] (see `any_environment_demand`) the environment is the loop's own, with its delay psi.
     """
@@ -513,8 +513,8 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 
 
 _ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; a lossless E has 2e-13 by rounding
-_VANISHES = 1e-5  # relative size of V below which V counts as vanishing in a direction
-#: relative passivity that replaces that of V in these directions; ratio from which V counts as not passive there
+_VANISHES = 1e-5  # size of V, relative to V(1), up to which V counts as vanishing in a direction
+#: passivity, relative to V(1), that is added in these directions; ratio above which V counts as not passive there
 _SOFTENED, _NEVER = 1e-12, 1e6
 
 
@@ -525,10 +525,10 @@ def asymmetric(V1: Array) -> str | None:
 
 
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
-    """Return `least_scale` (k,), without a demand in directions in which V vanishes.
+    """Return the least s (k,) of the demand at w (k,), demanding nothing in directions in which V vanishes.
 
     If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. The
-    moving average has this property at every zero of Theta-hat. If only V vanishes, the ratio is large.
+    moving-average coupling vanishes at every zero of Theta-hat. If only V vanishes, the ratio is large.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -653,6 +653,6 @@ def _least_scales(demand: Demand[Sampled]) -> Array:
 
 
 def _regular_part(E: Lti) -> Lti:
-    """Return a block with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle, except z = 1; stable if E is."""
+    """Return E z/(z-1) without its pole: the Hermitian part on the circle is the same, except at z = 1."""
     _, regular = E.over_z_minus_one()
     return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

@@ -1,7 +1,7 @@
 """Conditions with multipliers: this-environment with its facts, and any-environment.
 
 The blocks for walls, switching delays and limited forces are affine in a multiplier, which weighs an error term;
-`Multiplied` searches the best multiplier. The members of ranges are proved one by one.
+`Multiplied` searches for the best multiplier. The members of ranges are proved one by one.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ from haptic_loop.design.result import (
 )
 
 # ----------------------------------------------------------------------------------------------------
-# The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers, at finitely many
-# frequencies, solves a semidefinite program (design.cone). It bounds s from below. Frequencies at which a sweep with
-# the program's multiplier needs a larger s are added, until the sweep attains the bound.
+# The search for the best multiplier. s is required over available damping, and the block is affine in (s, multiplier).
+# At finitely many frequencies a semidefinite program (design.cone) gives the least s over all multipliers: a lower
+# bound. Frequencies at which a sweep with this multiplier needs a larger s are added until the sweep attains the bound.
 
 
 class Multiplied(Condition):
@@ -87,7 +87,7 @@ class Multiplied(Condition):
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the map that `block` takes. Raises SingularLoop, and NotProved if it is too large to be proved."""
+        """Return the map G of `block`. Raises SingularLoop, and NotProved if it is too large to be proved."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -101,11 +101,11 @@ class Multiplied(Condition):
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
-        """Return the multiplier that a search starts with, which is also used for blocks too large for a search."""
+        """Return the first multiplier of a search; blocks too large for a search use it unchanged."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block`, affine in s and the search's unknowns, which contain the multipliers of `hands` times s."""
+        """Return `block`, affine in s and all unknowns, for a multiplier in which those of `hands` are times s."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -118,7 +118,7 @@ class Multiplied(Condition):
         return named_parts(self.unknowns(loop), multiplier)
 
     def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
-        """Raise ValueError unless the numbers are multipliers."""
+        """Raise ValueError unless the numbers are allowed as multipliers."""
         values = self.named(loop, multiplier)
         for each in self.unknowns(loop):
             each.check(values[each.name])
@@ -126,7 +126,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier; without one, at the best multiplier, with the search's `bound`."""
+        """Return the requirement at this multiplier; for None, at the best one, with the search's lower `bound`."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -140,7 +140,7 @@ class Multiplied(Condition):
             return refusal(self.name, loop.delta, str(error))
 
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
-        """Return `required` for the map G."""
+        """Return the requirement for the map G at this multiplier; for None, at the best one."""
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
@@ -159,7 +159,7 @@ class Multiplied(Condition):
         return replace(needed, multiplier=values, bound=bound and min(bound, ratio))
 
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
-        """Return the reason why the block's static matrices violate it by more than rounding, or None."""
+        """Return the reason why a static matrix of the block is asymmetric or negative beyond rounding, or None."""
         return unsound_static(demand.free, demand, loop.delta)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
@@ -276,7 +276,7 @@ class _Search:
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
         """Return (largest ratio at these values, frequencies to add); no frequencies if the ratio is at the bound.
 
-        The ratio is that of the block less the demand's `spare`, a margin that allows rounding the multiplier.
+        The demand's `spare`, a margin that allows rounding the multiplier, is subtracted from the block first.
         """
         demand = self._block(values)
         demand = replace(demand, free=demand.free - self._spare) if self._spare.any() else demand
@@ -305,20 +305,20 @@ class _Search:
 
 
 # ----------------------------------------------------------------------------------------------------
-# In the environment of the loop, around walls that make and break contact, and at all members of ranges.
+# The condition this-environment, with walls that make and break contact, delays that switch, and ranges.
 
 
 class ThisEnvironment(Multiplied):
-    """Stability for every passive hand in the environment of the loop, with its facts (design.facts).
+    """Stability for every passive hand in the loop's environment, with the loop's facts (design.facts).
 
-    The facts are walls that make and break contact, delays that switch, and the members of ranges.
+    The facts are walls that make and break contact and delays that switch. The members of ranges are proved one by one.
     """
 
     name, covers = "this-environment", BEYOND
 
     @property
     def extensible(self) -> bool:
-        """False for subclasses: the block for limited forces and the fast sweeps do not contain their facts."""
+        """False for subclasses, because the block for limited forces and the fast sweeps do not contain their facts."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
@@ -326,10 +326,10 @@ class ThisEnvironment(Multiplied):
         return (*walls, Switching()) if loop.varying_delay else walls
 
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
-        """Return the start of each multiplier.
+        """Return the first values of each multiplier in a search.
 
-        alpha is half the width of the range of delays, times the device's largest force per own displacement. With many
-        devices the multipliers are not searched, and alpha is the best of several shares of this value.
+        alpha is half the width of the range of delays times the largest gain from the device's displacement to its
+        force. With many devices there is no search, and alpha is the best of several shares of this value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -373,7 +373,7 @@ class ThisEnvironment(Multiplied):
         return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the largest requirement over all members, with one multiplier for all."""
+        """Return the largest requirement over all members of ranges, with one multiplier for all."""
         if loop.ranges and self.unknowns(loop) and not self.beyond(loop):
             return self._of_members(loop, coupling, multiplier)
         if self.unknowns(loop) or self.beyond(loop):
@@ -386,7 +386,7 @@ class ThisEnvironment(Multiplied):
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
         """Return the largest requirement of all members with `multiplier`.
 
-        For None it is the smaller one of two: with the usual multiplier, and with the best one of the worst member.
+        For None, two multipliers are tried, the usual one and the best one of the worst member; the better one counts.
         """
         loops = [loop.at(member.network) for member in loop.members()]
 
@@ -402,7 +402,10 @@ class ThisEnvironment(Multiplied):
         return min(usual, best, key=lambda requirement: requirement.ratio)
 
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
-        """Check the static part; rounding is relative to the size of each channel and wall, whose units differ."""
+        """Return the reason why a static map is asymmetric or negative, or None.
+
+        Rounding is compared with the size of each channel and wall, because their units differ.
+        """
         if not loop.environment.walls:
             return super().unsound_static(G, loop, demand)
         m, S1 = loop.channels, G.dc()
@@ -454,7 +457,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Delays that switch within [lo, hi] at every tick and on every channel.
+# The condition switching: delays that switch within [lo, hi] at every tick, on each device separately.
 
 
 class SwitchingDelays(ThisEnvironment):
@@ -475,13 +478,14 @@ _SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # shares of alpha that are 
 
 
 def _half_widths(loop: Loop) -> Array:
-    """Return h = (hi - lo)/2, (m,)."""
+    """Return half the width (hi - lo)/2 of each channel's range of delays, (m,) [samples]."""
     return (np.array(loop.delays.hi) - np.array(loop.delays.lo)) / 2
 
 
 # ----------------------------------------------------------------------------------------------------
-# Forces that are sent through the limiter of controller.law. any-environment covers them without a further proof if the
-# environment has no delay: with rho = 0 the limiter and the environment together are a passive environment.
+# The condition limiter: forces are sent through the limiter of controller.law. With rho = 0 the limiter and a passive
+# environment together are passive, so any-environment covers limited forces without a further proof, except with a
+# delay in the environment.
 
 BETA = 0.01  # default lag of a limiter under this-environment, relative to Delta/T
 
@@ -502,7 +506,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device, to six digits; rho does not grow with the factor s on the damping."""
+        """Return rho [N/m] per device, to six digits, from the available damping (s = 1)."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -540,21 +544,21 @@ LIMITER = LimitedForces()
 
 
 def beta_of(loop: Loop, certificate: Certificate) -> float:
-    """Return beta of the limiter that a certificate covers, or BETA if it covers none."""
+    """Return beta of the limiter that a certificate covers; BETA if it covers none or beta is above 1."""
     rho, share = certificate.multipliers.get("rho", ()), loop.least_damping[0] / loop.delta[0]
     beta = float(f"{rho[0] * loop.T / (certificate.available[0] * share):.6g}") if rho else BETA
     return beta if 0 < beta <= 1 else BETA
 
 
 # ----------------------------------------------------------------------------------------------------
-# Theorem 4, and the least multiplier Phi of an environment with delay inside (psi >= 1), by (17).
+# The condition any-environment (Theorem 4), and its least multiplier Phi (17) for an environment with delay (psi >= 1).
 
 
 _ROOM = 1e-6  # relative increase of Phi that covers the solver's tolerance
 
 
 def least_phi(loop: Loop) -> Array | None:
-    """Return Phi (N,) of `least_multiplier`, verified at every frequency, or None for psi = 0, which needs no Phi."""
+    """Return a small Phi (m,) [N s/m] that is verified at every frequency, or None for psi = 0, which needs no Phi."""
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
@@ -567,14 +571,14 @@ _MOST_STATES = 30  # The least trace is computed up to so many states of E-hat: 
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return a diagonal Phi < Delta_D (N,) [N s/m] with E-hat + Phi passive; with few states, that of least trace.
+    """Return a diagonal Phi < Delta_D (m,) [N s/m] with E-hat + Phi passive; with few states, that of least trace.
 
     Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
     none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
-    least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
+    least, _ = uncovered(unit, loop.psi, none)  # Phi = least delta suffices; no smaller multiple does.
     each, root = least, np.linalg.inv(np.linalg.cholesky(level))
     if loop.levels:
         least, _ = uncovered(root @ unit @ root.T, loop.psi, none)
@@ -656,16 +660,14 @@ class _AnyEnvironment(Multiplied):
 
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
-            return "with delay in the environment its multiplier is of a linear one: no walls"
+            return "with delay in the environment the condition does not cover walls"
         if _in_frame(loop) and any(loop.psi):
             obstacle = "latency" if loop.latency else "delays that switch"
-            return f"with delay in the environment its multiplier is of whole, constant samples: no {obstacle}"
+            return f"with delay in the environment the condition does not cover {obstacle}"
         return None if any(loop.psi) else loop.environment.active(loop.T)
 
     def not_varied(self, loop: Loop) -> str | None:
-        return (
-            "with psi >= 1 every K, T and delay needs a multiplier of its own: not searched" if any(loop.psi) else None
-        )
+        return "with psi >= 1 every K, T and delay has its own multiplier, not searched here" if any(loop.psi) else None
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
@@ -690,8 +692,8 @@ class _AnyEnvironment(Multiplied):
     def _without(self, coupling: Coupling) -> str:
         """Return the reason why a coupling without V(z) is refused."""
         if coupling.holds_model:
-            return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
-        return "without a coupling there is nothing that Theorem 4 could use"
+            return "the coupling contains a model of the environment; Theorem 4 covers only couplings without one"
+        return "Theorem 4 needs a coupling, and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the requirement with `multiplier`, or with the least multiplier if one is needed."""
@@ -765,10 +767,10 @@ ANY_ENVIRONMENT = _AnyEnvironment()
 
 
 def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
-    """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling for any environment.
+    """Return the alpha [N/m] that admits the stiffest coupling for any environment; `damping` is delta/T [N/m].
 
     This alpha minimises the mean over frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), where vt is the mean
-    window and h = (hi - lo)/2 (docs/theory.md).
+    of the windows of the delays lo and hi, and h = (hi - lo)/2 (docs/theory.md, "any environment").
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)

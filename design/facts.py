@@ -3,7 +3,7 @@
 Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
 them. The **hands' side** is a lower bound of the energy that every passive hand and the devices dissipate, whatever
 forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. A **fact**
-of the environment's side describes the forces; it adds inputs, a row for each, and multipliers. The quadratic form is
+of the environment's side describes the forces; it adds inputs, one row for each, and multipliers. The quadratic form is
 
     sum over ticks of f'(displacement that f multiplies) + energy of the damping + terms of the multipliers,
 
@@ -58,10 +58,10 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return Delta_D T/T_max (m,) [N s/m], the damping for even periods T that stands for delta in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m]: damping that in even periods T counts like delta in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
-    the energy balance does not depend on T: the force map is the same at every tick.
+    the energy balance does not depend on T_k: the force map is the same at every tick.
     """
     T = loop.T if T is None else T
     damping = numbers(loop.delta, T)
@@ -75,7 +75,7 @@ def even_level(loop: Loop, T: Number | None = None) -> Any:
     return level if loop.T_max is None else level * (T / numbers(loop.T_max, T))
 
 
-Weights = Sequence[Any]  # w_0 + w_1/z + .. of a row, or w_0 + w_1 z + .. of a displacement
+Weights = Sequence[Any]  # coefficients of w_0 + w_1/z + .. (in a row) or of w_0 + w_1 z + .. (in a displacement)
 
 
 def _product(p: Weights, q: Weights) -> list[Any]:
@@ -88,7 +88,7 @@ def _product(p: Weights, q: Weights) -> list[Any]:
 
 
 def less_advance(p: Weights, follows: Any) -> list[Any]:
-    """Return the weights of (p(1/z) - follows z)/(z - 1), which is causal because p(1) = follows.
+    """Return the weights of (p(1/z) - follows z)/(z - 1), which has no pole at z = 1 because p(1) = follows.
 
     For p = z^-theta this is -(1 + 1/z + .. + z^-theta), the negative window of a delay.
     """
@@ -106,7 +106,7 @@ class Input:
     name: str
     channel: int
     moved: Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
-    follows: int = 1  # 1 if the input is a displacement of the environment, 0 for a speed
+    follows: int = 1  # 1 for a displacement, to which the environment responds; 0 for a speed
     slips: bool = True  # whether the limiter's slip is subtracted from the input
 
 
@@ -116,10 +116,10 @@ class Collected(Generic[Block]):
     def __init__(
         self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
     ) -> None:
-        """Add the rows of the hands' inputs.
+        """Add the hands' inputs and their rows.
 
-        With `any_object` the energy of a passive object behind the sent forces is subtracted: the factor of f_e[k] is
-        the displacement without x[k] - x[k-1] (docs/theory.md, "any environment").
+        With `any_object` the energy of a passive object behind the sent forces is subtracted: f_e[k] multiplies the
+        displacement less x[k] - x[k-1] (docs/theory.md, "any environment").
         """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
@@ -142,13 +142,13 @@ class Collected(Generic[Block]):
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:
-        """Subtract the limiter's slip, one more input per channel, from the displacements of inputs with `slips`."""
+        """Add the limiter's slip, one more input per channel, to the displacements of inputs with `slips`."""
         for i in self.hands:
             if i.slips:
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Add the quadratic form of the hands' side, in the displacements from which no slip is subtracted."""
+        """Add the quadratic form of the hands' side, in the displacements before the slip is subtracted."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -203,7 +203,7 @@ class Collected(Generic[Block]):
     # -- terms of rows
 
     def sums(self, row: int, channel: int, weights: Weights) -> None:
-        """Add the weighted sent force to a row. The force is the sum of its steps, which is a pole at z = 1."""
+        """Add the weighted sent force to a row. The force sums up its steps, so the row has a pole at z = 1."""
         self._sums.append((row, channel, weights, 1))
 
     def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
@@ -211,7 +211,7 @@ class Collected(Generic[Block]):
         self._steps.append((row, channel, weights, scale))
 
     def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
-        """Add the weighted steps of the displacement y across a wall to a row, or y itself if `summed`."""
+        """Add to a row the weighted steps of the displacement y across a wall, or y itself if `summed`."""
         self._walls.append((row, wall, weight, summed))
 
     def term(self, row: int, column: int, weight: Any) -> None:
@@ -227,12 +227,12 @@ class Collected(Generic[Block]):
         self._gain.append((row, column, weight))
 
     def keep(self, row: int, amount: float) -> None:
-        """Add a margin to the diagonal in a search, so that multipliers may be rounded."""
+        """Reserve a margin of the diagonal in a search, so that multipliers may be rounded."""
         self._keep.append((row, amount))
 
     @property
     def spare(self) -> Array | None:
-        """The margins (n,) of `keep`, or None."""
+        """The reserved margins (n,) of the diagonal, or None."""
         spare = np.zeros(self.size)
         for row, amount in self._keep:
             spare[row] += amount
@@ -261,7 +261,7 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return the block from inputs to [x; p; added force steps; previous inputs], and the previous inputs used."""
+        """Return the block from inputs to [x; p; added force steps; delayed inputs], and the numbers of the last."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -269,7 +269,7 @@ class Collected(Generic[Block]):
         return _of_weights(entries, second + len(late), self.size, self.T), late
 
     def build(self, G: Block | None) -> tuple[Array, Block, Any]:
-        """Return (residue at z = 1 (n, n), block without its pole, matrix that the damping multiplies).
+        """Return (residue at z = 1 (n, n), block without its pole and the damping, matrix of the damping).
 
         G maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
         the steps of the forces are inputs instead (`force`).
@@ -404,10 +404,10 @@ class HandsSide(ABC):
 
     @abstractmethod
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
-        """Return the matrix (n, n) over the inputs that is proportional to the devices' damping [N s/m^2]."""
+        """Return the matrix (n, n) over the inputs that is proportional to the devices' damping [N/m]."""
 
     def rest(self, loop: Loop, T: Number, values: Values) -> Sequence[Any]:
-        """Return matrices M_0, M_1 over the inputs; M_0 + M_1/z does not depend on the damping."""
+        """Return M_0, M_1 over the inputs; the part M_0 + M_1/z of the form does not scale with the damping."""
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
@@ -560,9 +560,10 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
 
 
 class PeriodCost(NamedTuple):
-    """L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step, vb = (v + v+)/2; (m,) each.
+    """Least energy L of a period of a known device, with c0, c2 and q of design.known_device; (m,) each.
 
-    The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m.
+    L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the ends of the
+    period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m.
     """
 
     move: Any  # c0/(T - q)
@@ -572,7 +573,10 @@ class PeriodCost(NamedTuple):
 
 
 class KnownMotor(HandsSide):
-    """The form f'(dx + beta dv) + L of motors and transmissions within known bounds (Theorem B); v is the speed."""
+    """The form f'(dx + beta dv) + L of devices whose motors and transmissions have known bounds (Theorem B).
+
+    v is the speed at the beginning of a period, and L is a `PeriodCost`.
+    """
 
     def __init__(self, cost: PeriodCost, beta: Any) -> None:
         self.cost, self.beta = cost, beta
@@ -618,9 +622,9 @@ class Fact(ABC):
 
 
 class Walls(Fact):
-    """Walls that make and break contact. The law of each wall at every tick has the multipliers a, c, d, m.
+    """Walls that make and break contact, with the multipliers a, c, d, m of each wall's law.
 
-    An input of every wall is u, the step of the depth h. A wall with a damper has one more input, s >= 0, which is
+    Every wall has the input u, the step of the depth h. A wall with a damper has one more input s >= 0, which is
     positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
     """
 
@@ -664,9 +668,10 @@ class Walls(Fact):
 class Switching(Fact):
     """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
-    A force that is late by n in [lo, hi] differs from the nominal one by at most half the width times the sum of the
-    steps in between. The multiplier weighs this error w against the displacement that the force multiplies. The axes of
-    a device share its delay, so that the weight may be the matrix alpha_i Delta_i / mean(diag(Delta_i)).
+    A force that is late by n in [lo, hi] differs by an error w from the mean of the forces late by lo and by hi. Summed
+    over all ticks, w^2 is at most ((hi - lo)/2)^2 times the squared steps of the force. The multiplier weighs w against
+    the displacement that the force multiplies. The axes of a device share its delay, so that the weight may be the
+    matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
@@ -697,7 +702,7 @@ class Switching(Fact):
 
 
 def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
-    """Return (power of 1/z, weight) of the causal terms of p(1/z) q(z); the other terms are their mirror images."""
+    """Return (power of 1/z, weight) of the terms of p(1/z) q(z) with powers >= 0."""
     return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
 
 
@@ -705,7 +710,7 @@ _SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's di
 
 
 class Limited(Fact):
-    """Forces that leave through the limiter of controller.law, which has the lag rho > 0 [N/m] on each device.
+    """Forces that are sent through the limiter of controller.law, which has the lag rho > 0 [N/m] on each device.
 
     The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights, so
     that the force of a device may be limited to a ball or to a box.
@@ -735,7 +740,7 @@ class Limited(Fact):
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
-    """Return the damping's form for matrix levels: q_ab delta_i of the inputs a, b of axis i becomes q_ab Delta_i."""
+    """Return the damping's form for a matrix Delta: q_ab delta_i of inputs a, b of axis i becomes q_ab Delta_ij."""
     if loop.levels is None:
         return form
     level, at = loop.Delta(isinstance(T, Fraction)), {(each.name, each.channel): g for g, each in enumerate(inputs)}
@@ -757,7 +762,7 @@ def compose(
     scaled: bool = False,
     hands: HandsSide | None = None,
 ) -> Demand[Block]:
-    """Return the block of the loop's hands' side with these facts, at these multipliers, which are not checked.
+    """Return the block of a hands' side with these facts at these multipliers, which are not checked.
 
     Args:
         G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and displacements across
@@ -766,7 +771,8 @@ def compose(
         facts: The facts of the environment's side.
         values: The multipliers by name.
         late: Whether the delays Theta have to be added; False if G contains them.
-        scaled: Whether the hands' side's values are s times its multipliers, so that the block is affine in s and them.
+        scaled: Whether `values` holds the multipliers of the hands' side times s, so that the block is affine in s and
+            all values.
         hands: The hands' side; None for `hands_side(loop)`.
     """
     values = values or {}
@@ -793,7 +799,7 @@ def compose(
 
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
-    """Add the form of the hands' side. If `scaled`, its terms with multipliers are not multiplied by s."""
+    """Add the form of the hands' side. If `scaled`, its multipliers contain s, so their terms become constant terms."""
 
     def form(values: Values) -> Any:
         return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)
@@ -807,7 +813,7 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
 
 
 def _paths(loop: Loop, switch: bool) -> list[Weights]:
-    """Return the weights of Theta for each channel; for switching delays the mean of both ends."""
+    """Return the weights of Theta for each channel; for switching delays the mean of the delays lo and hi."""
     spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
     return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
 
@@ -820,7 +826,7 @@ def compose_any(
     scaled: bool = False,
     hands: HandsSide | None = None,
 ) -> Demand[Block]:
-    """Return the block of the loop's hands' side for any passive object behind the coupling V, without delay psi.
+    """Return the block of a hands' side for any passive object behind the coupling V, without delay psi.
 
     The inputs are those of the hands' side and the facts, followed by df_e, the steps of the sent forces. The row of
     df_e is V(1)/2 - (V - V(1))/(z-1). The multipliers `values` are not checked.
