@@ -1,16 +1,19 @@
 """Engines, which move the plant between two samples, for one simulation or for many at once.
 
+The plant has the state s = [positions; velocities v; states of the hands' impedances], external forces w and forces f
+that are fed back. A step lasts h seconds.
+
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
-    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: MuJoCo computes the accelerations (one
-                  mj_forward a step), and J is the plant's matrix; exact for a linear scene at any stiffness and step
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: MuJoCo computes the accelerations qacc
+                  (one mj_forward per step), and J is the plant's matrix; exact for linear scenes at any stiffness and h
     RK4, ..       MuJoCo's own integrators; sim.accuracy compares numbers of steps per period
 
-The exponential and the exact engine have the same J. Their comparison checks MuJoCo's forces and the assembly of the
-scene, but not the stepping in time, which RK4 checks.
+The exponential and the exact engine use the same J. Comparing them checks MuJoCo's forces and the assembly of the
+scene, but not the time stepping. A comparison with RK4 checks the time stepping.
 
-MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step contains its state and force, and stays
-exact. MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the
-positions rest (Strang splitting). The splitting is of second order in the step and generates no energy.
+MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step includes the impedance and stays exact.
+MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the positions
+are fixed (Strang splitting). The splitting is of second order in the step and generates no energy.
 
 All engines read their inputs from a row of a step buffer and write the next row, without copies. With a timing
 (controller.delay) every tick has its own length, and late forces latch within the tick. The plant's state then ends
@@ -46,7 +49,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = 256  # maps of different ticks in an engine's cache
+_MOST_MAPS = 256  # size of an engine's cache of period maps, one for each kind of tick
 
 
 class Engine(Protocol):
@@ -58,7 +61,7 @@ class Engine(Protocol):
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """A function of k: hold the plant input of row k for T, and write the plant state of row k + 1."""
+        """A function of k that holds the plant input of row k for T and writes the plant state of row k + 1."""
         ...
 
     def troubled(self) -> bool:
@@ -70,7 +73,7 @@ class Engine(Protocol):
 class RunsBlocks(Protocol):
     """Optional methods of an engine that runs many ticks of a linear law in one call."""
 
-    run_block: RunBlock | None  # set by `start`: runs law and `advance` for a number of ticks from row 0 on
+    run_block: RunBlock | None  # set by `start`; runs the law and `advance` for a number of ticks from row 0 on
 
     def back(self, k: int) -> None:
         """Restore the plant state of row k after a `run_block`."""
@@ -144,7 +147,7 @@ class OneByOne:
 
 
 class ExactTimedEngine(_Exact):
-    """An exact engine for ticks of a timing; plant j of a stack moves simulation j of the buffer."""
+    """The exact engine with the tick lengths and latch times of a timing; plant j of a stack moves simulation j."""
 
     def __init__(self, plant: Plant, timing: Timing) -> None:
         held, kinds = lru_cache(_MOST_MAPS)(partial(hold, plant)), timing.kinds
@@ -226,7 +229,7 @@ class _Access:
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
 
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
-        """Return a function that moves tick k of the buffer from the plant's present state."""
+        """Return a function that advances the plant from its present state through tick k of the buffer."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
         states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
@@ -284,7 +287,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """Return a function that moves a tick from latch to latch, and writes the held forces after the next state."""
+        """Return a function that advances a tick from latch to latch, and stores the held forces after the state."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -303,7 +306,7 @@ class _Access:
         return advance
 
     def _move_by(self, seconds: float, row: Array) -> None:
-        """Move MuJoCo, whose present state is `row`, for some seconds, and update `row`."""
+        """Advance MuJoCo, whose present state is `row`, by some seconds, and update `row`."""
         (view,) = self._shaped(row[None])
         if self.move:
             for _ in range(self.substeps):
@@ -372,7 +375,7 @@ class MujocoEngine:
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """The function that moves one tick, made at its first use after `start`."""
+        """The function that advances one tick; it is made at its first use after `start`."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 
@@ -508,7 +511,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Return the product with each of a stack of matrices; a single matrix serves all columns."""
+    """Return the product of each matrix of a stack with its column; a single matrix multiplies all columns."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 
@@ -521,7 +524,7 @@ def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujo
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
     if integrator == EXPONENTIAL != default_integrator(scene) and scene.plant.felt is not None:
-        raise InputError("a human has an impedance (A, B, C, D) and a device rubs: use integrator RK4, not exponential")
+        raise InputError("a human has an impedance (A, B, C, D) and a device has friction: use integrator RK4")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])

@@ -26,7 +26,7 @@ from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.result import ANY
 
-Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison, which would be circular imports
+Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison; importing them would be circular
 
 
 class Run(Protocol):
@@ -93,7 +93,7 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 
 
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Write the figure in the format of the suffix, with its texts taken literally; the file is complete or absent.
+    """Write the figure atomically in the format of the suffix; its texts are not parsed as formulas.
 
     A .png is for the screen. A .pdf or .svg is for a paper: as wide as a page of two columns, with letters that are
     readable at that width.
@@ -114,13 +114,13 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
 
 
-_PAGE = 7.16  # [inch] both columns of an IEEE page, and nearly those of other two-column papers
-_LEGEND = 0.8  # columns of a legend per entry, in a figure that is printed at its own width
+_PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
+_LEGEND = 0.8  # columns of a legend per entry, in a figure that is not shrunk
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
 def _fit_paper(figure: Figure) -> None:
-    """Make a figure at most as wide as a page, its lines thinner in proportion."""
+    """Make a figure at most as wide as a page, and its lines thinner in proportion."""
     width, height = figure.get_size_inches()
     share = min(1.0, _PAGE / width)
     figure.set_size_inches(share * width, share * height)
@@ -136,7 +136,7 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Show texts literally: a dollar sign is no formula, and a character that the font lacks becomes a mark."""
+    """Show texts literally: a dollar sign starts no formula, and a character that the font lacks is replaced."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
     texts = list(figure.texts)  # findobj would create all ticks, which the layout creates again
     for axis in figure.axes:
@@ -167,7 +167,7 @@ class Contacts:
     """The contacts in a picture: names, places of walls, and the ticks at which a wall is touched."""
 
     names: Sequence[str] = ()  # (m,) of the channels; empty for "device 1", ..
-    walls: Sequence[tuple[int, float, str]] = ()  # channel from 0, place [m] and name of each wall on ground
+    walls: Sequence[tuple[int, float, str]] = ()  # channel (from 0), position [m] and name of each wall on ground
     touching: NDArray[np.bool_] | None = None  # (N,) whether any wall is touched
 
     def name(self, i: int) -> str:
@@ -193,7 +193,7 @@ def draw_run(
 ) -> Figure:
     """Draw displacements and forces of a run, with a zoom where the forces turn most sharply.
 
-    Handles are thick and encoders thin where the two differ.
+    Where handles and encoders differ, handles have thick curves and encoders thin ones.
 
     Args:
         result: The run.
@@ -403,7 +403,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Return the six periods of the first `ticks` in which the forces turn most sharply.
+    """Return the six periods within the first `ticks` in which the forces turn most sharply.
 
     The part is longer if no force has six turning points in six periods.
     """
@@ -421,7 +421,7 @@ def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> sli
 
 
 def _turns(f: Array) -> int:
-    """Return the largest number of turning points of a force, of forces (k, m)."""
+    """Return the largest number of turning points of any of the forces f (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
 
@@ -471,7 +471,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
 
 # ----------------------------------------------------------------------------------------------------
-# Checks: engines against each other, random humans, how tight a condition is.
+# Checks: engines against each other, and random humans.
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:

@@ -1,7 +1,7 @@
 """Scenarios: devices, humans, environment, delays and timing of one loop, read strictly from TOML.
 
-Unknown keys and impossible numbers are refused. Humans may stand in a file of their own, one [[human]] per device, so
-that the humans of a search can be stored and replayed.
+Unknown keys and impossible numbers are refused. Humans can be in a separate file with one [[human]] per device, so that
+the humans of a search can be stored and replayed.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # total of all channels [samples]; eigenvalues of 1000 states take ten seconds, of 2000 a minute
-_MOST_CHANNELS = 32  # a run of 16 channels without a coupling takes 13 s of a core; of 50 it takes minutes
+_MOST_CHANNELS = 32  # without a coupling a run of 16 channels takes 13 s of CPU time, a run of 50 takes minutes
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
-_TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
+_TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]
-_UNSAID: Any = None  # default that is replaced once the number of channels is known
+_UNSAID: Any = None  # placeholder of a default that depends on the number of channels
 
 
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -71,29 +71,29 @@ def _usual_hand(i: int) -> Human:
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Devices, humans, environment, delays and timing of one loop; every list has one entry per device.
 
-    A channel is an axis of a device. Delays and latencies are given per device and kept per channel.
+    A channel is an axis of a device. Delays and latencies are given per device and stored per channel.
     """
 
     name: str
     unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
     radius: float | None = None  # [m] from the axis of rotary devices to the hand, for the limits of a session
     T: float  # sampling period [s]
-    theta: _Delays  # transmission delays [samples] (4)
-    psi: _Delays = _UNSAID  # environment delays [samples] (5); none unless given
+    theta: _Delays  # transmission delays [samples], the paper's equation 4
+    psi: _Delays = _UNSAID  # environment delays [samples], equation 5; default: 0
     device: tuple[Device, ...]
     human: tuple[Human, ...] = _UNSAID  # the hands that hold the devices in a run; default: `_usual_hand`
     environment: Network
-    ranges: Ranges | None = None  # environments beside the nominal one that guarantees must cover
-    lam: _Delays | None = None  # reference delays [samples] (7); None: those of the case
+    ranges: Ranges | None = None  # environments that guarantees must cover besides the nominal one
+    lam: _Delays | None = None  # reference delays [samples], equation 7; None: `reference_delays` of the case
     person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # distribution of the humans that `validate` draws
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
-    T_min: float | None = None  # [s] the shortest period if periods vary; only known-device needs it
-    period: Periods | None = None  # the periods that are simulated; the computer's filters are designed for T
-    latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the force's latch
+    T_min: float | None = None  # [s] the shortest period if periods vary; only the known-device condition uses it
+    period: Periods | None = None  # the simulated periods; the coupling is computed for T
+    latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
@@ -124,7 +124,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
-            seconds = f"each is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
+            seconds = f"each sample is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
             raise ValueError(f"{many}: {seconds}; a longer T has fewer samples for the same delay")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
@@ -141,7 +141,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             free = [self.device[k - 1].axis_names for k in person.holds]
             if len(set(free)) > 1:
                 shown = "; ".join(", ".join(name[1:] for name in names) for names in free)
-                expected = f"expected devices with the same free axes, which are {shown}"
+                expected = f"expected devices with the same free axes; theirs are {shown}"
                 raise ValueError(f"person #{i}.holds is {list(person.holds)}, {expected}")
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
@@ -155,7 +155,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
     def _per_channel(self) -> None:
-        """Convert values per device to values per channel. Raises ValueError if the axes of a device differ in them."""
+        """Convert values per device to values per channel. Raises ValueError if axes of one device differ."""
         counts = [len(device.free) for device in self.device]
         if max(counts, default=1) == 1:
             return
@@ -212,7 +212,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lead(self) -> list[int]:
-        """(m,) the first channel of each channel's device, whose drawn delays and latencies all its axes share."""
+        """For each channel, the first channel of its device; all axes share this channel's drawn delay and latency."""
         counts = [len(device.free) for device in self.device]
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
@@ -232,7 +232,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"varying_delay has {varying.channels} ranges for {self.channels} channels")
         if self.environment.walls:
             instead = "design and design.audit prove both with --varying-delay"
-            raise ValueError(f"varying_delay and environment.walls: only linear loops are run with both; {instead}")
+            raise ValueError(f"varying_delay and environment.walls: the simulation cannot combine them; {instead}")
         for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True), start=1):
             if varying.playout and n != hi:
                 raise ValueError(f"theta #{i} is {n}, but varying_delay.playout makes it the largest delay, {hi}")
@@ -266,7 +266,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delta(self) -> tuple[float, ...]:
-        """The guaranteed damping on each channel [N s/m]; of a matrix, the diagonal (`loop` has the matrix: levels)."""
+        """The guaranteed damping on each channel [N s/m]; of a damping matrix (in `Loop.levels`), the diagonal."""
         return tuple(device.passivity_level for device in self.axis_devices)
 
     @property
@@ -300,7 +300,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def known_devices(self) -> tuple[DeviceBounds, ...] | None:
-        """The guaranteed bounds of every device, None unless all devices have some."""
+        """The guaranteed bounds of every device; None unless all devices have guaranteed bounds."""
         known = tuple(device.guaranteed for device in self.axis_devices if device.guaranteed)
         return known if len(known) == self.channels else None
 
@@ -353,7 +353,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lever(self) -> float:
-        """The radius [m] at which a hand holds a rotary device, 1 without one; it converts N to N m and m to rad."""
+        """The radius [m] at which a hand holds a rotary device, else 1; it converts between N and N m, m and rad."""
         return self.radius or 1.0
 
     def loop(self, case: str) -> Loop:
@@ -385,7 +385,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         theta, late, delta = self.theta[:1], self.latency and self.latency[:1], self.delta[:1]
         if self.device[0].axes > 1:
             least = np.linalg.eigvalsh(self.device[0].matrix("delta"))[0]
-            delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)  # rounding of eigvalsh
+            # The factor covers the rounding of eigvalsh.
+            delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)
         rest: dict[str, Any] = {"T_max": self.longest_period, "unit": self.unit, **self._known(1)}
         return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
 
@@ -479,31 +480,31 @@ def require_no_world(scenario: Scenario, what: str) -> None:
 
 
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
-    """Raise InputError if a loop has Coulomb friction or walls; with `walls` the command decides walls, too."""
+    """Raise InputError if a loop has Coulomb friction or walls; `walls` permits walls."""
     for i, device in enumerate(scenario.device, start=1):
         if np.any(device.friction):
             friction = list(device.friction) if isinstance(device.friction, tuple) else f"{device.friction:g}"
             instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device #{i}.friction is {friction} N: {what} decides linear loops; {instead}")
+            raise InputError(f"device #{i}.friction is {friction} N: {what} accepts linear loops only; {instead}")
     if scenario.environment.walls and not walls:
-        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
+        raise InputError(f"environment.walls: {what} accepts linear loops only; sim.run simulates walls")
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raise InputError if delays vary, for commands that cannot simulate this."""
+    """Raise InputError if delays vary, for commands that cannot simulate varying delays."""
     if scenario.varying_delay is not None:
-        instead = "sim.run simulates it"
-        raise InputError(f"varying_delay: {what} takes the delays that its link has; take the table out, {instead}")
+        instead = "or use sim.run"
+        raise InputError(f"varying_delay: {what} does not simulate varying delays; remove the table, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
-    """Raise InputError if ticks are uneven or forces latch late, for commands that cannot simulate this."""
+    """Raise InputError if the scenario has `period` or `latency`, for commands that cannot simulate them."""
     for name in ("period", "latency"):
         if getattr(scenario, name) is not None:
-            raise InputError(f"{name}: {what} takes the ticks that it has; take the key out, sim.run simulates it")
+            raise InputError(f"{name}: {what} does not simulate this key; remove it, or use sim.run")
 
 
-# ---- humans in a file of their own
+# ---- humans in a separate file
 
 
 class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -582,10 +583,10 @@ def _own_humans(text: str) -> _HumanFile:
         people = called(f"--human {text}", people)
     if callable(getattr(people, "draw", None)):
         if len(_checked_own(tuple(people.draw(np.random.default_rng(0), 2)))) != 2:
-            raise ValueError("draw(rng, 2) gives not two humans")
+            raise ValueError("draw(rng, 2) does not return two humans")
         return _HumanFile((), (), people)
     if not isinstance(people, list | tuple):
-        raise ValueError(f"it is {people!r}, expected a list of hands, or a population with draw(rng, n)")
+        raise ValueError(f"it is {people!r}, neither a list of hands nor a population with draw(rng, n)")
     persons = tuple(person for person in people if isinstance(person, Person))
     return _HumanFile(_checked_own(tuple(hand for hand in people if not isinstance(hand, Person))), persons)
 
@@ -602,7 +603,7 @@ def save_humans(
     persons: tuple[Person, ...] = (),
     mechanics: Sequence[Mechanics] = (),
 ) -> Path:
-    """Write humans and persons without voluntary motion so that reading gives the same numbers.
+    """Write humans and persons, without their voluntary motion, with all digits of their numbers.
 
     `remark` becomes a comment. `mechanics` are the drawn mechanics of the devices, if there are any.
     """
@@ -622,7 +623,7 @@ def save_humans(
     return write(path, "\n".join(lines) + "\n")
 
 
-# ---- conversion of files, and the words of their errors
+# ---- conversion of files, and error messages
 
 
 def _is_rotary(text: str) -> bool:
@@ -667,7 +668,7 @@ def _require_keys(raw: dict[str, Any]) -> None:
         )
         if missing := [name for name in (*needed, "damping", "force_limit", "credible_speed") if name not in given]:
             raise ValueError(
-                f"device #{i}: missing {', '.join(missing)}: a rotary device has no defaults, nor a catalogue"
+                f"device #{i}: missing {', '.join(missing)}: rotary devices have neither defaults nor a catalogue"
             )
 
 
@@ -702,7 +703,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
         return raw
     for i, n in enumerate(counts, start=1):
         if n != counts[0]:
-            raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as of device #1: clamp axes of it instead")
+            raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as of device #1: clamp its axes instead")
     names = AXES[: counts[0]]
     held = [one.get("clamped", []) for one in tables]
     contacts, walls = table.get("contacts", []), table.get("walls", [])
@@ -738,7 +739,7 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     if not several:
         return [spring]
     if "along" in spring:
-        raise ValueError(f"environment.springs #{number}: along with a list of {several[0]}: give one of them")
+        raise ValueError(f"environment.springs #{number}: expected along or a list of {several[0]}, not both")
     rest = {key: value for key, value in spring.items() if key not in several}
     by_direction: dict[tuple[float, ...], dict[str, float]] = {}
     for name in several:
@@ -807,7 +808,7 @@ def _require_no_along(environment: Any) -> None:
     """Raise ValueError if an environment without a world has a key that belongs to worlds."""
     extra = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
     if extra:
-        raise ValueError(f"environment.{extra[0]} is only with environment.world")
+        raise ValueError(f"environment.{extra[0]} is allowed only with environment.world")
 
 
 def _direction(number: int, row: Any) -> list[float]:
@@ -905,7 +906,7 @@ def _checked_own(value: Any) -> Any:
 
 
 def _given_fields(device: Device) -> dict[str, Any]:
-    """Return the fields of a device without newer fields at their default, so that old digests stay valid."""
+    """Return the fields of a device, but newer ones only if they are not default, so that old digests stay valid."""
     fields = msgspec.to_builtins(device)
     for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
         if fields.get(name) == default:

@@ -114,7 +114,7 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
             ('kind = "rigid"', 'kind = "compliant"'),
             "device #1: missing motor_mass, handle_mass, transmission_stiffness",
         ),
-        (('kind = "rigid"', 'device = "omega.3"'), "nor a catalogue"),
+        (('kind = "rigid"', 'device = "omega.3"'), "neither defaults nor a catalogue"),
         (("mass = 0.02\ndamping = 0.1", "mass = 1e9\ndamping = 0.1"), "mass is 1e+09, allowed are 1e-06 to 1000 kg m2"),
     ],
 )

@@ -320,7 +320,7 @@ def test_at_most_six_walls():
 
 
 def test_a_command_that_decides_linear_loops_refuses_walls():
-    with pytest.raises(InputError, match="decides linear loops"):
+    with pytest.raises(InputError, match="accepts linear loops only"):
         accuracy(["--scenario", "one-wall"])
 
 

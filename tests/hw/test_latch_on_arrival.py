@@ -126,7 +126,7 @@ def test_a_session_replays_bit_for_bit(tmp_path, capsys):
             "--latch arrival with --condition any-environment: with delay in the environment",
         ),
         (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
-        (["--latency", "1e-4"], "latency: hw.bridge takes the ticks that it has"),
+        (["--latency", "1e-4"], "latency: hw.bridge does not simulate this key"),
     ],
 )
 def test_what_does_not_go_together(more, said):

@@ -426,5 +426,5 @@ def test_varying_delays_of_scenarios_are_refused(module, scenario, tmp_path, mon
     monkeypatch.setattr(
         module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )
-    with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
+    with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ does not simulate varying delays"):
         module.main(["--rehearse", "--out", str(tmp_path)])

@@ -125,7 +125,7 @@ def test_where_devices_rub_runge_kutta_moves_an_impedance():
     rubbing = held_by(Light(), Light())
     devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
     simulation = assemble(rubbing.replace(device=devices), PUBLISHED["I"])
-    with pytest.raises(InputError, match=r"a human has an impedance .* and a device rubs: use integrator RK4"):
+    with pytest.raises(InputError, match=r"a human has an impedance .* and a device has friction: use integrator RK4"):
         make_engine(simulation, "mujoco", "exponential")
     coarse, fine = (run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x for n in (4, 16))
     assert rms(coarse, fine) < 1e-4  # of first order where a device sticks
@@ -300,9 +300,9 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     )
     assert len(_load_humans(f"{python}:good", 2).population.draw(None, 3)) == 3
     for name, message in [
-        ("none", "draw(rng, 2) gives not two humans"),
+        ("none", "draw(rng, 2) does not return two humans"),
         ("wrong", "human #1 is 1, expected a Human"),
-        ("number", "it is 1, expected a list of hands"),
+        ("number", "it is 1, neither a list of hands"),
     ]:
         with pytest.raises(InputError) as caught:
             _load_humans(f"{python}:{name}", 2)

@@ -312,7 +312,7 @@ def test_a_device_that_is_not_known_well_enough(device, message):
 
 
 def test_too_many_delay_states_are_refused():
-    with pytest.raises(ValueError, match=r"1998 samples in all, allowed are 1000: each is a state, .* about 80 s"):
+    with pytest.raises(ValueError, match=r"1998 samples in all, allowed are 1000: each sample is a state, .* 80 s"):
         load().replace(theta=(999, 999))
 
 
