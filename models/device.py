@@ -1,4 +1,4 @@
-"""Force-feedback devices with one to three axes, the damping that certificates rest on, and a catalogue of them."""
+"""Force-feedback devices with one to three axes, their guaranteed damping, and a catalogue of real devices."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m]
-_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below any device's, above the rounding of the largest
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] least for a damping matrix: far below any device's, but above rounding errors
 AXES = ("x", "y", "z")
 
 #: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
@@ -102,7 +102,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
 
     @property
     def ball(self: Any) -> bool:
-        """Whether `force_limit` bounds the length of the force vector, and not each axis."""
+        """Whether `force_limit` bounds the length of the force vector instead of the force on each axis."""
         return isinstance(self.force_limit, Real) and len(self.free) > 1
 
     def channels(self: Any) -> tuple[Device, ...]:
@@ -215,7 +215,7 @@ Device = CompliantDevice | RigidDevice
 
 
 class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Bodies and transmission of one device with guaranteed bounds, drawn within them."""
+    """The masses and the transmission of one device, drawn within its guaranteed bounds."""
 
     motor_mass: float  # [kg]
     handle_mass: float  # [kg]
@@ -227,13 +227,13 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
 
         A negative entry of u selects the bound itself, because the worst devices lie near the bounds. A positive entry
-        moves the logarithm of its value evenly away from the bound. At 1 the motor has ten times its least mass and the
-        handle, which has no bound, a hundredth of its mass. The stiffness is then a tenth of the largest one, and the
-        damping is the largest one.
+        moves the logarithm of its parameter evenly away from the bound. At 1 the motor has ten times its least mass,
+        the handle (which has no bound) has a hundredth of its mass, the stiffness is a tenth of the largest stiffness,
+        and the damping is the largest damping.
         """
         known = device.guaranteed
         assert known is not None  # the caller draws only where every device has bounds
-        assert isinstance(device, CompliantDevice)  # a rigid one is refused with bounds
+        assert isinstance(device, CompliantDevice)  # a rigid device with bounds is refused
         least, most = known.transmission_damping_min, known.transmission_damping_max
         ends = np.array([10.0, 0.01, 0.1, most / least])
         starts = known.motor_mass_min, device.handle_mass, known.transmission_stiffness_max, least
@@ -241,7 +241,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(motor, handle, stiffness, min(damping, most))
 
     def of(self, device: Device) -> Device:
-        """Return the device with these mechanics. Raises ValueError where they leave its guaranteed bounds."""
+        """Return the device with these mechanics. Raises ValueError if they are outside its guaranteed bounds."""
         if isinstance(device, RigidDevice):
             raise ValueError("a rigid device has no transmission that could be drawn")
         return msgspec.structs.replace(device, **msgspec.structs.asdict(self))
@@ -289,7 +289,7 @@ def _check_axes(self: Any) -> None:
 
 
 def _check_damping(self: Any) -> None:
-    """Raise ValueError unless 0 <= damping and 0 < delta <= damping, as matrices where there are several axes."""
+    """Raise ValueError unless 0 <= damping and 0 < delta <= damping, as matrices if there are several axes."""
     if self.axes == 1:
         for name in ("damping", "delta"):
             if isinstance(getattr(self, name), tuple):
@@ -316,13 +316,13 @@ def _check_damping(self: Any) -> None:
     # eigvalsh is exact to a few units in the last place of the largest entry
     if (left := np.linalg.eigvalsh(damping - delta)[0]) < -1e-12 * most:
         raise ValueError(
-            f"delta is {_listed(self.delta)}, allowed is delta <= damping as matrices: damping - delta has {left:g}"
+            f"delta is {_listed(self.delta)}, allowed is delta <= damping: an eigenvalue of damping - delta is {left:g}"
         )
 
 
 # ----------------------------------------------------------------------------------------------------
 # Published parameters of devices that can be bought or built, with their sources. A scenario that names a device must
-# give the parameters that nobody publishes, for example as measured by `python -m hw.identify`.
+# give its damping and force limit if nobody publishes them, for example as measured by `python -m hw.identify`.
 
 
 @dataclass(frozen=True)
@@ -367,7 +367,7 @@ _IDENTIFIED = "section 6 of the paper: a first-order model identified on an Omeg
 
 
 def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> Listed:
-    """Return a device of CHAI3D's table without its wrist and gripper."""
+    """Return a Force Dimension device of CHAI3D's table, without wrist and gripper."""
     limits = {"force_limit": force, "stiffness": stiffness, "framework_damping": 30.0}
     return Listed(f"Force Dimension {title}", **{name: _Known(value, _DELTA) for name, value in limits.items()}, **more)
 

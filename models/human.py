@@ -1,4 +1,4 @@
-"""Humans as passive ports at the handles: chains of masses, persons with several devices, random draws, own hands.
+"""Humans as passive ports at the handles: chains of masses, persons with several devices, random humans, own classes.
 
 Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
 feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). The constructor of a `Port` checks passivity,
@@ -88,7 +88,7 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     into = np.linalg.inv(speed * one - A)
     G = Lti((speed * one + A) @ into, into @ B, C @ (into @ (2 * speed * one)), D + C @ into @ B, 1.0)
     size = float(np.abs(G.at(np.exp(1j * np.pi * (np.arange(64) + 0.5) / 64))).mean())
-    rounding = 1 + float(np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # of the division by speed I - A
+    rounding = 1 + float(np.linalg.norm(into) * np.linalg.norm(speed * one + A))  # grows with cond(speed I - A)
     floor, least, t = hermitian_floor(G, -_ROUNDING * size, -_ROUNDING * size, rounding)
     hertz = f"{speed * math.tan(t / 2) / (2 * np.pi):.6g} Hz"
     if not least >= -_ROUNDING * size:
@@ -137,9 +137,9 @@ class Port:
             raise ValueError("port: a point that is no handle has no mass")
         groups = len(self.across) // self.axes
         if not self.across[:, : -self.axes].any(axis=1).all() or not -groups <= self.pull < groups:
-            raise ValueError("port: expected spring-dampers that touch a point each, and `pull` one of them")
+            raise ValueError("port: expected spring-dampers that touch a point each, and the index of one as `pull`")
         if self.impedance and (self.handles > 1 or self.impedance.A.shape[:-2] != tuple(many)):
-            raise ValueError("port: an impedance belongs to one handle, and to each of many humans")
+            raise ValueError("port: an impedance needs a port with one handle, and as many humans as the port")
 
     @classmethod
     def chain(cls, links: _Array) -> Self:
@@ -165,7 +165,7 @@ class Port:
         """Return this port on a device with `axes` axes. A port of one axis is repeated on each of them.
 
         Raises:
-            ValueError: The port has several axes, but another number of them.
+            ValueError: The port has several axes, but not `axes` of them.
         """
         if self.axes == axes:
             return self
@@ -186,7 +186,10 @@ class Port:
 
     @classmethod
     def body(cls, hands: int, values: _Array) -> Self:
-        """Return a body on ground, with a spring-damper from each hand to the next; values (..., 5) as Crowd.bodies."""
+        """Return a body on ground, with a spring-damper from each hand to the next.
+
+        `values` (..., 5) are mass, damping and stiffness of the body, then damping and stiffness between the hands.
+        """
         mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
         across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
         across[-1] = 0.0
@@ -228,7 +231,7 @@ class Port:
 def directions(axes: int) -> _Array:
     """Return directions (axes^2, axes) of springs: e_i + e_j and e_i - e_j for every two axes, then the axes.
 
-    The stiffness matrices of such springs together are exactly the diagonally dominant ones.
+    Springs along these directions can have any diagonally dominant stiffness matrix in total, and no other.
     """
     unit = np.eye(axes)
     skew = [unit[i] + sign * unit[j] for i in range(axes) for j in range(i + 1, axes) for sign in (1, -1)]
@@ -245,7 +248,7 @@ def _amounts_along(field: str, value: Any, axes: int) -> _Array:
     skew = [max(0.0, sign * each) for each in pairs for sign in (1, -1)]
     own = 2 * np.diag(matrix) - np.abs(matrix).sum(axis=1)
     if not (own >= -1e-12 * np.abs(matrix).max()).all():  # allows rounding in a matrix that was computed from amounts
-        expected = "no row whose diagonal entry is below the sum of the others' magnitudes"
+        expected = "diagonal entries of at least the sum of the other magnitudes in their row"
         raise ValueError(f"{field} is {matrix.tolist()}, expected {expected}")
     return np.array([*skew, *np.maximum(own, 0.0)])
 
@@ -267,7 +270,7 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
             raise ValueError("impedance: A has a double eigenvalue at zero, expected one spring at most")
         left = left / (left @ null)
         stiffness = float((C @ null).item() * (left @ B).item())
-        # The states without the eigenvalue at zero are those orthogonal to `left`, which A maps to themselves.
+        # A maps the states orthogonal to `left` to each other, there without the eigenvalue at zero.
         rest = np.linalg.svd(left[None])[2][1:].T
         B = B - np.outer(null, left @ B)
         A, B, C = rest.T @ A @ rest, rest.T @ B, C @ rest
@@ -285,8 +288,8 @@ class Hand(Protocol):
     def voluntary_force(self, t: _Array) -> _Array:
         """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port.
 
-        The force has the shape (N,) of t. On a device with several axes it may be (N, axes); then (N,) acts on the
-        first axis only.
+        The force has the shape (N,) of t, or (N, axes) on a device with several axes. There a force of shape (N,) acts
+        on the first axis only.
         """
         ...
 
@@ -299,7 +302,7 @@ def _freeze(record: object, name: str, values: Any) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The project's own humans.
+# The humans of scenarios.
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
@@ -329,7 +332,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
     @property
     def axes(self) -> int:
-        """The number of axes that the device must have; 1 if the link is the same in every direction."""
+        """The device's number of axes for which the link is made; 1 if it is the same in every direction."""
         return max(len(value) if isinstance(value, tuple) else 1 for value in (self.damping, self.stiffness))
 
 
@@ -363,7 +366,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         return force
 
 
-_MOST_LINKS = 500  # Largest number for one hand: eigenvalues then take 5 s, with 1000 links 30 s.
+_MOST_LINKS = 500  # Largest number for one hand: its eigenvalues take 5 s; those of 1000 links take 30 s.
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
@@ -389,7 +392,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
             raise ValueError(f"voluntary.along is {list(along)}, expected {max(several)} numbers as the links have")
 
     def vectors(self) -> list[tuple[str, tuple[Any, ...]]]:
-        """Return the fields, with values, that have an entry for each free axis of the device."""
+        """Return the names and values of all fields that have an entry for each free axis of the device."""
         named = [
             (f"links #{i}.{name}", getattr(link, name))
             for i, link in enumerate(self.links, start=1)

@@ -30,7 +30,7 @@ from haptic_loop.models.scene import quiet_warnings
 Array = NDArray[np.floating[Any]]
 
 _CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
-ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
+ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
 _MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
 _DIRECTION_SLACK = 1e-6  # repetitions end when they change limited forces by less than this part of the limit
@@ -60,7 +60,7 @@ class _Part:
 
     what: str
     count: int
-    at_the_port: str
+    at_the_port: str  # the bound
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ def files_of(path: Path) -> list[Path]:
         for node in _xml(file, path).iter():
             name = node.get("file")
             if node.tag == "include" and name:
-                beside = file.parent / name  # MuJoCo reads this file if the main file's folder has none of the name
+                beside = file.parent / name  # MuJoCo reads this file if the main file's folder has no file of this name
                 visit(base / name if (base / name).exists() or not beside.exists() else beside, base)
             elif node.tag == "model" and name and (part := base / name).suffix == ".xml":
                 if part not in files:
@@ -120,7 +120,7 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 digest of the names and contents of all files of a scene, without their folders.
 
-    Raises the errors of `files_of`.
+    Raises ValueError if a file cannot be read or is no XML.
     """
     total = hashlib.sha256()
     for file in files_of(path):
@@ -135,7 +135,7 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of bodies that may be contacts, in the order of the file. Raises the errors of `files_of`."""
+    """Return the names of bodies that may be contacts, in file order. Raises ValueError if a file cannot be read."""
     return _without_joints(_spec(path))
 
 
@@ -183,7 +183,7 @@ class World:
         base = _compiled(spec, self.path)
         self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
         rotations, springs, names = [], [], [contact.body for contact in self.contacts]
-        bodies = [_touchable(spec, name, names) for name in names]  # checked before the first one gets a joint
+        bodies = [_touchable(spec, name, names) for name in names]  # checks all bodies before the first gets a joint
         for contact, body, G in zip(self.contacts, bodies, stiffness, strict=True):
             values, Q = _principal(np.atleast_2d(np.asarray(G, dtype=float)), contact)
             _slide(spec, body, contact, Q, values, base.body(contact.body).quat)
@@ -216,8 +216,8 @@ class World:
     def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> WorldPort:
         """Return a simulation of the scene from its initial pose, with force limits (m,) [N] at the contacts.
 
-        A limit bounds each component of a contact's force. If the contact's channels are one of the `balls`, it bounds
-        the length of the force.
+        A limit bounds each component of a contact's force. If the contact's channels are one of the `balls`, the limit
+        bounds the length of the force.
         """
         limits = np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float)
         return WorldPort(self, limits, balls)
@@ -229,7 +229,8 @@ class World:
 
         Args:
             pose: Positions (nq,) of this model, the name of a keyframe of the MJCF file, or None for the initial pose.
-            step: The displacement of each position [m, rad]; speeds and forces cause the same displacement in one step.
+            step: The displacement of each position [m, rad]. Speeds and forces are changed so that they move the scene
+                by about as much in one step.
 
         Returns:
             A, B, C, D from forces on the contacts [N] to u [m], with the state (q, h v).
@@ -285,7 +286,7 @@ class World:
         return f"integrator discrete, timestep {self.h:g} s{slow}, elliptic cones, {solver}"
 
     def outside_the_lemma(self) -> list[str]:
-        """Return a name for each actuator, plugin and callback of the scene, which only the energy budget covers."""
+        """Return the names of actuators, plugins and callbacks, whose energy the lemma does not bound."""
         m = self.model
         listed = [f"actuator {m.actuator(i).name or i}" for i in range(m.nu)]
         listed += [f"plugin {m.plugin(i).name or i}" for i in range(m.nplugin)]
@@ -348,11 +349,11 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
     if body.parent.name != "world":
         raise ValueError(f"contact {name!r} is a child of body {body.parent.name!r}, expected a child of the world")
     if body.joints:
-        raise ValueError(f"contact {name!r} has a joint ({body.joints[0].name or 'unnamed'}), expected a body without")
+        raise ValueError(f"contact {name!r} has a joint ({body.joints[0].name or 'unnamed'}), expected none")
     if body.mocap:
         raise ValueError(f"contact {name!r} is a mocap body, expected an ordinary body without joints")
     if list(contacts).count(name) > 1:
-        raise ValueError(f"contact {name!r} is named twice; each device touches a body of its own")
+        raise ValueError(f"contact {name!r} is named twice; each device must touch a different body")
     fixed = list(_fixed_to(body))
     own = {mujoco.mjtObj.mjOBJ_BODY: {part.name for part in fixed}}
     own[mujoco.mjtObj.mjOBJ_SITE] = {site.name for part in fixed for site in part.sites}
@@ -384,7 +385,10 @@ def _name(contact: Contact, axis: int) -> str:
 
 
 def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
-    """Add a contact's slides and springs, set its mass, and compensate its weight, whatever the scene's defaults."""
+    """Add slides and springs to a contact, give it a mass if it has none, and compensate its weight.
+
+    All settings are explicit, so that the scene's defaults do not apply.
+    """
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))
     directions = Q.T @ np.array(contact.along) @ rotation.reshape(3, 3)  # in the frame of the body
@@ -433,7 +437,7 @@ def _force_settings(spec: Any, h: float, gravity: bool) -> None:
 
 
 def _off_rest(model: mujoco.MjModel) -> None:
-    """Lengthen tendon springs by 1e-12, since MuJoCo steps one that is exactly at rest as if it had no stiffness."""
+    """Lengthen tendon springs by 1e-12, because MuJoCo ignores the stiffness of a spring that is exactly at rest."""
     if not model.ntendon:
         return
     exact = (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(axis=1)
@@ -455,16 +459,17 @@ def _blockdiag(blocks: Sequence[Array]) -> Array:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # the last of the types of equalities and friction
+_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # last two-sided type (equalities, friction)
 
 
 class WorldPort:
     """One simulation of a world, tick by tick, with the energy that the scene has generated."""
 
     def __init__(self, world: World, force_limit: Array, balls: Sequence[slice] = ()) -> None:
-        """Start a simulation with `force_limit` (m,) [N], inf for none, and `balls` as in World.port.
+        """Start a simulation with `force_limit` (m,) [N], inf for none.
 
-        Raises ValueError for a limit that is not positive, or a ball whose channels have different limits.
+        If a contact's channels are one of the `balls`, the limit bounds the length of its force. Raises ValueError for
+        a limit that is not positive, or a ball whose channels have different limits.
         """
         if force_limit.shape != (world.channels,) or not (force_limit > 0).all():
             raise ValueError(f"force_limit is {force_limit.tolist()}, expected {world.channels} positive forces in N")
@@ -600,7 +605,7 @@ class WorldPort:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The constraint rows of the last step, and the contact or other constraint to which each belongs."""
+    """The constraint rows of the last step, grouped by contact or other constraint."""
 
     force: Array  # (rows,) [N]
     before: Array  # (rows,) w, the speed before the step [m/s]
@@ -610,7 +615,7 @@ class Rows:
     K: Array  # (rows,) reference stiffness [1/s^2]
     b: Array  # (rows,) reference damping [1/s]
     first: NDArray[np.intp]  # the first row of each contact or other constraint
-    one_sided: NDArray[np.bool_]  # (rows,) False for equalities and friction, whose phi stores energy on both sides
+    one_sided: NDArray[np.bool_]  # (rows,) False for equalities and friction (which stores no energy, K = 0)
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Rows:
@@ -633,7 +638,10 @@ class Rows:
         return self.D * self.K * inside**2 / 2
 
     def excess(self, h: float) -> Array:
-        """Return the energy [J] that each contact or other constraint creates: h f'w+ + phi(r + h w+) - phi(r)."""
+        """Return the energy [J] that each contact or other constraint creates: h f'w+ + phi(r + h w+) - phi(r).
+
+        phi(r) = D K min(0, r)^2/2 is the energy stored in a one-sided row; in a two-sided row r replaces min(0, r).
+        """
         rows = h * self.force * self.after + self._stored(self.depth + h * self.after) - self._stored(self.depth)
         return np.add.reduceat(rows, self.first)
 
