@@ -1,4 +1,4 @@
-"""Checks of function arguments, with one-line errors that name the argument."""
+"""Check function arguments; the errors have one line and name the argument."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 
 def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
-    """Raise TypeError unless `value` is a `kind`."""
+    """Raise TypeError unless `value` is an instance of `kind`; `expected` describes it in the message."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} is {shown(value)}, expected {expected}")
 
 
 def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
-    """Return a whole number from `low` to `high`; NumPy integers are allowed. Raises TypeError, ValueError."""
+    """Return `value` as an int from `low` to `high`; NumPy integers are allowed. Raises TypeError, ValueError."""
     span = f"{low} to {high}" if high < math.inf else f"{low} or more"
     allowed = f"whole numbers, {span}"
     try:
@@ -31,7 +31,7 @@ def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
 
 
 def number(name: str, value: Any, expected: str = "a number") -> float:
-    """Return a float; NumPy numbers are allowed. Raises TypeError."""
+    """Return `value` as a float; NumPy numbers are allowed. Raises TypeError."""
     if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__") or getattr(value, "ndim", 0):
         raise TypeError(f"{name} is {shown(value)}, expected {expected}")
     return float(value)

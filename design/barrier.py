@@ -3,9 +3,9 @@
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
 The barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is strictly
-feasible, and its value is at most degree/t above the minimum, where degree is the total size of the S_k. A Newton step
-is a least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from the eigenvalues of
-these matrices without further evaluations.
+feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k. A Newton
+step is a least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from the
+eigenvalues of these matrices without further evaluations.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
-_CENTRED = 0.5  # squared Newton decrement at which a point counts as central; it is 0.05/t above the best value
+_CENTRED = 0.5  # largest squared Newton decrement of a point that counts as central
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
 _LONGEST = 1e3  # largest step, in Newton steps
@@ -33,14 +33,14 @@ _upper = cache(np.triu_indices)
 
 @dataclass(frozen=True, eq=False)
 class MatrixInequality:
-    """constant + sum_a x_a slope_a > 0 at k frequencies, as real vectors (`packed`)."""
+    """constant + sum_a x_a slope_a > 0 at k frequencies; the matrices are stored as real vectors (`packed`)."""
 
     constant: Array  # (k, r^2)
     slope: Array  # (k, r^2, n)
 
     @classmethod
     def of(cls, constant: Complex, slope: Complex) -> MatrixInequality:
-        """Make the block of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
+        """Return the inequality with the Hermitian matrices constant (k, r, r) and slope (k, n, r, r)."""
         return cls(packed(constant), np.ascontiguousarray(np.swapaxes(packed(slope), 1, 2)))
 
     @property
@@ -58,11 +58,11 @@ class MatrixInequality:
         return _unpacked(self.constant + self.slope @ x)
 
     def moved(self, step: Array) -> Complex:
-        """Return the change of S by a step, (k, r, r)."""
+        """Return the change of S if x changes by `step`, (k, r, r)."""
         return _unpacked(self.slope @ step)
 
     def directions(self, x: Array) -> Array:
-        """Return the vectors of S^-1/2 slope_a S^-1/2 as columns (k r^2, n)."""
+        """Return the matrices S^-1/2 slope_a S^-1/2, `packed`, as columns (k r^2, n)."""
         rows = _turned(_inverse_root(self.at(x))) @ self.slope
         return rows.reshape(-1, rows.shape[2])
 
@@ -73,7 +73,7 @@ class MatrixInequality:
         return -np.tile(one, len(self.constant)) @ rows, rows.T @ rows
 
     def changed(self, U: Array) -> MatrixInequality:
-        """Return the block in terms of y, where x = U^-1 y."""
+        """Return the inequality in the unknowns y = U x."""
         import scipy
 
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
@@ -110,7 +110,7 @@ class EntryInequality:
         return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
-        """Return the change of S by a step, (k, r, r)."""
+        """Return the change of S if x changes by `step`, (k, r, r)."""
         r = self.left.shape[-1]
         X, own = np.split(step, [r * r * self.functions.shape[1]])
         filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)
@@ -154,7 +154,7 @@ class EntryInequality:
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
-    """Join the inequalities into one block for each size of matrices."""
+    """Join the inequalities into one block for each matrix size."""
     sizes = dict.fromkeys(block.constant.shape[1] for block in blocks)
     alike = [[block for block in blocks if block.constant.shape[1] == size] for size in sizes]
     return tuple(
@@ -164,7 +164,7 @@ def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """minimise |A x - b|^2 + c'x under the blocks."""
+    """Minimise |A x - b|^2 + c'x subject to the blocks."""
 
     A: Array  # (rows, n)
     b: Array  # (rows,)
@@ -235,9 +235,9 @@ def centre(program: Program, x: Array, t: float) -> Array:
 
 
 def towards(start: Array, x: Array, program: Program) -> Array:
-    """Return x if it is feasible, else a feasible point on the way from the feasible `start` to x.
+    """Return x if it is feasible, else a feasible point on the line from the feasible `start` to x.
 
-    The point is at nine tenths of the distance from `start` to the boundary.
+    The point lies at nine tenths of the distance from `start` to the boundary.
     """
     if program.feasible(x):
         return x
@@ -265,7 +265,7 @@ def _solved(hessian: Array, right: Array) -> Array:
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
     """Return the step length that minimises the barrier function and leaves a share _KEPT of every eigenvalue of S.
 
-    The share keeps the search away from the boundary, where Newton's method would be slow.
+    With this share the points stay away from the boundary, where Newton's method would be slow.
     """
     along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
     residual, slope = program.A @ x - program.b, program.A @ step
@@ -284,7 +284,7 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
 
 
 def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Array) -> Array:
-    """Return the eigenvalues of S^-1/2 dS S^-1/2 for the step, at every frequency."""
+    """Return the eigenvalues of S^-1/2 dS S^-1/2 at every frequency, where dS is the change of S by the step."""
     inverse = _inverse_root(block.at(x))
     return np.linalg.eigvalsh(inverse @ block.moved(step) @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 

@@ -1,8 +1,9 @@
 """Budgets of the searches, in one table, each with the measurement that set it.
 
-No clock ends a search, so that results do not depend on the load of the machine. A search ends because it has
-converged, because a proof or a bound decides, or because one of these budgets is spent. Work is counted from the sizes
-of matrices and numbers (`haptic_loop.controller.arithmetic.spend`); one unit takes about a second on one core.
+A search ends because it has converged, because a proof or a bound decides, or because one of these budgets is spent.
+No clock ends it unless the user sets a time limit, so that results do not depend on the load of the machine. Work is
+counted from the sizes of matrices and numbers (`haptic_loop.controller.arithmetic.spend`); one unit takes about a
+second on one core.
 Limits of bisections down to rounding, and of iterations in a tick, are defined where they are used.
 Measured on 23 loops, of which 22 are in benchmarks/loops, on one core of an AMD EPYC at 2.4 GHz.
 """
@@ -17,63 +18,63 @@ from haptic_loop.controller.arithmetic import TooLong
 EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.006 for two devices and 0.008 for three.
 SWEEPS = 60.0
-#: Growing the basis of an optimal coupling. The longest of the 23 take 19 (o11), 17 (o08) and 15 (n6, n7).
+#: The search over larger bases of an optimal coupling. The slowest of the 23 loops take 19 (o11), 17 (o08) and 15 (n6,
+#: n7).
 GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of contacts.
 RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
-#: Largest number of states of the loop with a basis. Solving and proving one of 268 states takes 8 for four devices
-#: (n6).
+#: Largest number of states of a loop with a basis. Design and proof of one with 268 states take 8 (n6, four devices).
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
-#: Largest number of unknowns of a basis for this-environment alone. They take ten seconds.
+#: Largest number of unknowns of a basis for this-environment alone. The largest program takes ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Largest product of unknowns and channels with further requirements. It takes ten seconds, too.
+#: Largest product of unknowns and channels with further requirements. The largest program takes ten seconds, too.
 BASIS_BESIDE = 3500
-#: Number of successive bases without a proof after which the growth ends.
+#: Number of successive bases without a certified coupling after which no larger basis is tried.
 UNPROVED_BASES = 2
-#: Number of bases that are tried, the best first, until one is proved at every vertex of ranges.
+#: Number of bases whose couplings are proved at every vertex of ranges, the best first, until one proof succeeds.
 RANGED_BASES = 3
 
 # Sizes of proofs, and rounds of searches that normally converge earlier, with the measured numbers -------------------
 
 #: Largest number of states of a proved block: 0.3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800.
 PROOF_STATES = 800
-#: Rounds of cuts of a multiplier (one-wall takes 8), and rounds without progress after which rounding dominates.
+#: Rounds of cutting planes for a multiplier (one-wall takes 8), and rounds without progress after which they end.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have that many.
 MULTIPLIER_ROWS = 24
-#: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many devices
-#: every start has the first number, and the best starts have the second. With few devices every start has the third.
+#: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many channels
+#: every start has the first number, and the best starts have the second. With few channels every start has the third.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
-#: Rounds with further frequencies of Theorem 4. Only delays of a hundred samples and more take any.
+#: Rounds that add frequencies to Theorem 4. Only delays of a hundred samples and more take any.
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains. Case I takes 2.
 SEQUENCE_STEPS = 60
 #: Designs for less damping until a second condition holds. one-wall takes 2.
 LESS_DAMPING_ROUNDS = 6
-#: Rounds with further frequencies of an optimal coupling. Case I takes 4.
+#: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6
-#: Rounds with further frequencies of the bound on linear couplings, sums of coefficients in it, and intervals of its
-#: integral. Cases I and II take 2 rounds and 568 intervals. Each step of a delay in a row gives a sum per column.
+#: Rounds that add frequencies to the bound on linear couplings, sums of coefficients in it, and intervals of its
+#: integral. Cases I and II take 2 rounds and 568 intervals. Each sample of a row's delay gives one sum for each column.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Convex problems for a coupling of fixed order. Case I takes 32.
 FIXED_ORDER_PROBLEMS = 100
-#: Cuts of the least share of a known device at one beta, and rounds of tangents for beta and multipliers. The pair of
-#: omega.3 with known transmissions takes 4 and 11, one with walls and limited forces 20.
+#: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
+#: and multipliers. The pair of omega.3 with known transmissions takes 4 and 11; with walls and limited forces, 20.
 BETA_CUTS, BETA_ROUNDS = 40, 60
 #: Numbers of points between the vertices of ranges: on all edges; least and most on one edge; on faces and inside; and
-#: starts of ascents. Together they take the 500 sweeps of RANGES.
+#: starts of compass searches. Together they take the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
-# Steps of iterations that converge, with the largest number of steps in brackets. Measured with the optimal and the
+# Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the
 # default designs of cases I and II and of 16 loops of benchmarks/loops (n0 to o09) -----------------------------------
 
-#: Newton steps to the centre of a barrier (9 centrings spent them and kept the last point), and of the primal-dual
-#: method (two runs spent them because of rounding).
+#: Newton steps to the centre of a barrier (9 centrings took all and returned the last point), and of the primal-dual
+#: method (two runs took all because of rounding).
 CENTRING_STEPS, CONE_STEPS = 60, 60
 #: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further pass
 #: divides the condition number by as much. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after
@@ -82,7 +83,7 @@ DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
 #: Rounds of halving the intervals of an integral (3), and intervals that are halved in one round.
 INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
 #: Blocks of 256 ticks over which an impulse response is summed to a relative 1e-9; a bound covers the rest.
-#: Only a mode that takes 250,000 ticks to fall to 1/e spends them.
+#: Only a mode that takes 250,000 ticks to fall to 1/e needs this many blocks.
 GAIN_CHUNKS = 20_000
 
 

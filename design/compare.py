@@ -1,8 +1,8 @@
-"""Couplings over frequency: singular values, required damping, perceived stiffness and damping."""
+"""Evaluate couplings over frequency: singular values, required damping, perceived stiffness and damping."""
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("compare")
@@ -23,7 +23,7 @@ from haptic_loop.design.frequency import Response, frequencies, on_circle
 from haptic_loop.design.result import PLAIN_CONDITIONS, Requirement
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
+# A coupling over frequency: singular values, required damping, and what a hand perceives.
 
 
 _LOWEST_HZ = 0.1
@@ -35,12 +35,12 @@ class Perceived:
     """The effective impedance of each channel with the others held still, as a spring and a damper."""
 
     stiffness: Array  # (k, m) Re G_ii [N/m]
-    damping: Array  # (k, m) Im G_ii / omega [N s/m]; negative where the motion receives energy
+    damping: Array  # (k, m) Im G_ii / omega [N s/m]; negative if the loop adds energy to the motion
 
 
 @dataclass(frozen=True, eq=False)
 class Demands:
-    """A coupling in its loop, with the requirements of its conditions."""
+    """The force map F of a coupling in its loop, with the requirement of each condition."""
 
     F: Lti
     requirements: dict[str, Requirement]
@@ -52,7 +52,7 @@ class Curves:
     """One coupling at the frequencies `hz` of its picture."""
 
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
-    sigma_M: Array  # (k, m) of the mismatch F - Lambda E [N/m]
+    sigma_M: Array  # (k, m) singular values of the mismatch F - Lambda E [N/m]
     perceived: Perceived
     demands: dict[str, Array | None] = field(metadata={"json": "left out"})  # (k,) required over available damping
 
@@ -63,7 +63,7 @@ def judge(
     """Evaluate every condition with all walls touching: its requirement, and its demand over frequency.
 
     `own` are a user's own conditions; `known` are requirements from an assessment of this loop and coupling. Raises
-    SingularLoop.
+    SingularLoop if the algebraic loop has no solution.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)
@@ -77,7 +77,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and those at which conditions bind."""
+    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and those where conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz

@@ -33,8 +33,8 @@ class Certificate(Strict, frozen=True):
 
     condition: str  # the base: a name of design.result.CONDITIONS, or the name of a user's own condition
     facts: tuple[str, ...]  # covered properties beyond one linear network with constant delays (conditions.FACTS)
-    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep with these multipliers
-    available: tuple[float, ...]  # (m,) [N s/m], the damping for which the condition is proved
+    required: tuple[float, ...]  # (m,) [N s/m] required damping, from a refined sweep with `multipliers`
+    available: tuple[float, ...]  # (m,) [N s/m] damping for which the condition is proved
     margin: float  # available / required
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
@@ -73,13 +73,13 @@ class Stored(Strict, frozen=True):
         return self.coupling.build(self.loop.T)
 
 
-_SAME = 1e-9  # allowed rounding between responses of a coupling and its form, relative to the largest response
+_SAME = 1e-9  # allowed difference between the responses of a coupling and its form, relative to the largest
 
 
 def filed(loop: Loop, coupling: Coupling) -> Coupling:
-    """Return the coupling as a file restores it, which for a user's own class is built from its form.
+    """Return the coupling as a file restores it. A coupling of a user's own class is rebuilt from its form.
 
-    Raises InputError if the restored coupling has another response in the loop, or another compliance.
+    Raises InputError if the rebuilt coupling has another response in the loop, or another compliance.
     """
     built = coupling.form().build(loop.T)
     if type(built) is type(coupling):
@@ -89,13 +89,13 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
     for method, own, other in (("around", through(coupling), through(built)), ("compliance", V, rebuilt)):
         if own is None:
             continue
-        name = f"coupling {type(coupling).__name__}: form(), which a file keeps, is another system than {method}()"
+        name = f"coupling {type(coupling).__name__}: form(), which files store, is another system than {method}()"
         if other is None:
             raise InputError(f"{name}: it is a {built.kind} and has no compliance")
         z = on_circle(frequencies(own))
         response = own.at(z)
         scale, apart = np.abs(response).max(), np.abs(response - other.at(z)).max()
-        if not apart <= _SAME * scale + rounding(own, z):  # also true for nan
+        if not apart <= _SAME * scale + rounding(own, z):  # true for nan, too
             raise InputError(f"{name}: responses differ by {apart / scale:.1e} of the largest")
     return built
 
@@ -119,7 +119,7 @@ def _canonical(part: Any) -> bytes:
 
 
 def own_fields(part: Any) -> Any:
-    """Return an array, or the class and the fields of a user's own environment, as plain data."""
+    """Return an array as lists, and a user's own environment as a dictionary of its class and fields."""
     return part.tolist() if isinstance(part, np.ndarray) else {"class": type(part).__qualname__} | vars(part)
 
 
@@ -147,7 +147,7 @@ def load(path: str | Path) -> Stored:
 
 
 class _Twice(Exception):
-    """An object of a file has two values for one name."""
+    """A JSON object in a file has two values for one name."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> None:
@@ -173,5 +173,5 @@ def save(stored: Stored, path: str | Path) -> None:
     if _read_back(stored) is stored:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
         own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")
-        raise InputError(f"{path}: a file holds no class of your own, the environment has one ({own})")
+        raise InputError(f"{path}: files cannot store classes of your own, and the environment has one ({own})")
     write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")

@@ -1,4 +1,4 @@
-"""Figures of reports on switching delays and on ranges."""
+"""Compute the figures of reports on switching delays and on ranges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from haptic_loop.design.transparency import decibels, transparency
 
 _NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: varying delays "
-    "of the measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
+    "of the measured positions, periods longer than T_max, or forces older than the range, as lost packets cause them."
 )
 
 
@@ -37,7 +37,10 @@ class _Playout:
 
 @dataclass(frozen=True)
 class SwitchingFigures:
-    """Requirement for any switching within a loop's range of delays; if it is infinite, further figures are None."""
+    """Requirement for any switching within a loop's range of delays.
+
+    If the requirement is infinite, the figures after lo and hi are None.
+    """
 
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
@@ -48,7 +51,7 @@ class SwitchingFigures:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> SwitchingFigures:
-        """Evaluate a coupling in the nominal environment; `known` is its requirement there, if it was evaluated."""
+        """Evaluate a coupling in the nominal environment; `known` is its requirement there, if already evaluated."""
         loop = loop.at(loop.environment)
         requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays
         if requirement.reason:
@@ -105,7 +108,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures over the ranges of the design that `nominal` makes without ranges, then those of `design`."""
+    """Return the figures over the ranges: of the design that `nominal` makes without ranges, then of `design`."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

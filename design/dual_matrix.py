@@ -1,7 +1,7 @@
 """The matrix of a dual point, with a lower bound of its eigenvalues on the whole circle, not only at samples.
 
 D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 (see `bound`), scaled by root(delta) from both sides. H is
-piecewise linear with bends c_i at x_i, so that with H_0 = mean and a = 1/z - 1
+piecewise linear with bends c_i at x_i (changes of slope, over 2 pi), so that with H_0 = mean and a = 1/z - 1
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
@@ -15,9 +15,9 @@ In an interval of length l without a bend inside, the error of linear interpolat
 - |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the
   interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times its slope,
   with |a^(1)| = |a^(2)| = 1.
-On the line between two Hermitian matrices, no matrix has an eigenvalue below the least ones of both. The least
-eigenvalue in the interval is therefore at least the smaller one at its ends, less the Frobenius norm of these errors
-and of rounding.
+On the line between two Hermitian matrices, no matrix has an eigenvalue below the least eigenvalues of both. The least
+eigenvalue of D in the interval is therefore at least the smaller of those at its ends, less the Frobenius norm of the
+errors above and of rounding.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ _MOST = 40_000_000  # bends times frequencies of one matrix: about two seconds
 _CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache
 _FAR = 2.0  # distance beyond which a bend counts as far, in lengths of the interval
 _COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, rounded up
-_SHARE = 8  # intervals are halved until their error is below 1/_SHARE of the tolerance, or of the shortage at the ends
+# An interval is halved until its error is below 1/_SHARE of the tolerance, or of the size of a negative eigenvalue at
+# its ends.
+_SHARE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,7 @@ class DualMatrix:
 
     points: Array  # (n,) x_i [rad/sample], in (0, pi)
     bends: Complex  # (n, m, m) c_i times 4/T, scaled
-    slopes: Array  # (n, m, m) the absolute values of the two slopes beside each bend, in the units of the bends
+    slopes: Array  # (n, m, m) sum of the absolute values of the two slopes beside each bend, in units of `bends`
     mean: Array  # (m, m)
     sums: Array  # (K + 1, m, m): C_0 and C_k
 
@@ -139,7 +141,7 @@ class DualMatrix:
         squares = np.arange(len(self.sums))[:, None, None] ** 2
         error = error + length**2 / 8 * (squares * np.abs(self.sums)).sum(axis=0)
         norm = np.linalg.norm((error + np.swapaxes(error, 1, 2)) / 2, axis=(1, 2))
-        return (1 + 1e-9) * norm  # The sums have no negative terms, so their rounding is far smaller.
+        return (1 + 1e-9) * norm  # The sums have no negative terms, so their relative rounding is far below 1e-9.
 
     def _interpolation(self, left: Array, right: Array) -> Array:
         """Return bounds on the errors of the entries of g, (k, m^2); left and right are (k, 1)."""

@@ -1,4 +1,4 @@
-"""A user's own classes and functions, named as FILE.py:NAME on the command line."""
+"""Load and call a user's own classes and functions, named as FILE.py:NAME on the command line."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 def named(option: str, text: str) -> Any:
     """Return the object that FILE.py:NAME names. No other function loads a user's own code.
 
-    Output of the file goes to standard error, because a report may go to standard output. The file's folder is added to
-    sys.path, for modules in the same folder and for worker processes.
+    What the file prints goes to standard error, because a report may go to standard output. The file's folder is added
+    to sys.path, so that the file and worker processes can import modules from it.
 
     Raises:
         InputError: The file or the object in it does not exist, or the file is not valid Python.
@@ -39,7 +39,9 @@ def named(option: str, text: str) -> Any:
         module = _loaded(option, text, file.resolve())
     if not hasattr(module, name):
         there = ", ".join(n for n, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__)
-        raise InputError(f"{option} is {text!r}: {place} has no {name}, but {there or 'no class and no function'}")
+        raise InputError(
+            f"{option} is {text!r}: {place} has no {name}; it defines {there or 'no class and no function'}"
+        )
     return getattr(module, name)
 
 
@@ -95,7 +97,7 @@ def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) ->
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Return whether a `raise` of this package raised the error; a traceback is then of no use."""
+    """Return whether a `raise` statement of this package raised the error, so that a traceback is of no use."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return last.filename.startswith(_OURS) and (last.line or "").startswith("raise ")
 

@@ -1,4 +1,4 @@
-"""Robustness: the damping that a coupling needs in environments near the one that it was designed for."""
+"""Robustness: the damping that a coupling requires in environments near the one of its design."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PERCENT = 10.0  # change of a parameter in reports
 
 @dataclass(frozen=True)
 class Robustness:
-    """The worst requirement of a coupling in environments whose parameters differ by `percent`."""
+    """The worst requirement of a coupling in the environments of `vertices`, which differ by `percent`."""
 
     percent: float
     required_over_available: float  # required over available damping in the worst environment
@@ -34,7 +34,7 @@ class Robustness:
 
 
 def at(loop: Loop, network: Network) -> Loop:
-    """Return the loop around this environment with constant delays."""
+    """Return the loop around the network, with constant delays."""
     return loop.at(network).switching(None)
 
 
@@ -75,7 +75,7 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
 def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness:
     """Return the worst requirement of a coupling over `vertices`, by the refined sweep of the condition.
 
-    For many vertices a coarse sweep first finds the candidates near the worst one.
+    If there are many vertices, a coarse sweep first selects those near the worst one.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network)}
     loops = {name: at(loop, one) for name, one in networks.items()}
@@ -94,10 +94,10 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """Return the worst requirement within ten percent.
+    """Return the worst requirement over `vertices` with changes of ten percent, or None.
 
-    Returns None for a condition that holds in any environment or is not varied, for walls, for environments given by a
-    block, and if a stiffness or mass plus ten percent is too large.
+    Returns None for a condition that holds in any environment or that sweeps skip, for walls, for environments given by
+    a block, and if a stiffness or mass plus ten percent is too large.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return None

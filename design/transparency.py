@@ -20,7 +20,7 @@ _ROUNDING = 1e-10  # relative to the environment; responses that differ by less 
 
 @dataclass(frozen=True)
 class Transparency:
-    """Figures of the mismatch M = F - Lambda E, as ratios. A mismatch of 1 (0 dB) is that of F = 0, no force at all.
+    """Figures of the mismatch M = F - Lambda E, as ratios. Without any force (F = 0) the mismatch is 1 (0 dB).
 
     Attributes:
         tau: Ratio (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1].
@@ -45,7 +45,7 @@ class Transparency:
 
     @property
     def mismatch_db(self) -> float:
-        """`relative_mismatch` in decibels; 0 dB is the mismatch without any force."""
+        """`relative_mismatch` in decibels."""
         return decibels(self.relative_mismatch)
 
     @property
@@ -55,11 +55,11 @@ class Transparency:
 
     @property
     def reason(self) -> str | None:
-        """The reason why a figure is infinite in decibels."""
+        """The reason why a figure is infinite in decibels, or None."""
         if self.relative_mismatch == 0:
             return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
-            return "some motion of the object costs no static force; tau (25), which divides by it, does not exist"
+            return "some motion of the object costs no static force, and tau (25) divides by the least force"
         return None
 
     def part(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     peak, _ = supremum(lambda w: sizes(w)[0], grid)
     least, _ = supremum(lambda w: -sizes(w)[2], grid)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
-    rounding = 1e-9 * float(np.abs(environment.D).max())  # A zero stiffness is computed as a difference.
+    rounding = 1e-9 * float(np.abs(environment.D).max())  # Rounding of a zero stiffness, computed as a difference.
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     worst = supremum(relative, grid)[0]
     if worst < _ROUNDING:
@@ -143,7 +143,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
-    """Compute the rms of the mismatch over log frequency alone, with rounding. Raises ValueError if E is zero."""
+    """Compute only the rms mismatch over log frequency; rounding is not set to 0. Raises ValueError if E is zero."""
     if silent(environment):
         raise ValueError(NO_FORCE)
     target = delay(lam, F.T) @ environment
@@ -155,7 +155,7 @@ def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         E, M = environment.at(z), F.at(z) - target.at(z)
         return (np.abs(M) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
 
-    # The grid is dense where the ratio may be sharp.
+    # The grid is dense where the ratio may have narrow peaks.
     logarithm = np.log(frequencies(F, environment, low=low, high=high, points=60))
     return float(np.sqrt(integral(square, logarithm) / (logarithm[-1] - logarithm[0])))
 

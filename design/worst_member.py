@@ -43,7 +43,7 @@ class _Worst:
 
 @dataclass(frozen=True)
 class Searched:
-    """The local maxima that a search found, the worst first."""
+    """The local maxima that a search found, with the largest first."""
 
     worst: tuple[_Worst, ...]
     tried: int  # number of members tried
@@ -57,10 +57,10 @@ def search(
     work: float = budgets.RANGES,
     over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """Find the members of these regions at which `ratio` is largest.
+    """Find the members of the regions at which `ratio` is largest.
 
-    The search ends early when it has done `work` units of counted work, or when `over` returns True because the user's
-    time limit has passed. The result then contains only maxima of the members tried so far.
+    The search ends early when `work` units of counted work are done, or when `over` returns True because the user's
+    time limit has passed. The result then contains the maxima among the members that were tried.
     """
     ended, until = False, spent_after(work)
     points = [list(_points(region)) for region in regions]
@@ -124,7 +124,7 @@ def _points(region: Region) -> Iterator[Array]:
 
 
 def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
-    """Return points with their values, largest first, without points that are close to a point of larger value."""
+    """Return points with their values, largest value first, without points close to one of larger value."""
     chosen: list[tuple[Array, float]] = []
     for i in np.argsort(-np.array(values), kind="stable"):
         if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
@@ -134,7 +134,7 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
-    step = 1.0 if point.size > _MANY else _FIRST  # With many parameters not all vertices were tried before.
+    step = 1.0 if point.size > _MANY else _FIRST  # With many parameters some vertices are untried.
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]
@@ -155,7 +155,7 @@ def search_ranges(
 ) -> Searched:
     """Find the members of the loop's ranges in which the coupling needs the most damping.
 
-    `ratio` returns required over available damping in the loop of a member. None stands for that of this-environment.
+    `ratio` returns required over available damping in the loop of a member; by default that of this-environment.
     """
     assert loop.ranges
     parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
