@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
         raise InputError("period: a map simulates constant periods; give T_max alone, its certificates cover all below")
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
-        raise InputError(f"--case none has no coupling, so there is nothing to map: {instead}")
+        raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
     chosen = chosen_by(args, scenario) if args.coupling else None  # one coupling for the whole map
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -255,7 +255,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
 
 def _about(conditions: Sequence[str]) -> str:
     """Return the words for the axes and for the guarantee of a certified cell."""
-    line = "K and B are those of every contact spring; a sweep certifies each cell for its own environment only"
+    line = "K and B are those of every contact spring; a sweep certifies each cell for its environment alone"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
