@@ -39,9 +39,7 @@ def named(option: str, text: str) -> Any:
         module = _loaded(option, text, file.resolve())
     if not hasattr(module, name):
         there = ", ".join(n for n, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__)
-        raise InputError(
-            f"{option} is {text!r}: {place} has no {name}; it defines {there or 'no class and no function'}"
-        )
+        raise InputError(f"{option} is {text!r}: {place} has no {name}, but {there or 'no class and no function'}")
     return getattr(module, name)
 
 
