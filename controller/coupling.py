@@ -34,7 +34,7 @@ class Coupling:
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether it contains a linear environment model, so that walls are excluded
+    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear environment model (no walls)
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
@@ -405,7 +405,7 @@ class _InternalModel(ReadOnly, Coupling):
             Q = Sampled(environment.z, np.tensordot(basis(self.poles, environment.z), self.Q, axes=1), environment.T)
             return environment - environment @ (Q @ environment)
         if further:
-            raise ValueError("the coupling holds a linear model of the environment: walls behind it have none")
+            raise ValueError("the coupling contains a linear model of the environment, which cannot include walls")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         T = environment.T
@@ -499,7 +499,7 @@ class ForceFilter(ReadOnly, Coupling):
                 Sampled(environment.z, np.tensordot(values, _own_columns(self.R), axes=1), environment.T) @ environment
             )
         if further:
-            raise ValueError("the coupling holds a linear model of the environment: walls behind it have none")
+            raise ValueError("the coupling contains a linear model of the environment, which cannot include walls")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         return self.filter(environment.T) @ environment
@@ -554,7 +554,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
         after.append(a * state + through)
         through = (1 - a * a) * state - a * through
     for b1, b2 in pairs:
-        first, second = signals[len(after)], signals[len(after) + 1]  # outputs with the numerators z and 1
+        first, second = signals[len(after)], signals[len(after) + 1]  # section outputs with the numerators z and 1
         read[len(after) + 1] = read[len(after) + 2] = 1 + b1 + b2
         after += [through - b1 * first - b2 * second, first]
         through = b2 * through + b1 * (1 - b2) * first + (1 - b2 * b2) * second

@@ -205,7 +205,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 return np.resize(np.asarray(recorded, dtype=np.int64), (ticks, lo.size))
 
     def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
-        """Return whether each packet (ticks, m) is in a burst; calm and bursts alternate with geometric lengths."""
+        """Return whether each packet (ticks, m) is in a burst. Calms and bursts alternate, with geometric lengths."""
         count = 1 + int(2 * ticks / (self.calm + self.burst)) + 8 * int(np.sqrt(ticks) + 1)
         columns = []
         for _ in self.lo:
@@ -311,7 +311,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """Draw a timing of `ticks` ticks; None if every period is T and forces latch at the beginning of their tick.
+    """Draw a timing of `ticks` ticks; return None if every period is T and forces latch at the beginning of their tick.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -173,7 +173,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # usual and largest spring that makes a block passive, relative to the mean gain
+_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # accepted and largest correcting spring, relative to the mean gain
 
 
 @functools.lru_cache(maxsize=64)

@@ -24,8 +24,8 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
 # which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. The wall
-# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall is the spring-damper
-# between the same nodes except for the constant force of its gap.
+# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall equals a
+# spring-damper between the same nodes, except for the constant force of its gap.
 #
 # The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
 # coupling respond within the tick, y = y_free - D p, so that the tick has an algebraic loop. This loop is the linear

@@ -119,7 +119,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
         for member in self.members():
             try:
-                member.network.check(self.psi, self.T)  # for example, nothing holds an internal node
+                member.network.check(self.psi, self.T)  # refuses, for example, an internal node that nothing holds
             except ValueError as error:
                 raise ValueError(f"{member.name}: {error}" if self.ranges else str(error)) from None
         if self.varying_delay:

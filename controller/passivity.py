@@ -1,4 +1,4 @@
-"""A lower bound of the least eigenvalue of He G at all points of the unit circle, not only at those of a grid."""
+"""A lower bound of the least eigenvalue of He G = (G + G*)/2 on the whole unit circle, not only on a grid."""
 
 from __future__ import annotations
 

@@ -140,8 +140,8 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
-    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted. Assumed: about three times the
-    # 0.7 m/s that teleoperation masters exceed in a fifth of the fast part of a tapping task (abstract of a study)
+    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted. Assumed: three times 0.7 m/s.
+    # In a study (abstract) teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
     guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
@@ -190,8 +190,8 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
     friction: _PerAxis = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
-    delta: _Levels | None = None  # [N s/m] guaranteed damping
-    credible_speed: float = 2.0  # [m/s] as for a compliant device
+    delta: _Levels | None = None  # [N s/m] guaranteed damping; None: `damping`
+    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed
     guaranteed: DeviceBounds | None = None  # refused, since a rigid device has no transmission
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
@@ -232,7 +232,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         and the damping is the largest damping.
         """
         known = device.guaranteed
-        assert known is not None  # the caller draws only where every device has bounds
+        assert known is not None  # the caller draws only if every device has bounds
         assert isinstance(device, CompliantDevice)  # a rigid device with bounds is refused
         least, most = known.transmission_damping_min, known.transmission_damping_max
         ends = np.array([10.0, 0.01, 0.1, most / least])
@@ -337,7 +337,7 @@ _CHAI3D = "CHAI3D's device table, src/devices/{}.cpp"
 _DELTA, _FALCON, _PHANTOM = (
     _CHAI3D.format(f"C{name}Device{s}") for name, s in (("Delta", "s"), ("Falcon", ""), ("Phantom", "s"))
 )
-_SHEET = "the maker's data sheet of the {}, quoted and not re-read here"
+_SHEET = "the maker's data sheet of the {}, not checked again"
 _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 1.5")
 
 

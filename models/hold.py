@@ -137,7 +137,7 @@ def _expm_in_units(matrices: _Array, unit: _Array) -> _Array:
     return expm_each(matrices * unit[:, None, :] / unit[:, :, None]) * unit[:, :, None] / unit[:, None, :]
 
 
-_ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
+_ORDER = 13  # order of the diagonal Padé approximant, Higham (2005), table 2.3
 _LARGEST = 5.37  # largest 1-norm for which this order has the accuracy of double precision
 _PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
 

@@ -372,8 +372,8 @@ _MOST_LINKS = 500  # Largest number for one hand: its eigenvalues take 5 s; thos
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A chain of masses and spring-dampers, from the handle to the equilibrium.
 
-    It is passive because no parameter can be negative. One link is the usual mass-damper-spring hand, two links are a
-    hand with a grip on an arm, and links without damping form a lossless chain.
+    The chain is passive because no parameter can be negative. One link is the usual mass-damper-spring hand, two links
+    are a hand with a grip on an arm, and links without damping form a lossless chain.
     """
 
     links: Annotated[tuple[Link, ...], msgspec.Meta(min_length=1)]
@@ -507,7 +507,7 @@ def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
 
 
 class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Random humans with log-uniform parameters and one link (a hand) or two (a hand with a grip on an arm)."""
+    """Random humans: chains of `links` links with log-uniform parameters."""
 
     mass: _Range = (0.01, 3.0)  # [kg]
     damping: _Range = (0.1, 30.0)  # [N s/m]

@@ -8,7 +8,7 @@ adds this spring and slides along the contact's directions. MuJoCo's `discrete` 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
 
 The functions take G and u0 as numbers and need no coupling or device. controller.budget.Shell measures and limits the
-energy that a scene generates; docs/theory.md, "MuJoCo worlds", proves that ordinary scenes generate none.
+energy that a scene generates. The lemma in docs/theory.md, "MuJoCo worlds", bounds this energy for ordinary scenes.
 """
 
 from __future__ import annotations
@@ -322,7 +322,7 @@ def _spec(path: Path) -> Any:
 def _compiled(spec: Any, path: Path) -> mujoco.MjModel:
     with _refused(path):
         model = spec.compile()
-        mujoco.mj_forward(model, mujoco.MjData(model))  # raises where the scene's memory is too small
+        mujoco.mj_forward(model, mujoco.MjData(model))  # raises if the scene's memory is too small
     return model
 
 
@@ -486,7 +486,7 @@ class WorldPort:
         any_limit = bool((force_limit < np.inf).any())
         self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if any_limit else None
         self.ticks = 0
-        self.created = 0.0  # [J] energy that contacts have created, D2 of the lemma
+        self.created = 0.0  # [J] upper bound on the energy that contacts have created so far
         self.unsettled = 0  # ticks in which the limited channels still changed after _MOST_REPETITIONS
         self._at_first = self._potential()
         self.released = 0.0  # [J] largest energy that gravity and the scene's springs have released so far
@@ -598,7 +598,7 @@ class WorldPort:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return the energy [J] that contacts created in the last step, the left side of the lemma."""
+        """Return an upper bound [J] on the energy that contacts created in the last step: their positive excesses."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 
