@@ -1,4 +1,4 @@
-"""Functions for scripts that design, certify, evaluate and store a coupling, as python -m design does. SI units."""
+"""Functions for scripts that design, certify, evaluate and store a coupling, as `python -m design` does (SI units)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DesignOptions(TypedDict, total=False):
     limiter: bool  # spring-damper and optimal for this-environment: cover limited forces, too (the default)
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal, spring-damper for this environment: band of the mismatch
-    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: no limit, but a small gain
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: a soft penalty instead
     seconds: float  # optimal: time after which no larger basis is tried
 
 
@@ -59,7 +59,7 @@ def design_coupling(
     """Design a coupling for a loop.
 
     Args:
-        loop: The loop, `scenario.loop("I")`.
+        loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
         condition: The name of a condition, or your own Condition (design.conditions). The coupling satisfies your own
             condition and the kind's usual one. None selects the usual condition (design.designs.usual_condition), as
@@ -68,24 +68,23 @@ def design_coupling(
 
     Returns:
         A Design. Its `coupling` has K (m,) [N/m] and B (m,) [N s/m] if it is a spring-damper. `requirement` is the
-        required damping, from a sweep of the coupling alone. `figure` is the name of the optimised figure, and
-        `objective` is its value.
+        required damping, from a sweep. `figure` is the name of the optimised figure, and `objective` is its value.
 
     Raises:
         TypeError: An argument has the wrong type, or the kind does not have an option.
-        ValueError: The kind, the condition or the loop is impossible.
-        DesignFailed: No such coupling exists.
+        ValueError: The kind or the condition does not exist, or does not suit the loop.
+        DesignFailed: No such coupling was found.
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
-    named(condition or usual_condition(loop, kind))  # raises ValueError if an own condition has a taken name
+    named(condition or usual_condition(loop, kind))  # Raises ValueError if a user's own condition has a taken name.
     known(options, KINDS[kind].options, f"kind {kind!r}")
     design = design_by_kind(loop, kind, condition, **options)
     return replace(design, certified_for=certified_for(loop, design.requirement.certified))
 
 
 def certified_for(loop: Loop, certified: bool) -> str:
-    """Name the linear network of a MuJoCo scene for which a coupling of this loop is certified, or "" for none."""
+    """Return the linear network of a MuJoCo scene for which a coupling is certified, in words, or "" for none."""
     scene = getattr(loop.environment, "linear_model_of", "")
     return f"the linear network of {scene}" if scene and certified else ""
 
@@ -105,9 +104,9 @@ def instead(
     condition: str | Condition | None = None,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> str:
-    """Return the alternatives to a failed design in words, least rms mismatch first, or "".
+    """Return certified alternatives to a failed design in words, least rms mismatch first, or "".
 
-    Each alternative is designed and certified here. Nothing is tried for varying delays.
+    Each alternative is designed and certified here. No alternative is tried for varying delays.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for i, (other, target, options) in enumerate(_QUICK):
@@ -130,8 +129,9 @@ def instead(
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
-    Your own `condition`, or else that of the design, is judged, too. With loop.varying_delay there is a further entry
-    "switching" for any switching of the delays within that range.
+    Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or else
+    that of the design, is also judged. With loop.varying_delay there is a further entry "switching", for delays that
+    switch in any way within that range.
 
     With ranges around the loop's environment, "this-environment" covers the environment and every vertex of the ranges.
     Between the vertices there is no proof, only a search (design.worst_member). If every vertex is proved and the
@@ -166,7 +166,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement[str]:
     """Return the requirement of the worst member of the ranges; `here` is that of the nominal environment."""
     ranges = check_ranges(loop, coupling, samples=0, condition=condition)
-    assert ranges  # the loop has ranges
+    assert ranges  # The caller passes only loops with ranges.
     _, worst = ranges.worst if ranges.proved else ranges.worst_found
     proof, held = ("rational", RANGES) if ranges.proved else ("sampled", here.guarantee)
     return replace(worst, proof=proof, guarantee=held)
@@ -175,8 +175,8 @@ def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Req
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
     """Return figures of the mismatch (8), M = F - Lambda E, in the loop's environment with all walls touching.
 
-    `mismatch_db` is the largest ratio of M to the environment over `band_hz`, and `rms_mismatch_db` is its rms. A
-    coupling without any force has 0 dB. `dc_ratio` is the rendered share of the static stiffness.
+    `mismatch_db` is the largest ratio of M to the environment over `band_hz`, and `rms_mismatch_db` is the rms ratio.
+    A coupling without any force has 0 dB. `dc_ratio` is the rendered share of the static stiffness.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -207,7 +207,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its certificate, or unchanged for ranges, for varying delays and without a proof."""
+    """Return the design with its certificate; unchanged for ranges, for varying delays, or if no proof is found."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -225,8 +225,8 @@ def store(
     """Save the coupling with its proof; `assessment` may contain proofs for ranges and for limited forces.
 
     If the ranges are not proved, the stored loop has the nominal environment only, unless the condition holds in any
-    environment. If switching delays are not proved, it has constant delays. Raises InputError if the file cannot be
-    written.
+    environment. If switching delays are not proved, the stored loop has constant delays. Raises InputError if the file
+    cannot be written.
     """
     ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
@@ -261,7 +261,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
 
 def _certificate(loop: Loop, design: Design) -> Certificate:
-    """Return the certificate of a design, which covers limited forces if the design has `c`. Raises NotProved."""
+    """Return the certificate of a design; it covers limited forces if the design has `c`. Raises NotProved."""
     if design.c:
         limiter = LimitedForces(lags=len(design.c[0]))
         return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])

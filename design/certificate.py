@@ -45,7 +45,7 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
 from haptic_loop.design.result import NotProved, Requirement, refusal
 
-_CLAIM_TOLERANCE = 1e-6  # allowed error of the required damping on file; repeated sweeps agree to 1e-9
+_CLAIM_TOLERANCE = 1e-6  # allowed relative error of required damping and margin on file; repeated sweeps agree to 1e-9
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def _in_time() -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
+# The certificate of a coupling is proved once, stored, and proved again from the file alone without a solver.
 #
 # The blocks are those of the condition (design.conditions, design.environments), over the rationals. The proof shows
 # that static matrices are symmetric, and positive semidefinite where required. It shows that each block at the
@@ -140,7 +140,7 @@ def _proof(
     """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
-    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep leaves them out.
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep omits multipliers.
     requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)
@@ -236,7 +236,7 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
     On the circle the difference of the responses, plus the rounding errors, may be at most _MOST_LOST of the largest
-    response or of Delta_D/T. It is larger if terms that are far larger than the forces cancel.
+    response or of Delta_D/T. Terms that are far larger than the forces and cancel make it larger.
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
@@ -251,14 +251,14 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     response = running.at(z)
     if running.A.shape == meant.A.shape:
         lost = rounding(running, z, meant)
-    else:  # Rounding has kept a state that cancels.
+    else:  # Rounding has kept a state that cancels in exact arithmetic.
         lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
     scale = max(float(np.abs(response).max()), 0.0 if loop.environment.world else min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
         return None
     return (
         f"in floating point the forces may be off by {lost / scale:.1e} of themselves, allowed is {_MOST_LOST:g}: "
-        "what runs would not be what is proved"
+        "the running loop would differ from the proved one"
     )
 
 
@@ -275,7 +275,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:
     """Return whether the certificate belongs to exactly this loop and coupling and holds.
 
-    It is verified unless this process has made it. `condition` is the user's own condition, if it certifies one.
+    It is verified unless this process has proved it before. `condition` is the user's own condition, if it is of one.
     """
     if certificate.scenario != digest(loop, coupling.form()):
         return False
@@ -301,8 +301,8 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     """Check the stored certificate's digest, seal and figures, and prove its matrices again in exact arithmetic.
 
-    `condition` is needed for a certificate of a user's own condition. Its block is proved again; its author claims that
-    the block keeps the loop safe.
+    A certificate of a user's own condition needs this `condition`. Its block is proved again; that the block keeps the
+    loop safe is the claim of the condition's author.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -418,7 +418,7 @@ def _is_ours(condition: Condition) -> bool:
 
 
 def named(condition: str | Condition) -> Condition:
-    """Return the condition of a name, or the condition itself. Raises ValueError for an unknown or reserved name."""
+    """Return the condition with this name, or the condition itself. Raises ValueError for an unknown or taken name."""
     if not isinstance(condition, str):
         name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in reserved
@@ -438,8 +438,8 @@ def required_damping(
 ) -> Requirement:
     """Return the damping that the condition requires, as one share of all devices' damping, from a refined sweep.
 
-    With ranges, this-environment returns the largest requirement of all members. The requirement of a loop without a
-    solution is infinite.
+    With ranges, this-environment returns the largest requirement of all members. The requirement of a singular loop is
+    infinite.
     """
     requirement = named(condition).judge(loop, coupling, multiplier)
     if requirement.reason:

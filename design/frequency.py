@@ -67,9 +67,9 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 
 
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
-    """Return the supremum (n,) of each row, refined between its frequencies: `common` (k,) and its `own` (n, p).
+    """Return the suprema (n,) of n functions on the grid of `common` (k,) and each one's `own` (n, p) frequencies.
 
-    A row with a value that is not finite gives infinity.
+    They are refined between the frequencies. A function with a value that is not finite has the supremum inf.
     """
     n = own.shape[0]
     parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
@@ -115,7 +115,7 @@ _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomsp
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
     """Return the frequencies (k,) common to n systems, and those (n, j) around the poles (n, p) of each system.
 
-    `delay` [samples] is the longest delay of the loop, which is the number of lobes in its response.
+    `delay` [samples] is the longest delay of the loop; it causes as many lobes in the response.
     """
     even = np.linspace(_LOWEST, np.pi, max(_EVEN, _PER_LOBE * (delay + 1)))
     common = np.unique(np.concatenate([_BELOW, even, np.geomspace(_LOWEST, np.pi, _EVEN)]))
@@ -170,7 +170,7 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
 
 
 _OFFSETS = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
-_OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # of frequencies around a pole, in its width
+_OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # distances of frequencies from that of a pole, in widths of the pole
 
 
 @lru_cache(maxsize=64)
@@ -183,12 +183,12 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
     A tick in double precision is an exact tick of a system with slightly different coefficients. Their relative errors
-    are at most (2n + 8) u for n states and the unit u. The differences between G and a system `meant` with the same
-    states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
+    are at most (2n + 8) 2^-53 for n states. The differences between G and a system `meant` with the same states are
+    added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
     |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
 
-    The difference of both responses would be less useful. Near a sharp resonance that difference is large as soon as
-    the peak moves by its width. Even a Schur form of badly scaled states moves the peak so far.
+    The difference of both responses would be less useful: it is large as soon as a sharp peak moves by its own width,
+    and even a Schur form of badly scaled states moves the peak so far.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -202,7 +202,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return one of each group of poles that lie within a hundredth of their distance to the circle."""
+    """Return one of each group of poles that are closer to each other than 1 % of their distance to the circle."""
     distinct = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
         if not (np.abs(distinct - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
@@ -213,9 +213,9 @@ def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
 def supremum(response: Response, grid: Array) -> tuple[float, float]:
     """Return the largest `response` over [grid[0], grid[-1]], refined between grid points, and its frequency.
 
-    Local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The
-    brackets are narrowed ten times, until two rounds gain nothing, or until no bracket can gain 1e-13 of the largest
-    value, which locates a smooth peak to rounding.
+    Local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their neighbours. The brackets
+    are narrowed up to ten times. The search ends earlier if two rounds in a row gain nothing, or if no bracket can
+    gain 1e-13 of the largest value. A value that is not finite gives inf.
     """
     spend(_POINT * grid.size)
     values = response(grid)
@@ -256,10 +256,10 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 
 
 def _brackets(values: Array, grid: Array, above: float) -> Array:
-    """Return the local maxima of at least `above` between their neighbours: the 32 that may become the highest.
+    """Return brackets of local maxima of at least `above`: the 32 at most that may become the highest.
 
     Where the response is flat, rounding makes many maxima, which may be higher than the grid points of a true peak. A
-    bracket is three points: axis 0 is their frequencies and values, axis 1 left, peak and right, axis 2 the brackets.
+    bracket has three points. Axis 0 is (frequency, value), axis 1 (left, peak, right), and axis 2 the bracket.
     """
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
@@ -269,17 +269,17 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
     return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
-#: distances from the parabola's peak to trial points, in widths of the bracket: near ones for a smooth peak, whose
-#: distance from that of the parabola falls with the square of the width, far ones for a kink
+#: distances of trial points from the parabola's peak, in widths of the bracket. The near points serve a smooth peak,
+#: whose distance from the parabola's peak falls with the square of the width; the far points serve a kink.
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
 _EIGHTHS = np.arange(1, 8)[:, None] / 8
 
 
 def _narrowed(response: Response, bracket: Array) -> Array:
-    """Return each bracket (`_brackets`) around the best of its points and of 16 more between them."""
+    """Return each bracket narrowed to the best of its points and 16 more, with the neighbours of the best."""
     (left, middle, right), (low, high, last) = bracket
     width = right - left
-    with np.errstate(divide="ignore", invalid="ignore"):  # equal points or values: the middle
+    with np.errstate(divide="ignore", invalid="ignore"):  # Equal points or values give the middle.
         rise, fall = (high - low) / (middle - left), (last - high) / (right - middle)
         shift = 0.5 * (rise * (right - middle) + fall * (middle - left)) / (rise - fall)
     peak = np.clip(middle + np.where(np.isfinite(shift), shift, 0.0), left, right)
@@ -291,7 +291,7 @@ def _narrowed(response: Response, bracket: Array) -> Array:
     order = np.argsort(w, axis=0, kind="stable")
     w, values = np.take_along_axis(w, order, 0), np.take_along_axis(values, order, 0)
     at = np.argmax(values, axis=0)
-    best = np.take_along_axis(w, at[None], 0)  # some points may be the same
+    best = np.take_along_axis(w, at[None], 0)  # Some points may coincide.
     three = np.stack([np.maximum((w < best).sum(axis=0) - 1, 0), at, np.minimum((w <= best).sum(axis=0), len(w) - 1)])
     return np.stack([np.take_along_axis(w, three, 0), np.take_along_axis(values, three, 0)])
 
@@ -342,7 +342,7 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
         return values[:, 0].astype(np.float64), vectors[:, :, 0]
     least = np.linalg.eigvalsh(H)[:, 0].astype(np.float64)
     shift = least - 1e-13 * np.abs(H).max(axis=(1, 2), initial=1e-300)
-    start = np.sin(1.0 + np.arange(m)).astype(np.complex128)  # without symmetry, so not orthogonal to an eigenvector
+    start = np.sin(1.0 + np.arange(m)).astype(np.complex128)  # irregular, so not orthogonal to an eigenvector
     v = np.linalg.solve(H - shift[:, None, None] * np.eye(m), start[:, None])[..., 0]
     return least, v / np.linalg.norm(v, axis=1, keepdims=True)
 

@@ -34,9 +34,9 @@ AT_VERTICES = "these ranges: proved at the vertices, searched between them"  # R
 #: limits of every certificate
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
-    "or leave through the limiter that a report names, "
-    "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
-    "friction pays for, velocity filters or friction compensation."
+    "or pass the limiter that a report names. "
+    "They do not cover periods longer than T_max (T without one), encoder steps that do more work than Coulomb "
+    "friction dissipates, velocity filters or friction compensation."
 )
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
@@ -67,8 +67,8 @@ class Requirement(Generic[C]):
         frequency_hz: The frequency [Hz] at which the condition binds, or None.
         reason: Why `required` is infinite.
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
-        multiplier: The multiplier of the figure, for a condition with multipliers.
-        bound: Lower bound of the ratio over all multipliers, at the frequencies of the search.
+        multiplier: The multiplier with which `required` was computed, or None.
+        bound: Lower bound of `ratio` over all multipliers, at the frequencies of the search, or None.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
@@ -91,13 +91,13 @@ class Requirement(Generic[C]):
         return f"Requirement({self.condition}: {self.words()}, {verdict})"
 
     def amounts(self, digits: int = 6) -> str:
-        """Return the required and the available damping, or in words that no damping is enough."""
+        """Return the required and the available damping; for an infinite requirement the reason in a few words."""
         if math.isfinite(self.ratio):
             return f"{listed(self.required, digits)} of {listed(self.available, digits)} N s/m"
         return "no damping is enough" if self.applies else "does not apply"
 
     def words(self, digits: int = 6) -> str:
-        """Return `amounts` as a predicate: "needs 1.2 of 1.37 N s/m"."""
+        """Return the requirement as a predicate: "needs 1.2 of 1.37 N s/m"."""
         return f"needs {self.amounts(digits)}" if math.isfinite(self.ratio) else self.amounts(digits)
 
     @property
@@ -171,7 +171,7 @@ class NotProved(ValueError):
 
 
 class DesignFailed(ValueError):
-    """No result could be verified. `problem` is the convex problem or None; `results` are the attempts."""
+    """No design could be verified. `problem` is the convex problem or None; `results` are the attempts."""
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice
@@ -179,7 +179,7 @@ class DesignFailed(ValueError):
 
 
 class Infeasible(DesignFailed):
-    """The problem has no solution."""
+    """The design problem has no solution."""
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -207,7 +207,7 @@ class Chosen:
         certificate: The Certificate of the file, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
         own: The user's own condition (design.conditions.Condition), or None.
-        switching: The delays [samples] within which the file of the coupling proves any switching, or None.
+        switching: The range of delays [samples] in which the coupling's file proves any switching, or None.
         notes: Remarks on the origin of the coupling, for reports.
         certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
     """
@@ -249,7 +249,7 @@ class Design(Chosen):
         requirement: The requirement of `condition`, from a refined sweep.
         sdps: The number of convex problems that were solved, or of runs of a local search.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per device, if its search took long.
+        c: The multiplier of the limiter, one row per device, if it is kept because its search took long; or None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.
@@ -257,7 +257,7 @@ class Design(Chosen):
         certificate: The Certificate, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
         own: The user's own condition (design.conditions.Condition), or None.
-        switching: The delays [samples] within which any switching is proved, or None.
+        switching: The range of delays [samples] in which any switching is proved, or None.
         notes: Remarks on the origin of the coupling, for reports.
         certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
     """
@@ -276,5 +276,5 @@ class Design(Chosen):
 
 
 def held_torques(loop: Loop) -> str | None:
-    """Return the remark that conditions ignore the change of pose while torques are held; None without `loop.axes`."""
+    """Return the remark that conditions ignore how the pose changes while torques are held; None without `axes`."""
     return "not charged: forces count as held in space while the pose moves on" if loop.axes else None
