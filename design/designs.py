@@ -1,4 +1,4 @@
-"""The kinds of designs by name with their options, and one function that makes all of them."""
+"""The kinds of designs by name with their options, and `design_by_kind`, which makes a design of any kind."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Kind(NamedTuple):
     options: tuple[str, ...] = ()  # names of design.api.DesignOptions that the function takes
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether limited forces are covered by default
-    softened: bool = False  # whether it may be redesigned for less damping until a second condition holds
+    softened: bool = False  # whether designs may be repeated for less damping until a second condition holds
 
 
 KINDS = {
@@ -77,19 +77,19 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     The default of a spring-damper is this-environment, which gives the least transparency error. In loops with walls,
     worlds, ranges or varying delays, but without a latency, it is any-environment. If bounds of the devices are known,
     two conditions that never require more damping take precedence: known-device replaces this-environment in loops
-    without a latency, and known-device-any is chosen with walls if it covers the loop. Apart from these two, every
-    other kind has one condition.
+    without a latency, and known-device-any is chosen with walls if it covers the loop. Apart from these two, each of
+    the other kinds has only one condition.
     """
     conditions = kind_of(kind).conditions
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
     more = len(plain) == 1 and not (loop.environment.walls or loop.environment.world)
     if loop.known_devices and KNOWN_DEVICE in conditions and not loop.latency and (more or not less):
-        return KNOWN_DEVICE.name  # never worse than this-environment
+        return KNOWN_DEVICE.name  # It never requires more damping than this-environment.
     walls = loop.environment.walls and not loop.environment.world
     if walls and KNOWN_DEVICE_ANY in conditions and not KNOWN_DEVICE_ANY.beyond(loop):
         return KNOWN_DEVICE_ANY.name
-    return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
+    return (plain[-1] if less and not loop.latency else plain[0]).name  # The last condition covers more environments.
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
@@ -113,7 +113,7 @@ def design_by_kind(
         loop: The loop.
         kind: A name of KINDS, or FILE.py:NAME of a function of the user's own.
         condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed for
-            the kind's usual condition, for the largest share of the damping with which both conditions hold.
+            the kind's usual condition, with the largest share of the damping for which the coupling satisfies both.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper covers limited forces if such a
             coupling exists; `limiter` True requires it. `switching` replaces loop.varying_delay.
@@ -130,7 +130,7 @@ def design_by_kind(
     chosen = KINDS[kind]
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
-        why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json is judged by it"
+        why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json can be judged by it"
         raise ValueError(f"condition is {own.name}, {why}")
     condition_name = usual_condition(loop, kind) if own or not name else name
     able = {c.name: c for c in chosen.conditions}
@@ -162,7 +162,7 @@ def design_by_kind(
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
-    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # The search for gains takes constant delays.
+    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # The search for gains allows constant delays only.
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls or loop.ranges or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)
@@ -203,7 +203,7 @@ class _Turned(Environment):
         return self.of.active(T)  # An orthogonal Q does not change the power.
 
 
-_ROUNDED = 1e-9  # share of the damping that covers the rounding of the levels' eigenvalues
+_ROUNDED = 1e-9  # share of the damping that covers the rounding of the eigenvalues of damping matrices
 
 
 def _in_principal_axes(
@@ -213,15 +213,15 @@ def _in_principal_axes(
     progress: Callable[[str, int, int], None],
     options: dict[str, Any],
 ) -> Design:
-    """Design in the principal axes of the levels, turn the coupling back, and judge it by the levels themselves.
+    """Design in the principal axes of the damping matrices, turn the coupling back, and judge it by the full matrices.
 
     With Delta_i = Q_i diag(d) Q_i' of every device, Q' Delta Q is diagonal. Conditions and mismatch do not change if E
-    and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError if the loop or the kind does not allow full levels,
-    DesignFailed if the coupling is not certified.
+    and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError if the loop or the kind does not allow full
+    matrices, and DesignFailed if the coupling is not certified.
     """
     if loop.ranges and kind == "optimal":
         why = "an optimal coupling is designed in the principal axes of the damping, into which ranges are not turned"
-        raise ValueError(f"levels: {why}; a spring-damper or a moving-average takes any")
+        raise ValueError(f"levels: {why}; use a spring-damper or a moving-average")
     if loop.environment.walls and kind == "spring-damper":
         if options.get("limiter") and (reason := LIMITER.not_designed(loop)):
             raise ValueError(reason)
@@ -232,7 +232,7 @@ def _in_principal_axes(
     values = (1 - _ROUNDED) * np.diag(Q.T @ Delta @ Q)
 
     def made(part: Loop) -> Design:
-        """Return the design for `part`, which is the loop with a share of its damping and with touching walls."""
+        """Return the design for `part`, the loop with a share of its damping and with all walls touching."""
         delta = tuple((part.delta[0] / loop.delta[0] * values).tolist())
         straight = {"environment": _Turned(loop.environment, Q), "delta": delta, "levels": None, "ranges": None}
         design = design_by_kind(msgspec.structs.replace(part, **straight), kind, condition, progress, **options)
@@ -259,7 +259,7 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
 
 
 def _before_walls(loop: Loop) -> str:
-    """Return an error suffix that names the first design certified before walls, or those that were tried."""
+    """Return an error suffix that names the first design that is certified with walls, or the designs tried."""
     others = {
         f"--coupling {kind} --condition {ANY_ENVIRONMENT.name}": kind for kind in ("spring-damper", "moving-average")
     }
@@ -284,22 +284,24 @@ def _with_less_damping(
 ) -> Design:
     """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
 
-    The designs are made for the condition `made_for` (default: the same) in the nominal environment, with all walls
-    touching and without the latency. Those that take no account of switching delays are made for the longest ones.
+    The designs are made for the condition `made_for` (by default `condition`) in the nominal environment, with all
+    walls touching and without the latency. Designs that cannot consider switching delays use the longest delays.
     """
     share, best, shortfall = 1.0, None, ""
     walls = loop.environment.walls
     constant = not (made_for or condition).extensible or loop.latency or walls
     where = loop.delayed(loop.delays.hi) if constant else loop
     if condition is KNOWN_DEVICE and walls:
-        where = where.at(held(loop.network))  # The search judges gains by beta alone.
+        where = where.at(held(loop.network))  # The search for gains has no multipliers of walls.
     judged = loop if condition.extensible or condition is KNOWN_DEVICE else loop.at(loop.environment)
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         design = make(msgspec.structs.replace(where, latency=None, ranges=None, **_scaled(loop, share)))
         needs = condition.judge(judged, design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            best = replace(design, requirement=needs, notes=())  # The notes describe `part`.
+            best = replace(
+                design, requirement=needs, notes=()
+            )  # The notes describe the loop with this share of the damping.
             if needs.ratio > 1 - _UNUSED:
                 return best
         if np.isinf(needs.ratio):

@@ -1,12 +1,12 @@
 """The necessary damping of devices with known motor and transmission (Theorem A), by a sweep.
 
-A linear motor (mass m, damping delta) is connected to the hand by a transmission, a spring k and a damper b in
-parallel. The response of a passive hand at each alias w_n = (w + 2 pi n)/T is arbitrary. Therefore the sampled
+A linear motor (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper b in
+parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
 responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
 conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
 held. With one channel, or channels with equal devices, every point of the disk is attained by some lossless hand. The
-device considered is that of least mass, least damping, stiffest spring and least damper within the bounds. Compare
-Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the proof.
+sweep uses the device of least mass, least damping, stiffest spring and least damper within the bounds. Compare Fardad
+and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the proof.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the da
 
 
 def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
-    """Return the least share of the damping at which no passive hand destabilises linear motors, by a refined sweep.
+    """Return the least share of the damping at which no passive hand makes the loop unstable, by a refined sweep.
 
-    For one channel or equal devices the share is a lower bound for every condition on these devices. Otherwise it is
-    sufficient, and close to that bound.
+    Motors are linear. For one channel or equal devices no condition on these devices requires less than this share.
+    Otherwise the share is sufficient, and close to the least one.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels
@@ -122,7 +122,7 @@ class LeftOver:
     def words(self) -> str:
         """The comparison as a sentence without its full stop."""
         need = ", ".join(f"{d:.5g}" for d in self.required_damping)
-        exact = "no proof for every passive hand can ask less" if self.attained else "that is enough, by a sweep"
+        exact = "no proof for every passive hand can require less" if self.attained else "this is enough, by a sweep"
         if self.proved_damping is None:
             return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
         excess = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
@@ -133,7 +133,7 @@ class LeftOver:
 def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
     """Return the necessary damping of this loop; None if Theorem A does not apply or no damping is enough.
 
-    `proved` is the requirement of known-device, if it is known already.
+    `proved` is the requirement of known-device, if the caller has it.
     """
     if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.levels or loop.T_max not in (None, loop.T):
         return None
