@@ -133,7 +133,7 @@ def _print_certificate(
     console.print(verdict(programs[0].assessment), soft_wrap=True)
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
-        f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
+        f"answers are {at[50]} us old (median), {at[99]} us at the 99th percentile, {ages.missing} of "
         f"{len(ages.values) + ages.missing} never arrived: {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)

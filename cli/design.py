@@ -79,7 +79,7 @@ def _parser() -> options.Parser:
     parser.add_condition("what to certify")
     ratio = "soften the coupling until every mode of the loop with the scenario's hands has this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
-    varying = "certify any switching of the forces' delays in this range, too [samples]; with --condition "
+    varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
     varying += "this-environment or known-device"
     parser.add_varying_delay(varying)
     limiter = "with this-environment: fail unless the proof covers limited forces (default: a spring-damper tries)"
@@ -343,9 +343,9 @@ class _Best:
         tried = (f"{basis.mismatch_db:z.2f}{_why_rejected(basis)}" for basis in self.bases)
         yield "bases [dB]", ", ".join(tried) or None
         yield "ended by --seconds", "a larger basis may be better" if self.ended_by_seconds else None
-        yield "last not taken", next((basis.rejected for basis in reversed(self.bases) if basis.rejected), None)
+        yield "last basis not taken", next((basis.rejected for basis in reversed(self.bases) if basis.rejected), None)
         if missed := [basis.reason for basis in self.bases if not (basis.certified or basis.rejected)]:
-            yield "last not proved", missed[-1]
+            yield "last basis not proved", missed[-1]
 
 
 def _why_rejected(basis: Any) -> str:

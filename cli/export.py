@@ -119,7 +119,7 @@ def _parser() -> options.Parser:
         "python -m design.export coupling.json --process --force-limit 12",
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
-    parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
+    parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block")
     link = "leave out Theta, if the link to the devices has this delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
     limit = "add the limiter that the certificate covers, with these largest forces [N]: one for all, one for each "

@@ -51,7 +51,7 @@ _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # mes
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one-line errors; --help shows the `first` options first and the examples at its end."""
+    """An argparse parser with one-line errors; --help shows the `first` options first and the examples last."""
 
     def __init__(self, prog: str, description: str, *examples: str, first: str = "") -> None:
         super().__init__(
@@ -133,7 +133,7 @@ class Parser(argparse.ArgumentParser):
     # options of several commands
 
     def add_loop(self) -> None:
-        """Add the options that describe a loop, which every command takes."""
+        """Add the options that describe a loop."""
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)

@@ -1,4 +1,4 @@
-"""The verdict on a coupling in one sentence, and the rows of its assessment."""
+"""The verdict on a coupling in a few sentences, and the rows of its assessment."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def verdict(
     nearby: Robustness | None = None,
     encoder: EncoderSteps | None = None,
 ) -> str:
-    """Return the verdict in one or two sentences: hands and objects of the guarantee, felt stiffness, restrictions.
+    """Return the verdict in a few sentences: hands and objects of the guarantee, felt stiffness, restrictions.
 
     Args:
         assessment: The assessment of exactly the loop that the command runs or judges.

@@ -190,7 +190,10 @@ def _designed_rows(fixed: FixedCoupling) -> render.Rows:
         "designed for",
         ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in fixed.contact_springs),
     )
-    yield "there", f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}"
+    yield (
+        "in that environment",
+        f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}",
+    )
 
 
 def _effects(effects: Shown) -> str:
