@@ -1,7 +1,7 @@
 """Errors of runs: of an engine against the exact engine, and of forces against an ideal environment's forces.
 
-`measure` returns the cost and the errors of one setting of an engine, from the same run. `compare_engines` finds the
-cheapest engine and step that keep a given error on a scene.
+`measure` returns the cost and the errors of one setting of an engine. `compare_engines` runs several settings on a
+scene, and `pick` chooses the cheapest one within a given error.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class PositionError:
-    """Error of device positions against the exact engine; without a comparison, None and the reason."""
+    """Error of device positions against the exact engine; None and the reason if there is no comparison."""
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
@@ -48,7 +48,7 @@ def position_error(
     """Return the position error of a trace against the exact engine.
 
     `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace that clips gets no
-    figures, because growth multiplies any difference: `reason` has the error up to the first clipped tick.
+    figures, because growth multiplies any difference. Then `reason` has the error up to the first clipped tick.
     """
     if exact is None:
         return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
@@ -65,7 +65,7 @@ def position_error(
     if linear == n:
         return PositionError(relative, largest)
     until = f"the unstable run first clips at t = {linear * simulation.scenario.T:.3f} s"
-    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
+    reason = f"{until}; the relative rms until then is {relative:.1e}, and growth multiplies any difference"
     return PositionError(reason=reason)
 
 
@@ -92,7 +92,7 @@ class Row:
     position_relative_rms: float | None
     growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
-    cycle_amplitude_n: float | None  # of the limit cycle without coupling
+    cycle_amplitude_n: float | None  # standard deviation of a force in the limit cycle without coupling
     cycle_frequency_hz: float | None
     cycle_amplitude_error: float | None  # relative
     cycle_frequency_error_hz: float | None
@@ -107,7 +107,7 @@ class _Reference:
     coupled: Simulation
     uncoupled: Simulation
     trace: Trace
-    cycle: tuple[int, float, float] | None  # channel, amplitude [N], frequency [Hz]; None without a limit cycle
+    cycle: tuple[int, float, float] | None  # channel, standard deviation [N], frequency [Hz]; None without limit cycle
 
 
 def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
@@ -158,7 +158,7 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto` for rows with right verdicts that no row of the same engine beats in cost and both errors.
+    """Set `pareto` for rows with right verdicts that no row of the same engine dominates in cost and both errors.
 
     MuJoCo's settings do not compete with the exact engine, which exists for linear plants only.
     """
@@ -203,7 +203,7 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
 def _cycle(
     truth: _Reference, engine: str, integrator: str | None, substeps: int | None
 ) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
-    """Return amplitude and frequency of the limit cycle, and their errors."""
+    """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors."""
     if truth.cycle is None:
         return None, None, None, None
     channel, amplitude, frequency = truth.cycle
@@ -276,7 +276,7 @@ def _not_credible(credible: Credible, until: float) -> str:
     excess = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
     if carried:
         excess = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {excess}"
-    return f"from t = {until:.2f} s on the motion is the linear model's and no device's: {excess}"
+    return f"from t = {until:.2f} s on no real device would move like the linear model: {excess}"
 
 
 # ---- errors against the ideal environment
@@ -299,7 +299,7 @@ class ForceError:
         if reason:
             return cls(asked, ideal, None, own, None, reason)
         if not np.isfinite([own, true, apart]).all():
-            return cls(asked, ideal, None, None, None, "the run left the range of numbers")
+            return cls(asked, ideal, None, None, None, "the numbers of the run overflowed")
         if true == 0:
             return cls(asked, ideal, None, own, true, "the ideal environment would have rendered no force")
         return cls(asked, ideal, 100 * apart / true, own, true, None)
@@ -308,8 +308,8 @@ class ForceError:
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
     """Compare the run's forces before clipping with those of Lambda E for the measured displacements.
 
-    With switching delays or a limiter, the run's forces are those that arrived, within their limits. With walls there
-    is no comparison, because walls have no linear ideal.
+    With switching delays or a limiter, the forces that the devices received, within their limits, are compared instead.
+    With walls there is no comparison, because walls have no linear ideal.
     """
     process = simulation.process
     if process.walls:
@@ -347,7 +347,7 @@ _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8),
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
 _EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics per step; other integrators need one
 _MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
-_EVEN = 0.6
+_EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
 _FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three
 
@@ -368,7 +368,7 @@ class EngineChoice:
 
     @property
     def cost(self) -> tuple[int, float]:
-        """Evaluations of the dynamics per tick, then the error: the order of settings by cost."""
+        """The key by which settings are sorted: evaluations of the dynamics per tick, then the error."""
         return self.substeps * _EVALUATIONS.get(self.integrator, 1), self.position_relative_rms
 
 
@@ -377,7 +377,7 @@ def compare_engines(
 ) -> tuple[EngineChoice, ...]:
     """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
 
-    Runs have the scenario's walls, limits, encoder steps, varying delays and net; verdicts are for constant delays
+    Runs include the scenario's walls, limits, encoder steps, varying delays and net. Verdicts are for constant delays
     without a net. With friction, the reference is refined until its error is at most `error`. Every run calls
     `progress`.
 
@@ -413,7 +413,7 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     if right:
         return min(right, key=lambda choice: choice.cost)
     best = min(choices, key=lambda choice: choice.position_relative_rms)
-    raise InputError(f"--error {error:g}: the nearest, {best.name}, is within {best.position_relative_rms:.1g}")
+    raise InputError(f"--error {error:g}: the nearest setting, {best.name}, has error {best.position_relative_rms:.1g}")
 
 
 @dataclass(frozen=True)
@@ -470,7 +470,7 @@ def _refined(
         count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # n + n/2 + ... substeps are 2 n
         if count > _MOST_EVALUATIONS:
             raise InputError(
-                f"--error {error:g}: where devices rub it asks for RK4 with about {needed:.0f} substeps, "
+                f"--error {error:g}: with friction it requires RK4 with about {needed:.0f} substeps, "
                 f"{1e-6 * count:.0f} million evaluations; allowed are {1e-6 * _MOST_EVALUATIONS:g} million: give a "
                 "shorter --duration or a larger error"
             )
@@ -479,7 +479,7 @@ def _refined(
 
 
 def _missed(gaps: Sequence[float]) -> float:
-    """Bound the finest run's error by the differences of successive runs; inf for less than three differences."""
+    """Bound the finest run's error by the differences of successive runs; inf for fewer than three differences."""
     *_, first, second, last = math.inf, math.inf, *gaps
     if not math.isfinite(first + second + last):
         return math.inf
@@ -505,7 +505,7 @@ def _positions(
 
 
 def _require_motion(positions: Array) -> None:
-    """Raise InputError if nothing moves, so that there is no relative error."""
+    """Raise InputError if nothing moves, because a relative error is then undefined."""
     if not positions.any():
         raise InputError("--error is relative to the motion, and nothing moves: give a tap, or a human an amplitude")
 
@@ -541,11 +541,9 @@ def settle(
     if engine != "mujoco":
         for name, value in (("integrator", integrator), ("substeps", substeps)):
             if value is not None:
-                raise InputError(f"--{name} with --engine {engine_name(engine)}: it is MuJoCo's; leave it out")
+                raise InputError(f"--{name} with --engine {engine_name(engine)}: only MuJoCo has it; leave it out")
         if engine == "exact" and simulation.friction:
-            raise InputError(
-                "--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco"
-            )
+            raise InputError("--engine exact is linear, but the devices have Coulomb friction; use --engine mujoco")
         return None, None, []
     integrator = integrator or default_integrator(simulation.scene)
     if substeps is None and integrator != EXPONENTIAL:
@@ -555,15 +553,15 @@ def settle(
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
-    """Return 1 for the exponential integrator on a smooth scene, else the least number that follows the plant.
+    """Return 1 for the exponential integrator on a smooth scene, else a number of steps that resolve the plant.
 
-    The number is at least 4; the comment at the head of this section states the rule. Raises InputError if no number up
-    to 10000 suffices.
+    The number is at least 4, and is doubled until the simulated loop has the verdict of the exact loop. Raises
+    InputError if no number up to 10000 suffices.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return 1
-    if integrator == "discrete":  # `_agrees` maps position and velocity only, and this integrator has more state.
-        raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
+    if integrator == "discrete":  # `_agrees` measures a map of position and velocity; this integrator has more state.
+        raise InputError(f"--integrator discrete gives no reliable verdict: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
     count = needed = speed.substeps(T)
@@ -579,7 +577,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
 def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
     """Return remarks on the user's number of substeps. Raises InputError outside the stable region."""
     if integrator == EXPONENTIAL:
-        nearer = "of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
+        nearer = "of first order with friction; RK4 is more accurate at equal cost (see --cross-check)."
         rubs = default_integrator(simulation.scene) != EXPONENTIAL
         return [f"{integrator} x {substeps}: {nearer}"] if rubs else []
     simulation = simulation.smooth.even
@@ -591,7 +589,7 @@ def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> l
         raise InputError(f"--substeps {substeps}: {setting}, outside the stable region of {integrator}; {instead}")
     remarks = [] if speed.within(h) else [f"{setting}: stable but coarse; {_instead(simulation, integrator)}."]
     if integrator == "discrete":
-        remarks.append(f"discrete gives no verdict to rely on: {_MODE_LOST}.")
+        remarks.append(f"discrete gives no reliable verdict: {_MODE_LOST}.")
     elif not _agrees(simulation, integrator, substeps):
         simulated, exact = simulated_growth(simulation, integrator, substeps), exact_growth(simulation)
         growth = f"{simulated:+.3g} 1/s, the exact loop {exact:+.3g} 1/s"
@@ -600,7 +598,7 @@ def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> l
 
 
 def _step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:
-    """Return the spectral radius of one substep on the passive plant: above 1 the integrator is unstable."""
+    """Return the spectral radius of one substep on the passive plant; above 1 the integrator is unstable."""
     step = _measured_hold(simulation, "mujoco", integrator, 1, simulation.scenario.T / substeps)
     return float(np.abs(np.linalg.eigvals(step.A)).max()) if np.isfinite(step.A).all() else np.inf
 
@@ -648,7 +646,7 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """Return the growth rate [1/s] of the loop that an engine simulates; with walls, the worst contact state's."""
+    """Return the growth rate [1/s] of an engine's loop; with walls, that of the worst contact state."""
     held = _measured_hold(simulation, engine, integrator, substeps)
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
         raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")

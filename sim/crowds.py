@@ -2,8 +2,8 @@
 
 Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result
 equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4 integrator, which
-shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a fifth of the cost. The
-exact engine simulates all humans, MuJoCo a sample (`_witnessed`). Workers end with the process that started them.
+shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost.
+The exact engine simulates all humans, MuJoCo a sample (`_witnessed`). Workers end when their parent process ends.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from haptic_loop.sim.stability import (
 from haptic_loop.sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
-_BATCH = 500  # humans that are decided together
-_NEAREST = 8  # size of the sample of each group of alike humans in a batch: those nearest to the stability limit
+_BATCH = 500  # largest number of sets of humans in a batch
+_NEAREST = 8  # number of humans nearest to the stability limit that are sampled in each group of a batch
 _AT_RANDOM = 64  # size of the random sample of all humans
 
 
@@ -78,7 +78,7 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
 
 @dataclass(frozen=True)
 class Validation:
-    """A loop, the number of humans that hold it, and the settings of their judgement."""
+    """A loop, the number of random humans that hold it, and the settings of the validation."""
 
     scenario: Scenario
     coupling: Coupling
@@ -88,7 +88,7 @@ class Validation:
     engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
-    environments: tuple[Member, ...] = ()  # humans meet these in turn; empty: all meet the scenario's
+    environments: tuple[Member, ...] = ()  # humans meet these in turn; if empty, all meet the scenario's environment
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 
@@ -108,7 +108,7 @@ class Validation:
         return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
 
     def environment(self, index: int) -> Member | None:
-        """Return the environment that the humans of this index meet; None is the scenario's own."""
+        """Return the environment that the humans of this index meet; None for the scenario's own."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
@@ -134,18 +134,20 @@ class Validation:
 class Findings:
     """The results for every set of humans, sorted by index; nan where an engine or a trace was not requested.
 
+    The energy W(N) is the work of the forces plus the least dissipation of the devices, up to tick N.
+
     Attributes:
-        index: (n,) number of each set, which together with the seed draws it.
+        index: (n,) number of each set; index and seed determine the set.
         radius: (n,) spectral radius of the exact loop, no unit.
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
-        frequency: (n,) frequency of that mode [Hz].
+        frequency: (n,) frequency of the exact loop's dominant mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
         trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's own engine; if there is none, on the exact one.
         witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
         trace_error: (n,) error of `trace` [1/s]; a rate of smaller size gives no verdict.
         clipped: (n,) number of ticks with a force at its limit, on that trace.
         energy: (n,) least energy W(N) on the exact trace [J].
-        audited: (n,) sum of the magnitudes that W adds up [J].
+        audited: (n,) sum of the magnitudes of the terms of W [J].
         settling: (n,) rms speed of the handles, last quarter over second quarter of the exact trace, no unit.
         contacts: (n,) how often a wall was touched on the exact trace.
         mass: (n,) geometric mean over channels of all mass of a hand [kg].
@@ -219,7 +221,7 @@ def _examine(
 ) -> Findings:
     """Judge and simulate the humans of `indices`, who all meet the same environment.
 
-    `ticked` is called with the number of ticks that were simulated for all of them.
+    `ticked` is called with the number of ticks that were simulated for all these humans.
     """
     simulation = validation.simulation
     if member := validation.environment(indices[0]):
@@ -290,7 +292,7 @@ def _other_engine(
 ) -> tuple[_Other | None, Array | None]:
     """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
 
-    `frozen` are the processes of the contact states. A user's own engine has no maps; its rates are those of traces.
+    `frozen` are the processes of the contact states. The map of a user's own engine is measured with every basis state.
     """
     if not isinstance(validation.engine, str):
         drawn = crowd.mechanics or ((),) * len(crowd)
@@ -325,10 +327,10 @@ def _geometric_mean(values: Array) -> Array:
 def _witnessed(
     validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return the numbers of the humans of one group that the other engine simulates, too.
+    """Return the positions in a group of the humans that the other engine simulates, too.
 
     These are all lossless humans, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of the random
-    sample of all humans. They depend on the question and the group alone, not on the number of processes.
+    sample of all humans. They depend on the validation and the group alone, not on the number of processes.
     """
     if validation.all_traces:
         return np.arange(len(index))
@@ -348,9 +350,9 @@ def _traced(
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
 ) -> ImpulseTest:
-    """Return the exact engine's impulse test, with growth and clipped ticks of the other engine for `witnesses`.
+    """Return the exact engine's impulse test; growth and clipped ticks of `witnesses` are those of the other engine.
 
-    Periods are even and forces latch in the middle of their range; `switched_crowd` tests their spread.
+    Periods are even, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks
@@ -372,9 +374,9 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine every batch and merge the findings, in `shards` processes.
+    """Examine every batch in `shards` processes, and merge the findings.
 
-    An interruption, the death of a worker and a lack of memory end the validation with the batches that are finished.
+    An interruption, the death of a worker or a lack of memory ends the validation; finished batches are returned.
     """
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
@@ -424,14 +426,14 @@ def _in_processes(question: Validation, shards: int, parts: dict[int, Findings],
             if future.done() and not future.cancelled() and not future.exception():
                 parts[number] = future.result()
         for worker in set(multiprocessing.active_children()) - strangers:
-            worker.terminate()  # A batch may take half a minute and stores nothing before its end.
+            worker.terminate()  # Waiting for a batch could take half a minute.
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _as_worker() -> None:
-    """Ignore Ctrl-C, which reaches every process of a terminal and which the parent handles; end with the parent."""
+    """Ignore Ctrl-C, which the parent process handles, and end this process when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

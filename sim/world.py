@@ -1,4 +1,4 @@
-"""A MuJoCo scene as the environment of a scenario: the scene behind a coupling, its energy account, and its claim.
+"""A MuJoCo scene as the environment of a scenario: the scene behind a coupling, its energy account and its guarantee.
 
     trace = simulate(scenario, design).meta["world"]
 
@@ -36,8 +36,8 @@ from haptic_loop.sim.scenario import Scenario
 if TYPE_CHECKING:  # loads MuJoCo, which other scenarios and --help do not need
     from haptic_loop.models.world import Contact, World, WorldPort
 
-_ROUNDING = 1e-9  # entries of A below this relative size are rounding of differences over 1e-6 m
-_APART = 1e-12  # entries of D_V below this relative size count as rounding
+_ROUNDING = 1e-9  # entries of A below this relative size are rounding errors of finite differences over 1e-6 m
+_APART = 1e-12  # entries of D_V below this relative size are rounding errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
     given_J: float  # largest energy given to hands and devices, beyond the dissipation of the devices' damping
-    port_least_J: float  # least sum of f'(u - u_-) at the contacts
+    port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # energy that contacts created, as the lemma on scenes in docs/theory.md counts it
     unsettled_ticks: int  # ticks in which the limited channels still changed after the last repetition of the step
@@ -76,9 +76,9 @@ class SceneRecord:
     """The entry `scene` of a report."""
 
     file: str
-    settings: str  # options that the program sets in the scene
-    parts: list[dict[str, object]]  # kinds of parts, their number, and what is known of each at the port
-    active: list[str]  # actuators, plugins, callbacks
+    settings: str  # options that this program sets in the scene
+    parts: list[dict[str, object]]  # kinds of parts, their number, and the bound on the energy that they generate
+    active: list[str]  # actuators, plugins and callbacks, which the lemma on scenes does not cover
 
     @classmethod
     def of(cls, scene: World) -> SceneRecord:
@@ -185,7 +185,7 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """The scenario's world in the loop, behind the coupling and the energy shell."""
+    """The settings of a net that puts the scenario's world behind the coupling and the energy shell."""
 
     start: float = START_J  # W0 [J]
     gravity: bool = True  # False switches the scene's gravity off
@@ -207,7 +207,7 @@ class Touched:
 
 
 def live(simulation: Simulation) -> Simulation:
-    """Return the loop with its world for any number of ticks. The net itself delays the forces."""
+    """Return the loop with its world, for any number of ticks; the net delays the forces."""
     touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:
@@ -238,7 +238,7 @@ class Late:
 
 
 class InWorld:
-    """A world, its shell, and the energy that hands and devices were given."""
+    """A world, its shell, and the energy that hands and devices received."""
 
     def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
         """`damping` (m, m) [N/m]: Delta/T, so that devices dissipate dx' Delta dx/T in a period."""
@@ -286,9 +286,9 @@ class InWorld:
 
 RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the hands' initial speeds
-_NEVER = 1e3  # [J] W0 with which a shell never acts, for measurements
-_ADVERSARIES = 20  # sets of hands that are thrown without a shell
-_STREAM = 11  # keeps these draws apart from those of the hands with the same seed
+_NEVER = 1e3  # [J] W0 so large that the shell never acts
+_ADVERSARIES = 20  # sets of hands that are thrown with a shell that never acts
+_STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def thrown(
     start: float = START_J,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[HandsInWorld]:
-    """Let hands of the scenario's population, thrown at random, move in the world for `duration` seconds.
+    """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
 
     Every second set is lossless, without dampers. `start` is W0 [J].
     """
@@ -370,7 +370,7 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
 
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int) -> dict[str, float]:
-    """Return for each adversary the least energy [J] at a port without a shell; 0 if the scene gave no energy."""
+    """Return per adversary the least energy [J] at a port whose shell never acts; 0 if the scene gave no energy."""
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, _ADVERSARIES, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
@@ -391,14 +391,14 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
     Args:
         world: A scenario with a world, or an MJCF file.
         pose: Positions (nq,) of the scene with its slides, the name of a keyframe, or None for the initial pose.
-        contacts: Names of the bodies in an MJCF file, which slide along x; a scenario has its own.
-        T: Period [s] for an MJCF file; a scenario has its own.
+        contacts: Names of bodies in an MJCF file, which slide along x; a scenario names its own contacts.
+        T: Period [s] for an MJCF file; a scenario has its own period.
 
     Returns:
         The network, whose `block` is the linear model.
 
     Raises:
-        InputError: The scene or the pose is impossible, or the model is not a passive environment.
+        InputError: The scene or the pose is invalid, or the model is not a passive environment.
     """
     from haptic_loop.models.world import Contact, World
 

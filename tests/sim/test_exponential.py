@@ -258,7 +258,7 @@ def test_the_default_follows_from_the_scene(simulation):
     assert default_substeps(stiff(1.45e6), "RK4") == 32
     assert _check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
     assert _check_substeps(rubbing, EXPONENTIAL, 8) == [
-        "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
+        "exponential x 8: of first order with friction; RK4 is more accurate at equal cost (see --cross-check)."
     ]
     assert default_substeps(rubbing, EXPONENTIAL) == 4
 
@@ -349,7 +349,7 @@ def test_what_the_finest_run_misses_is_no_chance():
         (RESTING, 1e-3, "nothing moves: give a tap, or a human an amplitude"),
         (RESTING.replace(device=RUBBING.device), 1e-3, "nothing moves: give"),
         (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
-        (SCENARIO, 1e-18, "--error 1e-18: the nearest, exponential x 1, is within"),
+        (SCENARIO, 1e-18, "--error 1e-18: the nearest setting, exponential x 1, has error"),
         (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
     ],
 )
@@ -362,7 +362,7 @@ def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
     """The third would be one of the many that the first two foretell: 100 ticks of 512 steps of 4 evaluations."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
-    words = r"asks for RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
+    words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
     with pytest.raises(InputError, match=words):
         compare_engines(assemble(RUBBING, PUBLISHED["I"]), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
     assert moved.count((100, 100)) == 2

@@ -75,7 +75,7 @@ def test_euler_once_per_period_hides_the_instability(substeps, wrong):
 def test_wrong_default_steps_are_doubled_or_refused():
     loop = assemble(SCENARIO, NoCoupling())
     assert default_substeps(loop, "Euler") == 4
-    with pytest.raises(InputError, match="discrete gives no verdict to rely on"):
+    with pytest.raises(InputError, match="discrete gives no reliable verdict"):
         default_substeps(loop, "discrete")
     # just unstable: Euler's bias towards stable hides it at 4 substeps
     near = assemble(SCENARIO.replace(delta=(1.55, 1.55)), NoCoupling())
