@@ -49,7 +49,7 @@ class Demands:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """One coupling at the frequencies `hz` of its picture."""
+    """The curves of one coupling at the frequencies of a picture."""
 
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
     sigma_M: Array  # (k, m) singular values of the mismatch F - Lambda E [N/m]

@@ -74,7 +74,7 @@ class ExportedBlock:
     input: _Signal
     output: _Signal
     about: tuple[str, ...]  # comment lines of the file
-    limiter: Limiter | None = None  # the limiter; `system` is the block while no force is limited
+    limiter: Limiter | None = None  # None: no limiter. With one, `system` is the block while no force is limited.
     single: bool = False  # whether the file computes in single precision
 
     @property

@@ -1,4 +1,4 @@
-"""Spring-damper gains for one environment, by a local search from several starts.
+"""Design spring-damper gains for one environment by a local search from several starts.
 
 The feasible set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by
 sequential quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a

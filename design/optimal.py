@@ -38,11 +38,8 @@ _LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only aft
 _FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
 _KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below this share of an accepted solution's.
 _FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's is dropped.
-_LAGS = (
-    (BETA, 0.05),
-    (0.1, 0.5),
-    (0.5, 2.0),
-)  # Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
+# Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
+_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))
 _HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
 _RESERVES = (0.95, 2.5, 50.0)  # unused damping in units of MARGIN; if a proof fails, the next value is tried
 # An environment that requires more than 1 + _TOLERATED times the damping is added to the program. Scaling the forces
@@ -592,7 +589,7 @@ class _Search:
         """Return the coupling with its figures and its swept requirement, without a proof.
 
         For known-device, `multiplier` holds beta, zeros in place of the bounds of q (`known_device._q_bounds`), and
-        the facts' multipliers. If it is None, they are searched.
+        the facts' multipliers. If `multiplier` is None, beta and the facts' multipliers are searched.
         """
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)

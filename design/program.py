@@ -218,7 +218,7 @@ def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
 class Span:
     """Basis functions of R, and the entries of R_1, R_2, .. that are unknowns; the first unknown is g."""
 
-    poles: Array  # (n,) real poles
+    poles: Array  # (n,) real poles; 0 for a tap
     pairs: Array  # (p, 2) coefficients a, b of z^2 + a z + b
     used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1)
 
@@ -286,9 +286,8 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
-    pairs += [
-        (-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)
-    ]  # The fast modes come last, because the filters of the devices' own forces end before them.
+    # The fast modes come last, because the filters of the devices' own forces end before them.
+    pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
     used = np.ones((count, m, m), dtype=bool)
@@ -306,7 +305,7 @@ def _zeros(E: Lti) -> Complex:
 
 
 def _separate(modes: Complex) -> list[complex]:
-    """Return the modes without those nearer to an earlier mode than 5 % of its distance to the unit circle."""
+    """Drop the modes that are nearer to an earlier mode than 5 % of its distance to the unit circle."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
@@ -567,9 +566,8 @@ class Problem:
         x, t, gaps = start, None, list(_GAPS)
         inner = start
         nothing = float(b @ b) + float(c.any())  # objective of zero force, for which tau is 1
-        demanding = any(
-            len(case.constraints) > 1 for case in self.cases
-        )  # With this-environment alone, scaling the forces ensures feasibility.
+        # With this-environment alone, scaling the forces ensures feasibility.
+        demanding = any(len(case.constraints) > 1 for case in self.cases)
         lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(budgets.PROGRAM_SWEEPS):
             program, y, back = posed(A, b, c, pairs, imposed, start, x)
@@ -603,10 +601,11 @@ class Problem:
 
 
 def _evened(E: Complex, size: Array) -> Complex:
-    """Return L with |M L|^2/|E|^2 = |M|^2/|E|^2 + EVEN mean over motions |M x|^2/(|E x|^2 + LEAST_FORCE^2 |E|^2 |x|^2).
+    """Return L, which adds to the mismatch M the errors in motions with small forces: |M L|^2 = |M|^2 + addition.
 
-    The mismatch M is relative to the largest force. Many couplings have nearly the same mismatch and differ only in
-    motions with small forces. The second term selects one whose error is small relative to these forces, too.
+    Relative to |E|^2 the addition is _EVEN mean over motions x of |M x|^2/(|E x|^2 + _LEAST_FORCE^2 |E|^2 |x|^2).
+    The mismatch is relative to the largest force, and many couplings with nearly the same mismatch differ only in
+    motions with small forces. The addition selects one whose error is small relative to these forces, too.
     """
     unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
     faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)

@@ -15,7 +15,7 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
-_ROUNDING = 1e-10  # relative to the environment; responses that differ by less count as equal
+_ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
 
 
 @dataclass(frozen=True)
