@@ -115,7 +115,7 @@ class HeldLine:
     def carry(self, k: int, force: Array) -> None:
         """Overwrite `force` (m, nsim), sent at tick k, with the force that the devices apply at tick k."""
         if k >= self._fresh.shape[0]:
-            raise ValueError(f"delays have {self._fresh.shape[0]} ticks, expected a row for tick {k} also")
+            raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, expected a row for tick {k}, too")
         self._sent[k % self._sent.shape[0]] = force
         np.copyto(self._held, self._sent.take(self._place[k]), where=self._fresh[k])
         force[...] = self._held

@@ -279,7 +279,9 @@ class RigidWall(Environment, enum.Enum):
     def check(self, psi: Sequence[int], T: float) -> None:
         if any(psi):
             shown = ", ".join(map(str, psi))
-            raise ValueError(f"psi is {shown}, expected 0: with a delay no loop around a rigid wall is stable")
+            raise ValueError(
+                f"psi is {shown}, expected 0: at a rigid wall no loop with a delayed environment is stable"
+            )
 
     def active(self, T: float) -> None:
         return None

@@ -316,7 +316,8 @@ def _check_damping(self: Any) -> None:
     # eigvalsh is exact to a few units in the last place of the largest entry
     if (left := np.linalg.eigvalsh(damping - delta)[0]) < -1e-12 * most:
         raise ValueError(
-            f"delta is {_listed(self.delta)}, allowed is delta <= damping: an eigenvalue of damping - delta is {left:g}"
+            f"delta is {_listed(self.delta)}, allowed is delta <= damping as matrices: "
+            f"damping - delta has the eigenvalue {left:g}"
         )
 
 
