@@ -117,7 +117,7 @@ def _parser() -> options.Parser:
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m], or one for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
-    parser.add_condition("the condition that must hold, your own in addition to the two standard ones", to=coupling)
+    parser.add_condition("the condition that must hold; your own is judged after the standard two", to=coupling)
     device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"from the catalogue: {device}; other options override it")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")

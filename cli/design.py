@@ -77,7 +77,7 @@ def _parser() -> options.Parser:
     around = "certify for every stiffness and mass within PERCENT of the nominal one, like [ranges] of a scenario"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")
-    ratio = "soften the coupling until every mode of the loop with the scenario's hands has this damping ratio"
+    ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
     varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
     varying += "this-environment or known-device"

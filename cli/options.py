@@ -177,7 +177,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
         """Add --no-limiter; `limiter` is None (the default behaviour) or False."""
-        help_ = f"{what}, in place of the limiter that a guarantee covers"
+        help_ = f"{what}, without the limiter that a guarantee covers"
         (to or self).add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
 
     def add_rigid(self) -> None:
