@@ -1,8 +1,8 @@
-"""Audit of a coupling: requirements, margins to the edge of each condition, and changes that would help."""
+"""Audit a coupling: its requirements, its margins to the edge of each condition, and changes that would help."""
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This comes before the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("audit")
@@ -68,7 +68,7 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
-    """Return the requirement at another T [s]; coefficients and delays in samples stay, T_max and T_min scale."""
+    """Return the requirement at T [s] with the same coefficients and delays in samples; T_max and T_min scale."""
     longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest, T_min=shortest)
 
@@ -86,16 +86,16 @@ def check_loop(loop: Loop) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Margins: the stiffest K, and the errors of the loop's data that the certificate tolerates.
 #
-# The loop is varied and the conditions are evaluated again, without a solver. A search goes outwards in steps and
-# bisects between the last two, so it can miss a gap narrower than a step. The returned value is certified.
+# The loop is varied and the conditions are evaluated again, without a solver. A search varies one value in steps and
+# bisects the first step that meets the edge, so it can miss a gap narrower than a step. The result is certified.
 
 
-_Ratio = Callable[[float], float]  # required over available damping, of a varied loop
+_Ratio = Callable[[float], float]  # value that is varied -> required over available damping
 
 #: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
-_EDGE = 1e-7  # relative accuracy of an edge
+_EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
 _NOT_CERTIFIED = "not certified, so no change can end a certificate"
 
 
@@ -109,7 +109,7 @@ class _Stiffest:
 
 @dataclass(frozen=True)
 class _Sensitivity:
-    """The tolerated error of each datum alone, or None and the reason.
+    """The tolerated error of each value alone, or None and the reason.
 
     Errors are relative: the certificate holds for (1 - delta_error) delta, and for (1 + T_error) T.
     """
@@ -151,9 +151,9 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Return the largest certified K of each channel, searched up to 2 (delta - B)/T, the bound at z^-n = -1.
+    """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound at frequencies with z^-n = -1.
 
-    The set of certified gains is convex and contains K -> 0, so the search meets one edge.
+    The set of certified gains is convex and contains K -> 0, so there is only one edge.
     """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
@@ -226,7 +226,7 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """Return the argument nearest `outside` at which the damping suffices, with the relative accuracy _EDGE."""
+    """Return an argument at which the damping suffices, as near to `outside` as possible (relative accuracy _EDGE)."""
     if suffices(ratio(outside)):
         return outside
 
@@ -284,7 +284,7 @@ class _Remedy:
 
 
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
-    """Return single changes that certify or lower the requirement by 10 %; [] for a certified coupling."""
+    """Return single changes that certify the coupling or lower the requirement by 10 %; [] if it is certified."""
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []
@@ -307,7 +307,10 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Shorten the delays `name` of all channels by one sample at a time; lam is 0 in the shortened loop."""
+    """Return the least reduction of the delays `name` that certifies, or the one with the least requirement.
+
+    All channels are shortened by the same number of samples, and lam is 0 in the shortened loop.
+    """
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
@@ -319,7 +322,7 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the largest factor that certifies, in steps of 0.001, or the one with the least requirement."""
+    """Return the largest factor that certifies, rounded down to 0.001, or the factor that requires least."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
@@ -374,9 +377,9 @@ def audit(
     Args:
         loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
-        condition: The condition that must hold, by default that of `assess`.
+        condition: The condition that must hold; None for the one that `assess` chooses.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
-        force_limit: (m,) [N], for the report.
+        force_limit: (m,) force limits [N], for the report.
         progress: Called with (points done, number of points) of the search over ranges.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Reading files of limited size, writing files atomically, and text for messages.
+"""Read files of limited size, write files atomically, and prepare text for messages.
 
 Folders that the user names (--out DIR) and default folders (out/..) are created. The folder of a file that the user
 names (--json, --video, --out FILE) must exist, so that a typing error creates no folder. Within `one_command` a file
@@ -36,13 +36,13 @@ _MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
 _MOST_UNPACKED = 4_000_000_000  # bytes of a trace: ten hours of two channels take 3e9
 _MOST_WORDS = 1000  # characters of one message
 
-_DEEPEST_KEY = 20  # most names joined by dots, because tomllib's time and memory grow with their square
+_DEEPEST_KEY = 20  # largest number of names joined by dots, because tomllib's time and memory grow with its square
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{_DEEPEST_KEY}}}")
 
 
 class InputError(ValueError):
-    """A mistake in the user's input: one line that names the field."""
+    """A mistake in the user's input. The message is one line that names the field."""
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -54,7 +54,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
-_QUOTED = re.compile(r"(?<!\w)'[^']*'|(?<!\S)[^\s/']{81,}(?!\S*/)")  # a text in quotes, or a long word that is no path
+_QUOTED = re.compile(r"(?<!\w)'[^']*'|(?<!\S)[^\s/']{81,}(?!\S*/)")  # a text in quotes, or a long word without /
 
 
 def _cut(text: str) -> str:
@@ -79,7 +79,7 @@ def counted(path: str) -> str:
 
 @dataclass
 class _Ledger:
-    """Files of a command, identified by device and inode, and by their path without links."""
+    """Files that a command reads and writes. A file's places are its path without links, and its device and inode."""
 
     read: dict[Any, str] = field(default_factory=dict)  # place -> name of the file in messages
     named: dict[Any, str] = field(default_factory=dict)  # place -> option that names the file as output
@@ -100,7 +100,7 @@ def one_command() -> Iterator[None]:
 
 
 def _places(path: Path) -> set[Any]:
-    """Return the identifiers of a file; none for a terminal or another target without content to destroy."""
+    """Return the places of a file (`_Ledger`); none for a terminal, a pipe or a device, which keeps no content."""
     place = _target(path)
     if not place.exists():
         return {place}
@@ -130,9 +130,9 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
     if content is None:  # A non-blocking read returns None for a kernel file such as /proc/kmsg without data.
-        raise InputError(f"{named}: has nothing to read, expected a file with content")
+        raise InputError(f"{named}: has no content that can be read, expected a file with content")
     if len(content) > most:
-        raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
+        raise InputError(f"{named}: is larger than {most / 1e6:g} MB, the largest allowed size")
     return content
 
 
@@ -152,14 +152,14 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
         if ledger := _ledger.get():
             places = _places(path)
             if option := _met(places, ledger.named):
-                raise InputError(f"{named}: is also the file of {option}; name another one there")
+                raise InputError(f"{named}: is also the file of {option}; name another file for {option}")
             ledger.read |= dict.fromkeys(places, named)
         file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  closed below
     except OSError as error:
         raise InputError(f"{named}: {error.strerror or error}{hint}") from None
     except InputError:
         raise
-    except ValueError as error:  # The name contains a zero byte.
+    except ValueError as error:  # The name contains a null byte.
         raise InputError(f"{named}: {error}{hint}") from None
     with file:
         try:
@@ -194,7 +194,7 @@ def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
     try:
         with _opened(path, str(path)) as file, ZipFile(file) as archive:
             entries = archive.infolist()
-            size = sum(entry.file_size for entry in entries)  # zipfile never unpacks more than this
+            size = sum(entry.file_size for entry in entries)  # zipfile never unpacks more than this size.
             if size > _MOST_UNPACKED:
                 raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {_MOST_UNPACKED / 1e9:g} GB")
             return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
@@ -205,14 +205,14 @@ def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
 
 
 def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
-    """Return one array, after comparing its declared size with the size of its data."""
+    """Return one array. Raises ValueError if its declared size is not the size of its data."""
     with archive.open(entry) as member:
         version = npy.read_magic(member)
         header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
         shape, fortran, dtype = header(member)
         there = entry.file_size - member.tell()
         if dtype.hasobject or min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != there:
-            raise ValueError(f"{entry.filename} declares {shape} of {dtype}, and holds {there} bytes")
+            raise ValueError(f"{entry.filename} declares {shape} of {dtype}, but contains {there} bytes")
         return np.frombuffer(member.read(), dtype).reshape(shape, order="F" if fortran else "C")
 
 
@@ -221,7 +221,7 @@ def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
 
 
 def check_file(option: str, path: Path, expected: str = "a file") -> Path:
-    """Return the path of a file that the user named. Raises InputError if it cannot be written."""
+    """Return `path`, the file of an option. Raises InputError if it cannot be written or has another use."""
     try:
         if path.is_dir():
             raise InputError(f"{option} {path}: is a folder, expected {expected}")
@@ -251,7 +251,7 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
 
 
 def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
-    """Return the file of --out, or the default file, whose folder is created. Raises InputError."""
+    """Return the file of --out, or the default file after creating its folder. Raises InputError."""
     if named is None:
         folder(Path(default).parent)
     return check_file("--out", Path(default if named is None else named), expected)
@@ -270,20 +270,20 @@ def folder(path: Path) -> Path:
 
 
 def _try(place: Path, name: str = "") -> None:
-    """Create and delete a temporary file in a folder. Its name is as long as the one that `write` uses for `name`."""
+    """Create and delete a file in a folder, with a name as long as that of the temporary file in `write`."""
     handle, temporary = tempfile.mkstemp(dir=place, prefix=f".{name}.")
     os.close(handle)
     os.unlink(temporary)
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
-    """Write a file under a temporary name and rename it into place; a device or a pipe is written directly.
+    """Write a file under a temporary name and rename it; a device or a pipe is written directly.
 
-    A link stays a link: the file that it points to is written. Raises InputError if the file cannot be written, or if
-    the command has read it or written it for another option.
+    For a link, the file that it points to is written. Raises InputError if the file cannot be written, or if the
+    command has read it, or has already written it and an option names it.
     """
     if "\0" in str(path):
-        raise InputError(f"cannot write {str(path)!r}: the name of a file has no null byte")
+        raise InputError(f"cannot write {str(path)!r}: a file name must not contain a null byte")
     try:
         place = _target(path)
         if place.exists() and not place.is_file():
@@ -319,13 +319,13 @@ def remove(path: Path) -> None:
 
 
 def _spare(path: Path) -> None:
-    """Raise InputError if the command has read the file or written it."""
+    """Record that a file will be written. Raises InputError if it was read, or written and named by an option."""
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):
             raise InputError(f"cannot write {path}: it was read, as {known}")
         if not places.isdisjoint(ledger.written) and (option := _met(places, ledger.named)):
-            raise InputError(f"cannot write {path} twice: it is the file of {option}, and one of the command's own")
+            raise InputError(f"cannot write {path} twice: it is the file of {option} and another output of the command")
         ledger.written |= places
 
 
@@ -343,13 +343,13 @@ def off_table(json: InJson = "always", default: Any = MISSING) -> Any:
     """Return a dataclass field of a report that no table shows.
 
     `json` says when the report's JSON has the field: `always`, `if given` (the value is not None), or never (`left
-    out`). With `inlined` the keys of a nested report stand among those of the outer report.
+    out`). With `inlined` the keys of a nested report become keys of the outer report.
     """
     return field(default=default, metadata={"json": json})
 
 
 def plain(report: Any) -> Any:
-    """Return a report as plain data: dataclasses by `part()` or their fields, None for infinity and nan."""
+    """Return a report as plain data: dataclasses become dicts (by `part()` if defined), inf and nan become None."""
     if is_dataclass(report) and not isinstance(report, type):
         own = getattr(report, "part", None)
         return plain(own()) if own else _part(report)
@@ -373,7 +373,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # The field for the key `from` is named from_.
+            part[one.name.removesuffix("_")] = plain(value)  # The key `from` has the field from_.
     return part
 
 
@@ -391,7 +391,7 @@ def write_json(destination: str | Path, report: Any) -> None:
 
 
 def nobody_reads() -> None:
-    """Discard further standard output, because its reader has left."""
+    """Discard further standard output, because the program that read it has ended."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)
