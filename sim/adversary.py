@@ -4,11 +4,11 @@ A lossless chain of masses and springs takes no energy out, and can present any 
 loop is weakest. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above 3 kHz, errors of the matrix
 exponential would decide the verdict.
 
-The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is larger unless v is constant
-between samples. For a sinusoid, |dx|^2 / T is (sin x / x)^2 times the integral, with x = pi f T. The condition
-therefore requires too much damping by about this factor at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms,
-0.03 % at 8 Hz (loops with long delays). No search has found an unstable human within this gap; most searches find one
-if the damping is below the gap.
+The conditions assume that a device with unit damping dissipates |dx|^2 / T in a tick. It dissipates the integral of
+v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f, |dx|^2 / T is (sin x / x)^2
+times the integral, with x = pi f T. A condition therefore requires too much damping by about this factor at the
+frequency where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). No search has found an
+unstable human within this gap; most searches find one if the damping is below the gap.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; roundin
 
 
 class _Pass(NamedTuple):
-    """One search over modes above a frequency: slower modes of a lossless hand barely decay and hide a growing one."""
+    """One search over modes above a frequency; slower modes of a lossless hand barely decay and hide a growing one."""
 
     links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
     min_frequency_hz: float  # modes below it are ignored
@@ -73,7 +73,7 @@ def search(
     first: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """Search for the lossless humans with the largest growth; with `first`, stop at the first that destabilise.
+    """Search for the lossless humans with the largest growth; with `first`, stop at the first ones that destabilise.
 
     `progress` is called after every generation.
     """
@@ -115,7 +115,7 @@ def search(
     return replace(best, evaluated=evaluated)
 
 
-_ELITE = 12  # sets of hands from which the next generation is bred
+_ELITE = 12  # number of the worst sets of hands, from which the next generation is combined
 
 
 def search_population(
@@ -144,7 +144,7 @@ def search_population(
 
 
 def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
-    """Return each set with its growth [1/s]; if no mode grows, the growth of the modes above 2 Hz."""
+    """Return each set with its growth [1/s]; if no mode grows, with the growth of the modes above 2 Hz."""
     layouts: dict[object, list[tuple[Hand, ...]]] = {}
     for hands in sets:
         layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)

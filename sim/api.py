@@ -58,7 +58,7 @@ class ScenarioRun:
     trace: Trace
     wall_s: float
     seed: int
-    unsolved: int  # vectors of forces for which a tick's limiter found no solution
+    unsolved: int  # number of ticks' force vectors for which the limiter found no solution
 
     @cached_property
     def exact(self) -> Trace | None:
@@ -79,8 +79,8 @@ def run_scenario(
 ) -> ScenarioRun:
     """Close the loop for the scenario's duration, for `sim.run` and `simulate`.
 
-    `lag` is rho (m,) [N/m] of the limiter through which forces leave, or None to clip them. `net` stands between the
-    forces and the devices. Raises InputError for impossible settings.
+    `lag` is rho (m,) [N/m] of the limiter of the forces, or None to clip them. `net` acts between controller and
+    devices. Raises InputError for impossible settings.
     """
     simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
@@ -134,10 +134,10 @@ def simulate(
             [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes it
             passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for any
             environment, with psi = 0.
-        energy_budget: W0 [J] of the shell (default 0, in a MuJoCo scene START_J). Without a shell, the energy budget of
-            the devices; None is no budget.
-        limiter: False to clip forces. By default forces leave through the limiter that the coupling's guarantee
-            covers, if there is one (`meta["assessment"]["force_limits"]`).
+        energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the shell's (default 0, in a scene START_J).
+            Otherwise it is the energy budget of the devices; None is no budget.
+        limiter: False to clip forces. By default the limiter that the coupling's guarantee covers limits them, if
+            there is one (`meta["assessment"]["force_limits"]`).
 
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
@@ -164,7 +164,7 @@ def simulate(
         expected = "a function of one array: from positions (m,) [m] to forces (m,) [N]"
         raise TypeError(f"environment is {shown(environment)}, expected {expected}")
     if environment is not None and world:
-        raise InputError("environment= with a scenario that has environment.world: give one of them")
+        raise InputError("environment= with a scenario that has environment.world: remove one of them")
     if world and energy_budget is None:
         energy_budget = START_J
     alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # only the nominal environment runs
@@ -230,20 +230,20 @@ def validate(
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
             engine and makes one engine for each set of humans.
-        duration: Length [s] of the traces. 0 is no trace, so that growth rates are those of the period maps alone.
+        duration: Length [s] of the traces. 0 means no traces, so that all growth rates come from period maps.
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.
-        traces: Which hands MuJoCo, or your own engine, simulates beside the exact engine: "sampled" (those nearest to
-            the stability limit, the lossless ones and 64 at random), or "all".
+        traces: The hands that MuJoCo, or your own engine, also simulates: "sampled" (those nearest to the stability
+            limit, the lossless ones and 64 at random), or "all".
 
     Returns:
         Findings with n = humans. `exact` and `mujoco` (n,) are growth rates [1/s], positive where a human makes the
-        loop unstable. `radius` (n,) and `frequency` (n,) [Hz] are those of the exact loop's mode, and `disagreements`
-        (n,) those of the engines. crowds.Findings lists the other fields.
+        loop unstable. `radius` (n,) and `frequency` (n,) [Hz] describe the exact loop's dominant mode, `disagreements`
+        (n,) whether the engines disagree. crowds.Findings lists the other fields.
 
     Raises:
-        InputError: A device has Coulomb friction; verdicts are of linear loops.
+        InputError: A device has Coulomb friction, or the environment is a MuJoCo scene; verdicts are of linear loops.
         ValueError: A number is out of range.
         TypeError: An argument has the wrong type.
     """

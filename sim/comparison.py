@@ -84,7 +84,7 @@ def alternatives(
     """Run the scenario with each coupling that is possible in its loop.
 
     Scenarios with ranges get couplings for any environment only. Scenarios with walls get no optimal coupling, because
-    it contains a linear model. `also` is a user's own condition; if given, it judges every coupling, too.
+    it contains a linear model. `also` is a user's own condition, which then judges every coupling, too.
 
     Raises:
         InputError: the delays switch.
@@ -177,12 +177,15 @@ class ComparedCoupling:
     def of(
         cls, loop: Loop, name: str, chosen: Chosen, assessment: Assessment, judged: compare.Demands, hz: Array
     ) -> ComparedCoupling:
-        """Draw the curves of one coupling in `loop` at the frequencies `hz` (k,)."""
+        """Compute the curves of one coupling in `loop` at the frequencies `hz` (k,) [Hz]."""
         curves, conditions = compare.curves(loop, judged, hz), {}
         for key, requirement in judged.requirements.items():
             demand, reason = curves.demands[key], requirement.reason
             if demand is None:
-                reason = reason or f"this coupling is no V in feedback around the environment: no curve for {key}"
+                reason = (
+                    reason
+                    or f"this coupling is no V in feedback around the environment, so there is no curve for {key}"
+                )
             conditions[key] = ConditionCurve(requirement, requirement.ratio, demand, reason)
         return cls(
             name,
@@ -233,7 +236,7 @@ class Comparison:
         }
         hz = compare.grid(loop, list(judged.values()))
         short = [Path(name).name for name in chosen]
-        shown = short if len(set(short)) == len(short) else [*chosen]  # Two files of one name keep their paths.
+        shown = short if len(set(short)) == len(short) else [*chosen]  # Files with the same name keep their paths.
         couplings = [
             ComparedCoupling.of(loop, label, c, assessments[name], judged[name], hz)
             for label, (name, c) in zip(shown, chosen.items(), strict=True)

@@ -42,9 +42,17 @@ def choose(
 ) -> Chosen:
     """Return the coupling `name` of a case; by default design a spring-damper, or a moving average in a MuJoCo scene.
 
-    See design.designs.design_by_kind for `condition`, `limiter` and `progress`.
+    Args:
+        scenario: The scenario whose loop the coupling is for.
+        case: The reference delays, "none", "I" or "II".
+        name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
+        condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
+        limiter: True to require that limited forces are covered, False to ignore them; None to cover them if possible.
+        progress: Called during long searches with (task, steps done, number of steps).
 
-    Raises InputError for contradicting options, DesignFailed if no coupling was found.
+    Raises:
+        InputError: Options contradict each other.
+        DesignFailed: No coupling was found.
     """
     try:
         target, own = name_and_own(condition)
@@ -103,7 +111,7 @@ def own_of(name: str, loop: Loop) -> Chosen:
 
 
 def given(coupling: Any, kind: str = "given") -> Chosen:
-    """Return the record of a coupling, or of a design with its proofs; None is the loop without a coupling."""
+    """Return the record of a coupling, or of a design with its proofs; None means no coupling."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, limiter=proof)
@@ -148,7 +156,7 @@ def from_file(
         both loops.
     """
     claim, coupling = stored.certificate, coupling or stored.built()
-    # A condition of the user's own has to be given again.
+    # The file stores only the name of a user's own condition, so the caller must pass the condition again.
     made_for = claim.condition if claim and claim.condition in CONDITIONS else THIS_ENVIRONMENT.name
     condition = own if claim and own and claim.condition == own.name else None
     try:
@@ -209,8 +217,8 @@ def assessed(
         scenario: The scenario. A guarantee must cover all its ranges, delays, periods and force limits.
         case: The reference delays, "none", "I" or "II".
         chosen: The coupling with its proofs.
-        environment: The environment that runs instead of the scenario's (design.assessment.assess).
-        energy_budget: W0 [J] (design.assessment.assess).
+        environment: A network or function that runs in place of the scenario's environment.
+        energy_budget: W0 [J] of the shell around a function or a MuJoCo scene, otherwise of the devices' energy budget.
         limiter: False to clip forces.
         seed: Seed of the environments that are drawn from inside ranges.
         band_hz: Frequency band [Hz] of the mismatch.
@@ -236,7 +244,7 @@ def assessed(
     )
     plugged = shelled(environment or scenario.environment)
     if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.axis_devices):
-        return assessment.without_guarantee("the devices have encoder steps, and the account needs exact positions")
+        return assessment.without_guarantee("the devices have encoder steps, and the shell requires exact positions")
     budgeted = energy_budget is not None and not plugged
     if scenario.loses_packets and assessment.guarantee and not budgeted:
         return assessment.without_guarantee("a lost packet makes a force older than the range of delays")

@@ -83,7 +83,7 @@ class HeldDevices:
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Return the growth (n,) [1/s] of the dominant mode with every human, and of the dominant mode that is fast.
+        """Return the growth (n,) [1/s] of the dominant mode, and of the dominant fast mode, with every human.
 
         A fast mode has at least `min_frequency_hz`. Humans for which `humans` (n,) is false are skipped; their growth
         is -inf.
@@ -135,14 +135,14 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating. The loop starts in the mode of that human, with an amplitude at
-# which Coulomb friction does not hold it. The hand presses with a force that starts smoothly and then stays constant.
-# The second half of the trace gives the verdict.
+# whose exact linear loop is nearest to oscillating. The loop starts in the mode of that human, with an amplitude that
+# overcomes Coulomb friction. The hand presses with a force that starts smoothly and then stays constant. The second
+# half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
-_EASE = 0.5  # [s] in which the press grows
+_EASE = 0.5  # [s] in which the hand's force grows to its constant value
 _START = 1e-3  # [m] displacement of the motor or handle that moves most, at the start
 _BLOCK = 64  # ticks in one block
 DECIDED = 0.2  # [1/s] a linear growth rate nearer to zero cannot be seen within a trace
@@ -150,7 +150,7 @@ UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear 
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
-    """Return the devices with motors that never clip: a map shows the loop below its force limits."""
+    """Return the devices with motors that never clip, because a map shows the loop below its force limits."""
     return tuple(msgspec.structs.replace(device, force_limit=_UNLIMITED) for device in devices)
 
 
@@ -188,7 +188,7 @@ class Points:
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """(k,) whether the linear loop grows or decays too slowly to be told from a limit cycle."""
+        """(k,) whether the linear loop grows or decays too slowly to be distinguished from a limit cycle."""
         return np.abs(self.growth) <= DECIDED
 
     @property

@@ -23,7 +23,7 @@ from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 
-#: in the order of drawing: a broken line lies on a solid one, so that both are seen where they coincide
+#: in the order of drawing; broken lines are drawn over solid ones, so that both are visible where they coincide
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
@@ -91,7 +91,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
 
 
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
-    """Return the contact springs of the coupling's own environment, where they lie on the map."""
+    """Draw the contact springs of the coupling's own environment that lie on the map, and return the legend's entry."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
     shown = [(s.B, s.K) for s in report.fixed.contact_springs] if report.fixed else []
     for b, k in shown:

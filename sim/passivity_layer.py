@@ -1,10 +1,10 @@
-"""Passivity layers under a simulated controller: the energy budget, and the shell around a user's own environment.
+"""Passivity layers of a simulated controller: the energy budget, and the shell around a user's own environment.
 
     traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-With a net, a tick's block does not contain Theta. The forces of G = (I + Psi E V)^-1 Psi E go through the net, then
-through a delay line, for constant and for varying delays. The budget stands before the line and sees forces within the
-actuators' limits.
+A net is such a layer. With a net, a tick's block does not contain the delays Theta. The forces of
+G = (I + Psi E V)^-1 Psi E go through the net, then through a delay line, for constant and for varying delays. The
+budget acts before the delay line, on forces within the actuators' limits.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class EnergyNet:
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
-        packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # least dissipation delta |dx|^2 / T
+        # A device dissipates at least delta |dx|^2 / T in a tick, which is smallest for the longest T.
+        packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T
         settings: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         try:
             budget = EnergyBudget(
@@ -94,25 +95,25 @@ class Wanted(Protocol):
     """The settings of a net: EnergyNet, Plugged, or a class of your own."""
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh net for one record of `nsim` runs."""
+        """Return a new net for `nsim` runs that are simulated together."""
         ...
 
 
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
-    """Return the same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
+    """Return the loop with a net between controller and devices, for runs of up to `ticks` (default: the scenario's).
 
-    For linear analyses, such as certificates and modes, use the simulation without a net. Varying delays stay those of
-    the simulation. Raises InputError for numbers that no budget can have.
+    For linear analyses, such as certificates and modes, use the simulation without a net. The delays of the simulation
+    do not change. Raises InputError for latencies and for numbers that no budget can have.
     """
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:
-        raise InputError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
+        raise InputError("latency: an energy account assumes forces that latch at ticks; add a sample to theta instead")
     if process.delays is None:
         samples = scenario.samples if ticks is None else ticks
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
         process = replace(process, delays=constant)
     make = partial(wanted.net, simulation, process)
-    make(1)  # raises for impossible numbers before anything runs
+    make(1)  # raises InputError for impossible numbers before anything runs
     return replace(simulation, process=replace(process, net=make))
 
 
@@ -136,7 +137,7 @@ def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: Bu
 
 
 class _InLoop:
-    """Base of the nets: it limits forces as the actuators do, and measures how far the devices moved in a tick."""
+    """Base class of nets; limits forces as the actuators do, and measures how far the devices moved in a tick."""
 
     def __init__(self, process: Process) -> None:
         self._within = process.applied
@@ -149,7 +150,7 @@ class _InLoop:
 
 
 class _Budgeted(_InLoop):
-    """An energy budget, and devices behind it that drop a force that is too old."""
+    """An energy budget, followed by devices that drop a force that is too old."""
 
     def __init__(
         self, budget: EnergyBudget, guarantee: str | None, process: Process, late: Ticks | None, oldest: Array

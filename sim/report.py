@@ -37,11 +37,11 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class EncoderSteps:
-    """Whether declared Coulomb friction is enough: the work that encoder steps can do must be dissipated."""
+    """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound
-    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which are reported only
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
     friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, where nothing is proved
     covered: bool
     words: str
@@ -57,7 +57,7 @@ class EncoderSteps:
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which are reported only.
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing.
         """
         if not any(steps):
             return None
@@ -65,7 +65,7 @@ class EncoderSteps:
         published = tuple(friction_max or [None] * len(steps))
         values = tuple(steps), tuple(friction), published
         if loop.environment.walls:
-            return cls(*values, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
+            return cls(*values, None, False, f"encoder steps of {widths} um: with walls no friction is proved enough")
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
@@ -145,13 +145,13 @@ def _printed_gains(scenario: Scenario, case: str, coupling: Coupling) -> tuple[P
         "damping that the printed gains need [N s/m]",
         f"at most {listed(scenario.delta, 5)}",
         f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
-        "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
+        "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); corrected, it refuses these gains",
     )
     return gains, damping
 
 
 def _tau(case: str) -> PaperRow:
-    why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
+    why = "inf sigma_min(E) = 0: moving both contacts together takes no static force"
     return PaperRow("transparency index tau (25)", f"{_PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
@@ -167,7 +167,7 @@ def _figure(case: str, stability: Stability) -> PaperRow:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Varying delays: ages, growth, and the cover of certificates.
+# Varying delays: ages of forces, growth, and whether certificates cover them.
 
 
 @dataclass(frozen=True)
@@ -207,14 +207,14 @@ class _PeriodGrowth:
 
 @dataclass(frozen=True)
 class _DelaysMet:
-    """The delays that a run met, and the growth of its linear loop under them."""
+    """The delays that occurred in a run, and the growth of its linear loop under them."""
 
     age: _Age | None  # None where no force arrives
     lost_packets: list[int]
     held_ticks: list[int]
     growth_rate_per_s: float
     verdict: str | None  # None where the rate is too small for the time
-    judged_s: float
+    judged_s: float  # duration of the trace that gave the growth
     period: _PeriodGrowth | None
 
     @classmethod
@@ -238,7 +238,7 @@ class _DelaysMet:
 
     @property
     def worst(self) -> _DelaysMet | _PeriodGrowth:
-        """The record that holds the decisive growth: the worst switching if it was searched, else the run's delays."""
+        """The record with the decisive growth: the worst switching if it was searched, else the run's delays."""
         return self.period or self
 
     @property
@@ -302,7 +302,7 @@ class UnevenTicks:
 
 
 def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
-    """Return the verdict on a run with switching delays, whose eigenvalues exist only over a period of switching."""
+    """Return the verdict on a run with switching delays, for which one tick's eigenvalues decide nothing."""
     met = delays.met
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))

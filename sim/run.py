@@ -1,4 +1,4 @@
-"""Runs: the computer's side and the plant of a scenario, closed tick by tick.
+"""Runs: the loop of a scenario's controller and plant, closed tick by tick.
 
     trace = run(assemble(scenario, coupling), "mujoco")
 
@@ -86,7 +86,7 @@ class Simulation:
 
     @cached_property
     def loop(self) -> Loop:
-        """The loop as designs see it. Its reference delays are those of case I, and do not matter here."""
+        """The loop as designs see it, with the reference delays of case I, which a run does not use."""
         return self.scenario.loop("I")
 
     @cached_property
@@ -233,7 +233,7 @@ def _finite_ticks(buffer: StepBuffer, count: int) -> int:
 
 
 def _columns(rows: Array, which: tuple[int, ...]) -> Array:
-    """Return these columns, as a view if they are adjacent."""
+    """Return the columns `which`, as a view if they are adjacent."""
     together = slice(which[0], which[-1] + 1)
     return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
@@ -276,7 +276,7 @@ def run_blocks(
 ) -> None:
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), block by block.
 
-    After each block `each_block` is called; it returns True to stop. Row 0 of the buffer is the block's first tick. The
+    `each_block` is called after each block and returns True to stop. Row 0 of the buffer is the block's first tick. The
     default block is small enough for the processor's cache.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
@@ -302,7 +302,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     first = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
-        engine.run_block(ticks)  # the linear law, whose forces are checked afterwards
+        engine.run_block(ticks)  # runs the law without limits; `linear_until` then checks its forces
         first = buffer.linear_until(ticks)
         if first == ticks:
             return
@@ -310,7 +310,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
         buffer.calm = False
     tick, advance = buffer.tick, engine.advance
     for k in range(first, ticks):
-        tick(k)  # sample x, compute f and z+, limit f
+        tick(k)  # sample x, compute f and the next z, limit f
         advance(k)  # hold -f on the actuators for T, move the plant
 
 
@@ -361,7 +361,7 @@ def make_engine(
 
     The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
     as it is; a user's class or function is called with the simulation. Raises ValueError for an unknown name, an object
-    that is no engine, the exact engine with Coulomb friction, and a user's own engine with uneven ticks.
+    that is no engine, the exact engine with Coulomb friction, or a user's own engine with uneven ticks.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)
@@ -395,5 +395,5 @@ def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], 
         expected = "expected an object with start(buffer), advance(k) and troubled() (sim.engines.Engine)"
         raise InputError(f"{name} has no {' and no '.join(lacking)}: {expected}")
     if simulation.timing and not type(own_engine).__module__.startswith("haptic_loop."):
-        raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
+        raise InputError(f"{name}: only these engines simulate period and latency: {' and '.join(ENGINES)}")
     return own_engine

@@ -57,7 +57,7 @@ class Ran:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """The result of a run; absent parts are null."""
+    """The result of a run; missing parts are null."""
 
     case: str
     scenario: str
@@ -74,7 +74,7 @@ class RunReport:
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
     robustness: Robustness | None = off_table(default=None)
-    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the figures that the paper prints
+    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the paper's figures with ours
     remarks: tuple[str, ...]
 
     @property
@@ -123,7 +123,7 @@ def run_report(
     environment: str,
     check: bool,
 ) -> RunReport:
-    """Report a run in the environment of this name; `check` repeats the run with another integrator."""
+    """Return the report of a run; `environment` is a name, and `check` repeats the run with another integrator."""
     simulation, trace, loop, requirements = run.simulation, run.trace, scenario.loop(case), assessment.requirements
     delays, grows = None, None
     if simulation.scenario.varying_delay:

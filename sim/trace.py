@@ -1,12 +1,12 @@
 """The trace of a run, its files, and oscillations in its displacements.
 
-Oscillations are judged by displacements alone, because the states of a bridge, of a stored trace and of a nonlinear
-loop are unknown. The slow motion is subtracted, and the rest is split into octaves.
+Oscillations are judged by displacements alone, because a session on a device, a stored trace and a nonlinear loop have
+no known states. The slow motion is subtracted, and the rest is split into octaves.
 
 oscillation   Does an oscillation last in the second half of a trace? The half is cut into two windows. The oscillation
               lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
-              times that in the first. Octaves are judged apart, so that a slow mode that decays does not hide a fast
-              one that grows.
+              times that in the first. Octaves are judged separately, so that a slow mode that decays does not hide a
+              fast one that grows.
 growth        How fast does an oscillation grow? If it grows like exp(g t), the amplitude grows by exp(g hop) from one
               window to the next, and g is the slope of a line through the logarithms. The slope describes a motion and
               is no verdict on a loop: the motion of a person who shakes the handle harder and harder grows, too.
@@ -33,13 +33,13 @@ from haptic_loop.controller.tick import Net, at_limit
 from haptic_loop.controller.units import in_unit, with_unit
 from haptic_loop.design.files import InputError, read_arrays, write
 
-_MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # number of axes of the arrays in a file
+_MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # array in a file -> number of dimensions
 _STATES = {"z": 2, "s": 2}
 _UNITS = {"x": "m", "f": "N", "x_handle": "m", "v_handle": "m/s"}
 
 
 def _real(name: str, values: NDArray[Any]) -> Array:
-    """Raise ValueError for an array that holds anything but real numbers."""
+    """Return an array of real numbers. Raises ValueError for any other array."""
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} is of type {values.dtype}, expected real numbers")
     return values
@@ -69,7 +69,7 @@ class Trace(ReadOnly):
         s: (N, 2 n) states of the plant: positions [m], then velocities [m/s].
         diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
         interrupted: Whether the run was stopped from the keyboard.
-        net: The passivity layer under the controller in its final state; None without one.
+        net: The passivity layer between controller and devices, in its final state; None without one.
         names: (m,) names of the channels if devices have several axes; empty if channels are numbered.
     """
 
@@ -109,11 +109,11 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether any force was at its limit, (m,) [N]; `balls` are channels with a limit on the length."""
+        """Return (N,) whether a force reached `force_limit` (m,) [N]; `balls` are channels with a limited length."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
-        """Return the number of ticks before the first clipped one, or of all ticks."""
+        """Return the number of ticks before the first clipped one; without a clipped tick, the number of all ticks."""
         clipped = self.clipped(force_limit, balls)
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
@@ -204,7 +204,7 @@ class Trace(ReadOnly):
 
     @property
     def _channels(self) -> list[str]:
-        """The suffix of a quantity in a header, for each channel: its name, or its number."""
+        """The suffix of each channel in a header: its name, or its number."""
         return [f" {name}" for name in self.names] or [str(i) for i in range(1, self.x.shape[1] + 1)]
 
     def save_csv(self, path: Path) -> Path:
@@ -295,7 +295,7 @@ _LEAST_SAMPLES = 10  # least number of samples in a window
 _WINDOWS = 7  # least number of windows, each of which overlaps the next by half
 _NEEDED = 4  # consecutive windows in which an oscillation must be seen
 _SHORTEST = 200  # ticks that a growth rate needs
-_FLOOR = 3.0  # an oscillation exceeds this multiple of the encoders' rounding in its octave
+_FLOOR = 3.0  # an oscillation must exceed this multiple of the encoders' rounding in its octave
 _CLEAR = 4.0  # standard errors by which a slope must differ from zero, because a line may have only four points
 _FARTHEST = 1e100  # [m] the square of a larger number may overflow
 _EVEN = 1e-3  # periods may differ by this share; rounding of long times is smaller
@@ -415,7 +415,7 @@ def growths(trace: Trace) -> list[Growth]:
     except (TypeError, ValueError, OverflowError):
         raise InputError("the trace's run.steady_ticks or run.encoder_step_m are no numbers for its channels") from None
     if np.any(ends[:, 0] < 0) or np.any(ends[:, 1] > n) or np.any(ends[:, 0] > ends[:, 1]):
-        raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, it has {n} ticks")
+        raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, but it has {n} ticks")
     if not all(np.isfinite(values).all() for values in (trace.t, trace.x, steps)):
         raise InputError("the trace has times, displacements or encoder steps that are not finite")
     if not m or np.abs(trace.x).max(initial=0.0) > _FARTHEST:

@@ -29,7 +29,7 @@ class Unstable:
 
     exact: int
     mujoco: int | None
-    own: int | None = off_table("if given", None)  # of an engine of the user's own
+    own: int | None = off_table("if given", None)  # by a user's own engine
     others: str = off_table("left out", "")
 
     @classmethod
@@ -148,7 +148,7 @@ class Traces:
     humans: int
     clipped_runs: int
     contacts: int
-    measured: int
+    measured: int  # traces with a growth rate
     witnessed: int  # traces that MuJoCo, or a user's own engine, also made
     undecided: int  # traces that are too short for the sign of their rate; eigenvalues decide there
     largest_difference_per_s: float | None
@@ -197,7 +197,7 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Test of W >= 0 on traces; traces with clipped forces are left out, those with a limiter are tested."""
+    """Test that the energy W(N) >= 0 on traces; traces with clipped forces are left out, unless a limiter clips."""
 
     audited: int
     clipped: int

@@ -1,4 +1,4 @@
-"""The report of a Z-width map, and its CSV file with a line for every cell."""
+"""The report of a Z-width map, and its CSV file with one line per cell."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class _Simulated:
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The report of a map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
+    """The report of a map. Rows are stiffnesses; null means infinite, or not reached before an interruption."""
 
     rigid: bool
     scenario: str | None
@@ -253,7 +253,7 @@ def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
     parts = [f"null at {unreached.sum()} cells: {_NOT_REACHED}"] if unreached.any() else []
     if infinite.size:
         first = infinite[0]
-        why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the required damping is infinite"
         at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
         parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
     return "; ".join(parts) or None

@@ -143,5 +143,5 @@ def test_uneven_periods_cannot_exceed_the_budget():
 
 
 def test_a_net_counts_forces_that_latch_at_ticks():
-    with pytest.raises(ValueError, match="a net counts forces that latch at ticks"):
+    with pytest.raises(ValueError, match="an energy account assumes forces that latch at ticks"):
         netted(assemble(SHORT.replace(latency=((0.0, 1e-4),) * 2), NoCoupling()), NoCoupling(), EnergyNet(0.0))

@@ -455,7 +455,7 @@ def test_own_engines_judge_every_hand(delays):
 
 def test_own_engines_need_even_ticks():
     question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
-    with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
+    with pytest.raises(InputError, match=r"OwnEngine: only these engines simulate period and latency: mujoco"):
         examine_module._examine(question, range(2))
 
 
