@@ -275,7 +275,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:
     """Return whether the certificate belongs to exactly this loop and coupling and holds.
 
-    It is verified unless this process has proved it before. `condition` is the user's own condition, if it is of one.
+    It is verified unless this process has proved it before. `condition` is needed for a user's own condition.
     """
     if certificate.scenario != digest(loop, coupling.form()):
         return False

@@ -7,8 +7,8 @@ as free + s gain, where s multiplies the damping Delta_D that the devices guaran
 
 A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
 states whether periods vary and forces have a latency. A `Fact` is a wall, delays that switch, or the limiter. `compose`
-stacks their inputs and adds their forms, as design.facts describes. design.environments searches the multipliers of all
-conditions, and design.certificate has one exact proof and one file format.
+stacks their inputs and adds their forms, as design.facts describes. design.environments searches for the multipliers of
+all conditions, and design.certificate has one exact proof and one file format.
 
 To add a hands' side, derive a class from `HandsSide` and state
   `inputs`   one `Input` per scalar input. Its `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
@@ -21,7 +21,7 @@ To add a hands' side, derive a class from `HandsSide` and state
 Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
 adds walls, limiter and switching without further code.
 
-any-environment is Lemma 4 of the paper for any passive environment under backward Euler (`_v_hat`,
+any-environment applies Lemma 4 of the paper to any passive environment under backward Euler (`_v_hat`,
 `any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
 """
 
@@ -241,8 +241,8 @@ FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 class Condition(ABC):
     """A block that must be strictly positive real. A user's own condition needs a name and `demand`.
 
-    `design.certificate` proves and verifies the block like that of every condition. Its author claims that it keeps a
-    loop safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
+    `design.certificate` proves and verifies the block like that of every condition. The author claims that the
+    block keeps a loop safe. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
     """
 
     name: str  # name in requirements, certificates and reports

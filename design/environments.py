@@ -105,7 +105,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block`, affine in s and all unknowns, for a multiplier in which those of `hands` are times s."""
+        """Return `block` for a multiplier whose values for `hands` are times s; it is affine in s and all values."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -203,7 +203,7 @@ class _Search:
         self._searched = np.flatnonzero(self._units)
         bounds = [(each.least, each.most) for each in unknowns for _ in each.units]
         self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
-        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last values and result of `swept`
+        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last arguments and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.zeros(system.outputs) if demand.spare is None else demand.spare)
         self._plain: list[Demand[Lti]] = []  # the block for zero multipliers, then for each unknown alone
@@ -218,7 +218,7 @@ class _Search:
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio over all multipliers, best multiplier), starting with these values."""
+        """Return (lower bound of the ratio over all multipliers, best multiplier found), starting with these values."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
@@ -587,7 +587,7 @@ def least_multiplier(loop: Loop) -> Array:
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
         return max(each, 0.0) * delta
-    # The matrix of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
+    # The Phi of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
     # halfway between its least possible value and Delta_D.
     return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
 
@@ -632,7 +632,7 @@ class _AnyEnvironment(Multiplied):
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         V = coupling.compliance(loop.period(exact))
-        assert V is not None  # `required` refuses None
+        assert V is not None  # `required` refuses a coupling without V.
         if exact:
             budgets.require_size(V.order + sum(loop.delays.hi))
         return V

@@ -44,7 +44,7 @@ class Demand(Generic[Block]):
     gain: Block
     static: Mapping[str, Array] = field(default_factory=dict)
     semidefinite: tuple[str, ...] = ()
-    spare: Array | None = None  # (n,) margin of the diagonal in a search for multipliers
+    spare: Array | None = None  # (n,) margin that a search for multipliers subtracts from the diagonal of `free`
 
     def __post_init__(self) -> None:
         for name, part in (("free", self.free), ("gain", self.gain)):
@@ -107,7 +107,7 @@ class Input:
     channel: int
     moved: Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
     follows: int = 1  # 1 for a displacement, to which the environment responds; 0 for a speed
-    slips: bool = True  # whether the limiter's slip is subtracted from the input
+    slips: bool = True  # whether the limiter's slip, if there is one, is subtracted from the input
 
 
 class Collected(Generic[Block]):
@@ -142,7 +142,7 @@ class Collected(Generic[Block]):
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:
-        """Add the limiter's slip, one more input per channel, to the displacements of inputs with `slips`."""
+        """Add the limiter's slip, one more input per channel; inputs with `slips` become displacements less slip."""
         for i in self.hands:
             if i.slips:
                 self.input("de", i.channel)
@@ -828,7 +828,7 @@ def compose_any(
 ) -> Demand[Block]:
     """Return the block of a hands' side for any passive object behind the coupling V, without delay psi.
 
-    The inputs are those of the hands' side and the facts, followed by df_e, the steps of the sent forces. The row of
+    The inputs are those of the hands' side and the facts, followed by df_e, the steps of the sent forces. The block of
     df_e is V(1)/2 - (V - V(1))/(z-1). The multipliers `values` are not checked.
     """
     values, hands, T = values or {}, hands or hands_side(loop), V.T

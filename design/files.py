@@ -152,7 +152,7 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
         if ledger := _ledger.get():
             places = _places(path)
             if option := _met(places, ledger.named):
-                raise InputError(f"{named}: is also the file of {option}; name another file for {option}")
+                raise InputError(f"{named}: is also the file of {option}; give that option another file")
             ledger.read |= dict.fromkeys(places, named)
         file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  closed below
     except OSError as error:

@@ -27,7 +27,7 @@ PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDIT
 
 
 #: the environments for which this-environment holds in a loop with walls, in words
-MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
+MAKING = "this environment, whose walls may make and break contact, have any gap, and be softer in proportion"
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 AT_VERTICES = "these ranges: proved at the vertices, searched between them"  # RANGES in words
