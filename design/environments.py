@@ -660,10 +660,10 @@ class _AnyEnvironment(Multiplied):
 
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
-            return "with delay in the environment the condition does not cover walls"
+            return "with delay in the environment the condition covers no walls"
         if _in_frame(loop) and any(loop.psi):
             obstacle = "latency" if loop.latency else "delays that switch"
-            return f"with delay in the environment the condition does not cover {obstacle}"
+            return f"with delay in the environment the condition covers no {obstacle}"
         return None if any(loop.psi) else loop.environment.active(loop.T)
 
     def not_varied(self, loop: Loop) -> str | None:

@@ -283,7 +283,7 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     command has read it, or has already written it and an option names it.
     """
     if "\0" in str(path):
-        raise InputError(f"cannot write {str(path)!r}: a file name must not contain a null byte")
+        raise InputError(f"cannot write {str(path)!r}: a file name may contain no null byte")
     try:
         place = _target(path)
         if place.exists() and not place.is_file():

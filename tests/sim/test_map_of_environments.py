@@ -90,7 +90,7 @@ def test_the_model_of_a_pair_may_stay_behind():
     assert behind == pytest.approx(densely(sweep, kept, 300.0, 0.5), rel=1e-5)
     assert behind != pytest.approx(this, rel=1e-4)
     assert np.isinf(any_)
-    assert "knows none" in sweep.refusals["any-environment"]
+    assert "only couplings without one" in sweep.refusals["any-environment"]
 
 
 def test_bare_walls_match_colgates_condition():
