@@ -1,1 +1,1 @@
-"""The running loop in a window or as a film: `stage` shows what `session` computes from keys, scripts and mouse."""
+"""The running loop in a window or a film: `session` runs it under keys, scripts and mouse, `stage` draws it."""

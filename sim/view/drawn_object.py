@@ -1,7 +1,7 @@
-"""The virtual object in pictures: its masses, springs and walls, and the places of its nodes at each tick.
+"""The virtual object in pictures: its masses, springs and walls, and the positions of its nodes at each tick.
 
-The displacements of the nodes are computed beside the loop and change nothing in it. They are additional outputs of the
-equations that compute the forces of a tick before Theta.
+The displacements of the nodes are computed in addition to the loop and do not affect it. They are further outputs of
+the equations that give the forces of a tick before the delays Theta.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from haptic_loop.sim.run import Simulation
 if TYPE_CHECKING:  # --help does not load MuJoCo
     import mujoco
 
-_FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03  # [m] handles to contacts, between columns, above the floor
+# Distances [m] from handles to contacts, between columns of nodes, and from the floor to the object.
+_FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03
 _RADIUS = {"contact": 0.012, "node": 0.008, "mass": 0.02}  # [m]; a mass is a cube
 SPRING = 0.002  # [m] radius
 _WALL = (0.03, 0.03, 0.002)  # [m] half the sides of a wall; the last is along its normal
@@ -51,7 +52,7 @@ class _Shape(NamedTuple):
 
     @property
     def size(self) -> tuple[float, ...]:
-        """Half the sides of a box, or the radius of a sphere three times [m]; meaningless for a spring."""
+        """Half the sides of a box [m], or the radius of a sphere [m] in each entry; unused for springs."""
         return _WALL if self.kind == "wall" else (_RADIUS[self.kind],) * 3
 
     @property
@@ -67,7 +68,7 @@ class _Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnObject:
-    """A network of springs with a place for each of its points, left of the devices."""
+    """A network with a position for each of its points, left of the devices."""
 
     network: Network
     rest: dict[str, Array]  # (3,) [m] of each point at rest
@@ -75,7 +76,7 @@ class DrawnObject:
 
     @classmethod
     def of(cls, network: Network) -> DrawnObject:
-        """Place contacts before their devices, and every other point a column behind its nearest neighbours."""
+        """Place contacts beside devices, and other points one column behind their neighbours nearest to a contact."""
         points = tuple(network.points) or tuple(network.nodes())
         nodes = set(network.contacts)
         contacts = tuple(name for name in points if nodes & set(network.coordinates(name)))
@@ -98,11 +99,11 @@ class DrawnObject:
         return _FIRST + _COLUMN - min(0.0, *(float(at[0]) + _FIRST for at in self.rest.values()))
 
     def motion(self, coupling: Coupling, psi: Sequence[int], T: float) -> _Motion:
-        """Return the displacements of the nodes, tick by tick."""
+        """Return an object that computes the nodes' displacements tick by tick, behind `coupling`."""
         return _Motion(self.network, coupling, psi, T)
 
     def shapes(self, displacements: Array | None = None) -> Iterator[_Shape]:
-        """Yield the shapes for displacements (nodes,) [m] of the nodes; None is at rest."""
+        """Yield the shapes for displacements (nodes,) [m] of the nodes; None means at rest."""
         moved = {name: np.zeros(3) for name in self.rest}
         if displacements is not None:
             q = dict(zip(self.network.nodes(), displacements, strict=True))
@@ -167,7 +168,7 @@ class _Motion:
 
 
 def object_of(simulation: Simulation) -> DrawnObject | None:
-    """Return the object of a loop; None for a MuJoCo world and for environments that are no network."""
+    """Return the virtual object of a loop; None for a MuJoCo world and for environments that are no network."""
     environment = simulation.scenario.environment
     return DrawnObject.of(environment) if isinstance(environment, Network) and not environment.world else None
 
@@ -177,7 +178,7 @@ def object_of(simulation: Simulation) -> DrawnObject | None:
 
 
 def scene_xml(simulation: Simulation) -> str:
-    """Return the MJCF of the devices with the object beside them; the object is at rest and collides with nothing."""
+    """Return the MJCF of the devices with the object at rest beside them; the object collides with nothing."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(simulation.scene.xml)
@@ -197,7 +198,7 @@ def scene_xml(simulation: Simulation) -> str:
 
 
 def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
-    """Add the geoms of a MuJoCo scene in its first pose, left of the devices; meshes and soft bodies are left out."""
+    """Add the geoms of a MuJoCo scene in its initial pose, left of the devices; meshes and soft bodies are left out."""
     import mujoco
 
     with quiet_warnings():

@@ -1,4 +1,4 @@
-"""The running loop behind the window, without a display: it turns keys, scripts, mouse and clock into frames.
+"""The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
 When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities. The new process
 starts at the equilibrium for these positions, z = A z + B x. Its delay lines hold the force F(1) x, so that no step in
@@ -6,8 +6,8 @@ x occurs. The force changes to that of the new coupling, and the motion of the e
 
 The mouse is a hand: a spring and a damper between the handle and the dragged point. It is part of the exact plant and
 passive, so a certificate for every passive human covers it. Only the end of the spring moves with the mouse, as in a
-voluntary motion. A force that is computed once per picture would not be passive: it comes too late, and may destabilise
-a certified loop.
+voluntary motion. A force that is computed once per picture would not be passive, because it comes too late, and could
+destabilise a certified loop.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ _STRONGEST = 100.0  # [N] largest push
 
 @dataclass(frozen=True)
 class Couple:
-    """Another coupling, made for the present delays."""
+    """A change to another coupling, which is chosen for the present delays."""
 
     name: str  # one of COUPLINGS, or GIVEN
 
 
 @dataclass(frozen=True)
 class _Delay:
-    """More or fewer samples of delay on every channel; the coupling stays as it is."""
+    """A change of the delay by a number of samples on every channel; the coupling stays the same."""
 
     which: str  # theta or psi
     samples: int
@@ -67,7 +67,7 @@ class _Delay:
 
 @dataclass(frozen=True)
 class _Push:
-    """A force on a handle, until the next push."""
+    """A constant force on a handle until the next push."""
 
     channel: int  # counted from 1
     force: float  # [N]
@@ -96,9 +96,9 @@ KEYS: dict[int, tuple[str, _Event]] = {
 
 
 def keys_help(with_file: bool) -> list[tuple[str, str]]:
-    """Return the keys and their actions, then those of the mouse; `with_file` adds the coupling from a file."""
+    """Return the actions of keys and of the mouse; `with_file` adds the key for the coupling from a file."""
     keys = [(name, words(event)) for name, event in KEYS.values() if with_file or event != Couple(GIVEN)]
-    return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
+    return [*keys, ("double click", "take a body"), ("Ctrl+right", "pull it")]
 
 
 Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
@@ -156,15 +156,15 @@ def _number(text: str) -> float:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A loop that is prepared while another one runs, with its growth rate and certificates.
+# A loop that is prepared while another one runs, with its growth rate and assessment.
 
 
 @dataclass(frozen=True)
 class Menu:
-    """The settings by which keys and scripts choose couplings."""
+    """The settings with which keys and scripts choose couplings."""
 
     case: str
-    condition: str | Condition | None = None  # of designs; None is the default of the kind
+    condition: str | Condition | None = None  # of designs; None for the default of the kind
     given: str | None = None  # the file of --coupling
     limiter: bool | None = None  # False: forces are clipped
 
@@ -195,7 +195,7 @@ def first_loop(menu: Menu, scenario: Scenario, label: str) -> PreparedLoop:
 
 
 def _changed(prepared: PreparedLoop, event: Couple | _Delay) -> PreparedLoop:
-    """Return the loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
+    """Return the loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop stays valid."""
     if isinstance(event, Couple):
         chosen = _choose(prepared.menu, prepared.scenario, event.name)
         return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
@@ -239,7 +239,7 @@ _STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as in t
 
 @dataclass
 class _Pace:
-    """The number of ticks of T seconds that are due on a clock that began at 0."""
+    """Counts the ticks of T seconds that are due on a clock that began at 0."""
 
     T: float  # [s]
     patience: float = LONGEST_LAG  # [s]
@@ -267,9 +267,9 @@ class _Pace:
 
 @dataclass(frozen=True)
 class Grip:
-    """The device that the mouse holds, and the point to which it draws the handle."""
+    """The device that the mouse holds, and the point to which the mouse pulls the handle."""
 
-    channel: int  # the first one of the device, counted from 0
+    channel: int  # first channel of the device, counted from 0
     target: tuple[float, ...]  # [m] displacement of the handle on each axis of the device
 
     @property
@@ -288,7 +288,7 @@ class Grip:
 
 
 def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
-    """Return the plant with the spring and damper of the mouse's hand on a handle; their far end rests."""
+    """Return the plant with the spring and damper of the mouse's hand on a handle; their other end is fixed."""
     free, n = scene.plant, scene.model.nq
     A = free.A.copy()
     for channel in channels:
@@ -454,7 +454,7 @@ class LiveLoop:
         self._tick += count
         if not (np.isfinite(buffer.s[: count + 1]).all() and np.isfinite(buffer.z[: count + 1]).all()):
             self._happen(_Restart())
-            self._note = "the process itself ran away, beyond all numbers: restarted from rest"
+            self._note = "the loop diverged until numbers overflowed: restarted from rest"
             return
         f = buffer.f[:count, :, 0]
         limits = buffer.process.force_limit, buffer.process.balls
@@ -502,7 +502,7 @@ class LiveLoop:
             self._start_engine()
 
     def _start_engine(self) -> None:
-        """Start the engine of the plant, with the mouse's hand if there is one, on the present buffer."""
+        """Start an engine on the present buffer, for the plant with the mouse's hand if there is one."""
         simulation, held = self.prepared.simulation, self._grip
         plant = _gripped(simulation.scene, held.channels, simulation.scenario.T) if held else simulation.plant
         self._engine = ExactEngine(plant)
@@ -510,7 +510,7 @@ class LiveLoop:
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
-    """Return (tick, event, loop after it) for each event of the script; None for events that keep the loop."""
+    """Return (tick, event, loop after the event) for each event of the script; None if the event keeps the loop."""
     events = []
     for time, event in script:
         into = None

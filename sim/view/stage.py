@@ -1,8 +1,8 @@
-"""Pictures of the window and of films: places, colours, text, arrows and plots.
+"""Pictures of the window and of films: positions, colours, text, arrows and plots.
 
-The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and the mouse to it. It shows
-a copy of the scene with added shapes. The shapes have no mass and collide with nothing, so that both models have the
-same matrices. Pillow draws the pictures of a film; Pillow writes a GIF, and ffmpeg an MP4.
+The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and mouse to the session. The
+window shows a copy of the scene with added shapes. The shapes have no mass and collide with nothing, so that both
+models have the same matrices. Pillow draws the pictures of a film; Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ _LONGEST = 0.12  # [m] length of the arrow of a force at its limit
 _SIZE = (640, 640)  # pixels of a video
 _WORDS = 0.40  # share of a video's height for the text at the top
 _PLOT = 0.25  # share of the picture's height for the forces at the bottom
-_WIDTH = 60  # characters of a line of words
-_COLUMNS = 250  # spans of the plotted forces, each with its least and largest
+_WIDTH = 60  # characters in a line of text
+_COLUMNS = 250  # time spans in a plot of forces, each drawn from its least to its largest force
 
 _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
@@ -94,7 +94,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """Return the number of steps from the handle to each joint's body: 0 the handle, -1 a motor, 1.. an arm."""
+    """Return the steps from the handle to each joint's body: 0 for the handle, -1 for a motor, 1 or more for an arm."""
     place = dict.fromkeys(range(scene.channels), -1)
     for i, points in enumerate(scene.points[: _devices(scene)]):
         place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
@@ -103,7 +103,7 @@ def _places(scene: Scene) -> tuple[int, ...]:
 
 
 def _scale(history: Array, limit: Array) -> float:
-    """Return a power of two [N] above every force, and above a sixteenth of the largest limit of a force."""
+    """Return a power of two [N] above every force, at least 1 N or, if smaller, 1/16 of the largest force limit."""
     least = min(1.0, float(np.max(limit)) / 16)
     return float(2.0 ** np.ceil(np.log2(max(least, 1.05 * np.abs(history).max(initial=0.0)))))
 
@@ -170,7 +170,7 @@ def _needs(requirement: Requirement) -> str:
 
 
 def _apart(lines: _Lines) -> tuple[_Lines, _Lines]:
-    """Separate the last refusal, which may take several lines, from the other lines."""
+    """Separate the note on the last event from the other lines if it takes several lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
@@ -185,7 +185,7 @@ def _list(values: tuple[int, ...]) -> str:
 
 
 class _ShownScene:
-    """The scene of devices and object in a picture, with handles that the mouse can hold."""
+    """The picture of devices and object, with handles that the mouse can hold."""
 
     def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
         self.scene, self.force_limit, self.object = scene, force_limit, drawn
@@ -201,7 +201,7 @@ class _ShownScene:
         mujoco.mj_forward(self.model, self.data)
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return the grip of the mouse, which holds the handle of a device whichever of its bodies was clicked."""
+        """Return the grip of the mouse; a click on any body of a device grips the device's handle."""
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
@@ -248,7 +248,7 @@ class _ShownScene:
         return drawn
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
-        """Look from above at the devices, between the words and the plots."""
+        """Aim the camera from above at the devices, between the text and the plots."""
         behind = (self.object.reach - STEP) / 2 if self.object else 0.0  # [m] by which the middle moves to the object
         camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array((0.0, 0.0, 0.2))
         camera.lookat[0] -= behind
@@ -289,7 +289,7 @@ class _ShownWorld(_ShownScene):
         return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return the grip of the mouse, which holds a contact in the directions in which the contact slides."""
+        """Return the grip of the mouse on a contact, in the directions in which the contact slides."""
         held = int(perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
         if perturb.select not in self._bodies or not held:
             return None
@@ -310,7 +310,7 @@ class _ShownWorld(_ShownScene):
             _connect(drawn, _ARROW, size / 4, at, at + reach * pushes[i] @ along, (0.1, 0.1, 0.1, 1.0))
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
-        """Look from the camera of the scene, or from the front and somewhat above."""
+        """Aim like the scene's own camera, or from the front and somewhat above."""
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         if self.model.ncam:
             camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
@@ -319,7 +319,7 @@ class _ShownWorld(_ShownScene):
 
 
 def stage_for(session: LiveLoop) -> _ShownScene:
-    """Return the stage of a loop."""
+    """Return the stage that shows a session's loop."""
     simulation = session.prepared.simulation
     if session.world:
         return _ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
@@ -327,7 +327,7 @@ def stage_for(session: LiveLoop) -> _ShownScene:
 
 
 def _dressed(scene: Scene) -> mujoco.MjModel:
-    """Return the scene's model with shapes, places, colours and a camera's distance, but the same dynamics."""
+    """Return the scene's model with shapes, positions, colours and the camera's range, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
@@ -368,7 +368,7 @@ def _undress(spec: mujoco.MjSpec) -> None:
 
 
 def _figure(device: int, low: Array, high: Array, top: float, unit: PositionUnit) -> mujoco.MjvFigure:
-    """Return a figure of one device's forces (spans, axes) [N], drawn from least to largest in every span."""
+    """Return a figure of one device's least and largest forces (spans, axes) [N] in every time span."""
     figure = mujoco.MjvFigure()
     mujoco.mjv_defaultFigure(figure)
     figure.title, figure.xlabel = in_unit(f"force on device {device + 1} [N]", unit), "time [s]"
@@ -430,7 +430,7 @@ def _connect(
 _RATE = 60.0  # frames per second
 _PATIENCE = 30  # [s] for the display to answer
 
-# Without a display the viewer's thread dies and its caller waits for ever, so a separate process tries a window first.
+# Without a display the viewer's thread dies and its caller waits forever, so a separate process first opens a window.
 _PROBE = (
     "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
     "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
@@ -471,7 +471,7 @@ def show(session: LiveLoop, stage: _ShownScene, until: float | None = None) -> N
             with window.lock():
                 stage.aim(window.cam)
             _loop(session, stage, window, time.perf_counter, time.sleep, until)
-    finally:  # the viewer must have left OpenGL before Python ends
+    finally:  # The viewer's threads must release OpenGL before Python ends.
         for thread in set(threading.enumerate()) - threads:
             thread.join(_PATIENCE)
 
@@ -524,10 +524,10 @@ def _typed(session: LiveLoop) -> Callable[[int], None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Films: flat pictures, and the file.
+# Films: their pictures, and the file.
 
 _FORMATS = (".gif", ".mp4")
-_COLOURS = 48  # of a GIF: few, so that it stays small
+_COLOURS = 48  # number of colours in a GIF, which keeps the file small
 _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
 
@@ -540,11 +540,11 @@ class _FlatPictures:
         places, owners, first = _places(scene), _owners(scene), dict[int, int]()
         for joint, body in enumerate(scene.model.jnt_bodyid.tolist()):
             first.setdefault(body, joint)
-        #: number, place and device of each body, in the order of its first joint
+        #: (number, steps from the handle, device) of each body, in the order of its first joint
         self._shapes = [(body, places[joint], owners[joint]) for body, joint in first.items()]
 
     def picture(self, frame: Frame) -> Picture:
-        """Return the picture (height, width, 3) of a frame: words, bodies and forces from top to bottom."""
+        """Return the picture (height, width, 3) of a frame: text, bodies and forces from top to bottom."""
         image = Image.new("RGB", _SIZE, "white")
         pen = ImageDraw.Draw(image)
         height = _SIZE[1]
@@ -608,7 +608,7 @@ class _FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw range and mean of the force since the last frame (in space the mean only); the device feels -f."""
+        """Draw range and mean of the felt force -f since the last frame; with several axes draw the mean only."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
@@ -660,7 +660,7 @@ class _WorldPictures(_FlatPictures):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def rendered(self, frame: Frame, width: int, height: int) -> Picture:
-        """Return the pixels (height, width, 3) of scene and devices alone."""
+        """Return the pixels (height, width, 3) of scene and devices, without text and plots."""
         stage, size = self.stage, mujoco.MjrRect(0, 0, width, height)
         stage.show(frame)
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
@@ -674,7 +674,7 @@ class _WorldPictures(_FlatPictures):
         return pixels[::-1]
 
     def close(self) -> None:
-        """Free the renderer, because the next one would share its texture numbers."""
+        """Free the renderer, because the next renderer would otherwise share its texture numbers."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
@@ -698,7 +698,7 @@ def _offscreen(width: int, height: int) -> Any:
             return import_module(f"mujoco.{kind}").GLContext(width, height)
         except Exception:
             continue
-    raise InputError("--video: a scene is rendered by OpenGL, and neither EGL nor OSMesa is here (libegl1)")
+    raise InputError("--video: a MuJoCo scene requires OpenGL; install EGL (libegl1) or OSMesa")
 
 
 def _rgb(parts: _Colour) -> tuple[int, int, int]:
@@ -712,7 +712,7 @@ def check_film(path: Path) -> None:
         raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
     check_file("--video", path)
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise InputError(f"--video {path}: MP4 needs ffmpeg, which is not on the PATH; a .gif needs nothing")
+        raise InputError(f"--video {path}: MP4 requires ffmpeg, which is not on the PATH; install it or write a .gif")
 
 
 def save_film(path: Path, pictures: Iterable[Picture], fps: float) -> int:
@@ -724,7 +724,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
     images: list[Image.Image] = []
     palette: Image.Image | None = None
     for picture in pictures:
-        # One palette for all pictures avoids flicker, and unchanged pixels then need no space in the file.
+        # One palette for all pictures avoids flicker, and lets the file omit unchanged pixels.
         palette = palette or _palette(picture)
         images.append(Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE))
 
@@ -736,7 +736,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 
 def _palette(first: Picture) -> Image.Image:
-    """Return the colours of the first picture and of forces that may appear later, in light and in shade."""
+    """Return a palette for the colours of the first picture and of forces that may appear later, bright and shaded."""
     shades = [np.multiply(shade, light) for shade in (*_PALETTE, _ALARM) for light in (1.0, 0.75, 0.5)]
     strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
     later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
