@@ -1,15 +1,15 @@
 """Emulate a device: the scenario's plant under the firmware's own state machine, with faults on request.
 
-A fault of a cable, a process or a device is written KIND[=VALUE][@START[+DURATION]]. The prefix `up:` (device to host)
-or `down:` selects one direction of the line, and a prefix such as `axis2:` selects another axis than the first:
+A fault is written KIND[=VALUE][@START[+DURATION]]. The prefix `up:` (device to host) or `down:` selects one direction
+of the line, and a prefix such as `axis2:` selects another axis than the first:
 
-    drop=0.1          a tenth of all frames never arrives
-    up:flip=0.02@1+2  from 1 s after arming, for 2 s, one bit of every fiftieth STATE is wrong
+    drop=0.1          each frame is lost with probability 0.1
+    up:flip=0.02@1+2  from 1 s after arming, for 2 s, a STATE has one wrong bit with probability 0.02
     stall=0.03@1      the device freezes for 30 ms, 1 s after arming
     unplug@1          the cable is pulled, 1 s after arming
     axis2:freeze@1    encoder 2 shows the same count from 1 s after arming on
 
-Without @ a fault is there from the start. Every draw comes from a seeded generator.
+Without @ a fault acts from the start. Only faults of the line end after DURATION. All random numbers are seeded.
 """
 
 from __future__ import annotations
@@ -35,56 +35,61 @@ from haptic_loop.sim.run import outside_forces
 from haptic_loop.sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
-_BLOCK = 1000  # ticks of outside forces that are computed at once
+_BLOCK = 1000  # ticks for which outside forces are computed at once
 _SUBSTEPS = 8  # steps of the plant per tick where there is Coulomb friction
-_SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+_SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximum
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
-_ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
+_ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at full cap after which the person starts to move: the gain is at 1 by then
-_FARTHEST = 2**31 - 1  # [counts]
+_SETTLED = 203  # ticks at full cap before the person starts to move; the gain reaches 1 earlier
+_FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
-#: faults of the line: kind -> (what VALUE is, least, most, default)
+#: faults of the line: kind -> (meaning, minimum, maximum and default of VALUE)
 _LINE = {
     "flip": ("probability per frame that one bit is wrong", 0.0, 1.0, 0.01),
     "drop": ("probability per frame that it is lost", 0.0, 1.0, 0.1),
     "truncate": ("probability per frame that its end is lost", 0.0, 1.0, 0.1),
     "garbage": ("mean number of random bytes before a frame", 0.0, 1000.0, 4.0),
     "duplicate": ("probability per frame that it comes twice", 0.0, 1.0, 0.1),
-    "reorder": ("probability per frame that the one after it overtakes it", 0.0, 1.0, 0.1),
+    "reorder": ("probability per frame that the next frame overtakes it", 0.0, 1.0, 0.1),
     "delay": ("seconds by which every frame is late", 0.0, 10.0, 1e-3),
     "jitter": ("mean of an exponential extra delay in seconds", 0.0, 10.0, 1e-4),
-    "burst": ("seconds between two bursts, which bring every frame that waits", 1e-6, 1.0, 1e-3),
+    "burst": ("seconds between two bursts; each burst delivers all waiting frames", 1e-6, 1.0, 1e-3),
 }
-#: faults of the device: kind -> (what VALUE is, least, most, default)
+#: faults of the device: kind -> (meaning, minimum, maximum and default of VALUE)
 _DEVICE = {
     "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
     "unplug": ("no value", 0.0, 0.0, 0.0),
     "reset": ("no value", 0.0, 0.0, 0.0),
-    "leap": ("ticks by which its tick number leaps", 1.0, 32000.0, 300.0),
-    "stuck": ("no value: it holds its force, without a watchdog and whatever STOP says", 0.0, 0.0, 0.0),
+    "leap": ("ticks by which the device's tick number leaps", 1.0, 32000.0, 300.0),
+    "stuck": (
+        "no value: the device holds its force and ignores its watchdog and every STOP except ESTOP",
+        0.0,
+        0.0,
+        0.0,
+    ),
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
-    "cross": ("part of the force of motor 1 that motor 2 makes, too", -1.0, 1.0, 1.0),
+    "cross": ("share of motor 1's force that motor 2 adds to its own", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
-#: faults of one axis of the device: kind -> (what VALUE is, least, most, default)
+#: faults of one axis of the device: kind -> (meaning, minimum, maximum and default of VALUE)
 _AXIS = {
     "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
     "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
     "toggle": ("no value: one channel of its encoder is dead, so that it toggles between two counts", 0.0, 0.0, 0.0),
-    "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
+    "saturate": ("millimetres at which its encoder saturates", -1000.0, 1000.0, 5.0),
     "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
-    "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
+    "drift": ("metres per second by which its encoder drifts", -10.0, 10.0, 2.0),
     "late": ("ticks by which its encoder is read late", 1.0, 50.0, 2.0),
     "reverse": ("no value: its encoder counts backwards", 0.0, 0.0, 0.0),
-    "scale": ("counts that its encoder shows for one", 0.01, 100.0, 3.0),
-    "noise": ("counts of noise, root mean square, that its encoder shows", 0.0, 100.0, 0.5),
-    "motor": ("part of a force that its motor makes: 0 a dead motor, -1 a reversed one", -10.0, 10.0, 0.0),
-    "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
+    "scale": ("counts that its encoder shows per true count", 0.01, 100.0, 3.0),
+    "noise": ("counts of noise (root mean square) in its encoder", 0.0, 100.0, 0.5),
+    "motor": ("share of a force that its motor makes: 0 if dead, -1 if reversed", -10.0, 10.0, 0.0),
+    "own": ("newtons that its motor makes while armed, whatever FORCE says", -12.0, 12.0, 2.0),
 }
 KINDS = _LINE | _DEVICE | _AXIS
 _FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
@@ -92,11 +97,11 @@ _FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(
 
 @dataclass(frozen=True)
 class FaultInjection:
-    """One fault of the line, the host or a device."""
+    """One fault of the line or of a device."""
 
     kind: str
     value: float
-    where: str = "both"  # up | down | both: direction of the line; axis1 ..: of the device
+    where: str = "both"  # up | down | both: direction of the line; axis1 ..: axis of the device
     start: float | None = None  # [s] after arming; None: always
     duration: float = _FOREVER  # [s]
 
@@ -139,7 +144,7 @@ class FaultInjection:
 
 
 class Line:
-    """One direction of the link. It delivers the bytes of frames later, with the faults injected."""
+    """One direction of the link. It delays frames and injects faults."""
 
     def __init__(self, direction: str, faults: tuple[FaultInjection, ...], seed: int, latency_us: float = 0.0) -> None:
         self._faults = [u for u in faults if u.kind in _LINE and u.where in (direction, "both")]
@@ -186,7 +191,7 @@ class Line:
 
 
 class _EmulatedPlant:
-    """The devices and their passive humans between ticks, by the matrix exponential.
+    """Advance the devices and their passive humans between ticks by the matrix exponential.
 
     The person starts to move at the first tick after `begin`, and holds still while `still` is true, so that a session
     is armed at rest. With `coulomb` [N] every motor also has dry friction, which is updated eight times a tick.
@@ -216,7 +221,7 @@ class _EmulatedPlant:
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
         """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
 
-        Where a tick `begins`, its outside forces are computed; otherwise those of the last call act on.
+        If a tick `begins`, its outside forces are computed; otherwise those of the last call continue to act.
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
@@ -243,7 +248,7 @@ class _EmulatedPlant:
 def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scenario:
     """Return the scenario without hands, persons and tap.
 
-    Each handle carries a damper of `damping` [N s/m] and a `mass` [kg]; a large one clamps the handle.
+    Each handle carries a damper of `damping` [N s/m] and a `mass` [kg]; a large mass clamps the handle.
     """
     return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * len(scenario.device), person=(), tap=None)
 
@@ -281,17 +286,17 @@ class Emulator:
         self.device.deadman = True
         self.plant = _EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
         self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
-        self.armed_at: int | None = None  # [us] of the first arming: faults are timed from here
+        self.armed_at: int | None = None  # [us] time of the first arming, from which faults are timed
         self.begun_at: int | None = None  # tick at which the person began to move
         self.unplugged = False
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
-        self._motor: Array = np.ones(scenario.channels)  # part of its force that each motor makes
+        self._motor: Array = np.ones(scenario.channels)  # share of its force that each motor makes
         self._swapped, self._crossed = False, 0.0
-        # start of the tick [us], its share that is still to come, and whether none of it has passed
+        # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
-        self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
+        self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
         # by axis: function from the true count to the count that a broken encoder shows
         self._encoder: dict[int, Callable[[int], int]] = {}
         for fault in faults:
@@ -307,7 +312,7 @@ class Emulator:
         return None if self.armed_at is None else 1e-6 * (now - self.armed_at)
 
     def receive(self, data: bytes, now: int) -> None:
-        """Process bytes from the host. A device without a cable, or frozen, receives none."""
+        """Process bytes from the host. An unplugged or frozen device receives none."""
         if self.unplugged or now < self.stalled_until:
             return
         before = self.device.applied
@@ -317,7 +322,7 @@ class Emulator:
             self.applied = np.array(self.device.applied) * self.force_step * self._motor
 
     def _move(self, now: float) -> None:
-        """Advance the plant to `now` [us], within the tick."""
+        """Advance the plant to `now` [us] within the current tick."""
         period = 1e-3 * self.info.period_ns * self.stretch
         portion = min(1.0, (now - self._begun) / period)
         share = min(self._rest, max(0.0, portion - (1.0 - self._rest)))
@@ -327,7 +332,7 @@ class Emulator:
 
     def tick(self, now: int) -> bytes:
         """Begin a period: sample, latch, answer. `now` is the device's clock [us]; advance() must follow every tick."""
-        if self._rest:  # finish the tick before
+        if self._rest:  # finish the last tick
             self.plant.advance(-self.applied, self._rest, self._at_tick)
             self._rest = 0.0
         self._misbehave(now)
@@ -347,7 +352,7 @@ class Emulator:
         return b"" if self.unplugged else data
 
     def advance(self) -> None:
-        """Advance the plant by a period while the answer travels, in pieces if forces act on arrival."""
+        """Advance the plant by a period; if forces act on arrival, leave this to receive() and tick()."""
         if self.device.config is not None and not self.device.config.theta:
             self._rest, self._at_tick = 1.0, True
         else:
@@ -357,7 +362,7 @@ class Emulator:
         return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
 
     def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
-        """Return how an encoder that breaks now alters its counts."""
+        """Return the function from true counts to the counts of an encoder that breaks now."""
         step = self.info.encoder_step[fault.axis]
         now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
         match fault.kind:

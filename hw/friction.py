@@ -1,26 +1,28 @@
-"""Estimate the damping of an axis from a balance of forces, and bound it so that the bound holds on real rigs.
+"""Estimate the damping of an axis from a balance of forces, and a lower bound of this damping.
 
 Both sides of the balance are filtered by a Gaussian window h (modulating functions, Shinbrot 1957):
 
     m x'' + b x' + p x''' + r x'''' + k x + f0 + f1 t + (1 + a D^2)(g + q x'|x'|) + periodic(x) = (1 + l D + a D^2) f
 
-with D = d/dt. The fit estimates m and b. The term k x stands for a cable, a spring or gravity that changes with
-position, f0 + f1 t for a constant force and its drift. A handle (m2) behind a transmission (k12, d12) gives a = m2/k12,
-l = d12/k12, p = a b + l m, r = a m1. All of these are polynomials, since both sides were multiplied by a s^2 + l s + 1.
-A lag tau of the amplifier changes l to l - tau and a to a + tau^2/2, so the fit does not take it for negative damping.
-The fit differentiates h, never the encoder, and integrates a force held for a tick exactly. The balance is linear in
-all parameters but the a beside g, so a fit takes milliseconds, and it needs no initial state.
+with the displacement x, the motor's force f and D = d/dt. The fit estimates m and b. The term k x stands for a cable, a
+spring or gravity that changes with position, f0 + f1 t for a constant force and its drift. A motor (m1) that drives the
+handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12, p = a b + l m, r = a m1. The balance has no
+fractions, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier changes l to l - tau and a to
+a + tau^2/2, so the fit does not mistake this lag for negative damping. The fit differentiates h, never the encoder, and
+integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
+takes milliseconds. A fit needs no initial state.
 
-Dry friction g(x') is c tanh(v/v0), with a part that vanishes at speed (Stribeck), or a bristle that bends over some
-distance (Dahl). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits almost as well as
-the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term holds
-forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods are
-searched in the residual.
+Dry friction g(x') is c tanh(v/v0), with a part that vanishes at high speed (Stribeck), or a bristle that bends over
+some distance (Dahl). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits almost as well
+as the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term
+holds forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods
+are searched in the residual.
 
-For one law, the bound is b minus two parts: its scatter when tenths of the record are left out in turn, and a share of
+For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
 the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit.
 
-The power that friction dissipates, per speed squared, is least at high speed, where only b is left. So b is guaranteed.
+The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
+b is a lower bound at every speed.
 """
 
 from __future__ import annotations
@@ -34,30 +36,30 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
 
-_WINDOW = 0.012  # [s] least standard deviation of h, which halves the amplitude at 16 Hz
-_ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave; a coarse encoder gets a longer window
+_WINDOW = 0.012  # [s] least standard deviation of h; this h halves amplitudes at 16 Hz
+_ACCELERATION_NOISE = 1.5e-3  # [m/s2] rounding noise allowed in accelerations; a coarse encoder gets a longer window
 _SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that friction depends on; sets the shortest window
-_SPACING = 0.4  # distance of two rows in standard deviations of the window: filtered signals have no finer detail
+_SPACING = 0.4  # distance of two rows, in standard deviations of h: filtered signals have no finer detail
 _NEARBY = 3.5  # standard deviations between a row and the nearest tick at which the balance does not hold
 _REACH = 6  # standard deviations at which a window is cut off
-_STILL = 0.02  # [s] an encoder that stays within one count for so long stands still
-#: [m/s] speed at which dry friction is at 3/4
+_STILL = 0.02  # [s] an axis is at rest if its encoder stays within one count for this long
+#: [m/s] speed at which dry friction reaches 3/4 of its maximum
 _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
 _BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction reverses by position (Dahl 1968)
-_STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
-_SLOW, _WEAK = 0.2, 0.05  # share of a force that the window must pass; share of the strongest that need not pass
-_SLIP = 0.002  # [m/s] slip of dry friction where the best law is a bristle
+_STRIBECK = 0.02  # [m/s] speed at which the Stribeck part has fallen to 37 %
+_SLOW, _WEAK = 0.2, 0.05  # least share of a force that h must pass; share of the strongest force that needs no check
+_SLIP = 0.002  # [m/s] slip assumed in `dry_friction` if the best law is a bristle
 _BLOCKS = 10  # parts of the record that are left out in turn
-_HIDDEN = 0.03  # part of the damping that the residual could hide, subtracted from the bound
+_HIDDEN = 0.03  # share of the damping hidden by the residual that is subtracted from the bound
 #: error of the encoder's scale, which no recording shows; 20 um of eccentricity over part of a turn of 40 mm give 3e-3
 SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows below which a record is too short
-_ALMOST = 4.0  # largest log likelihood ratio of the best law to one that counts in the bound
+_ALMOST = 4.0  # twice the largest log likelihood ratio of the best law to a law that counts in the bound
 _ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
-_NEAR = np.geomspace(0.92, 1.09, 24)  # factors of the best of these periods, searched next
-_PERIODIC = 4  # most periodic disturbances in a fit
+_NEAR = np.geomspace(0.92, 1.09, 24)  # multiples of the best of these periods, searched next
+_PERIODIC = 4  # largest number of periodic disturbances in a fit
 _CHANCE = 2.0  # least gain of log likelihood beyond the gain of the best pair in pure noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
@@ -73,18 +75,18 @@ class Friction:
     stiffness: float  # [N/m] to ground
     constant: float  # [N] constant force
     drift: float  # [N/s] of the constant force
-    static: float  # [N] Stribeck part of dry friction, which is gone at speed
+    static: float  # [N] Stribeck part of dry friction, which vanishes at high speed
     drag: float  # [N s2/m2]
     slip: float  # [m/s] in the best law of dry friction; 0 where friction reverses by position
     reach: float  # [m] over which dry friction reverses by position; 0 where it reverses by speed
-    periods: tuple[float, ...]  # [m] of periodic disturbances that were found
+    periods: tuple[float, ...]  # [m] periods of the disturbances found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b
     rms: float  # [N] residual of the balance
 
 
 def _window(order: int, sigma: float, T: float) -> Array:
-    """Return samples of the derivative of a Gaussian of standard deviation sigma [s], times T."""
+    """Return samples, times T, of the `order`-th derivative of a Gaussian of standard deviation sigma [s]."""
     t = np.arange(-round(_REACH * sigma / T), round(_REACH * sigma / T) + 1) * T / sigma
     hermite = np.polynomial.hermite_e.hermeval(t, [0.0] * order + [1.0])
     return T * (-1) ** order * hermite * np.exp(-(t**2) / 2) / (np.sqrt(2 * np.pi) * sigma ** (order + 1))
@@ -132,7 +134,7 @@ def _bristle(x: Array, reach: float) -> Array:
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
-    """Return where the window passes most of the force. Elsewhere, hidden motion changes the friction."""
+    """Return the ticks at which the window passes enough of the force. Elsewhere, hidden motion changes friction."""
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
@@ -143,11 +145,11 @@ class _Balance:
     def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
         import scipy
 
-        noise = 3 * step**2 * T / (96 * np.sqrt(np.pi) * _ACCELERATION_NOISE**2)  # sigma^5, of white rounding
+        noise = 3 * step**2 * T / (96 * np.sqrt(np.pi) * _ACCELERATION_NOISE**2)  # sigma^5 for white rounding noise
         self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T, noise**0.2), force
         self.x = x - x[0]
         self._reach = round(_REACH * self.sigma / T)
-        # leave out rest and dither, whose friction g does not model
+        # leave out rest and dither, where g does not describe friction
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
         spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
@@ -186,7 +188,7 @@ class _Balance:
         return [(slip, 0.0, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 
     def matrix(self, dry: Array) -> Callable[[float], Array]:
-        """Return the columns (rows, p) of the balance, given the weight of friction's second derivative."""
+        """Return the function from the weight a of friction's second derivative to the columns (rows, p)."""
         laws = [dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
         plain, bent = zip(self._drag, *(self._of(law, 0, 2) for law in laws), strict=True)
 
@@ -196,7 +198,7 @@ class _Balance:
         return columns
 
     def waves(self, periods: Array) -> list[_Pair]:
-        """Return for every period [m] the pairs of a force and of an encoder error that repeat with position."""
+        """Return two pairs for each period [m]: a force and an encoder error that repeat with position."""
         waves = [(p, wave) for p in periods.tolist() for wave in self._complex(np.exp(2j * np.pi * self.x / p), 0, 2)]
         return [_Pair(period, np.stack([wave.real, wave.imag], axis=1)) for period, wave in waves]
 
@@ -226,7 +228,7 @@ class _Fit:
 
 
 def _triangle(rows: Array) -> Array:
-    """Return the triangle of the QR factorization of rows [columns, force]: all that least squares needs of them."""
+    """Return R of the QR factorization of rows [columns, force]. Least squares needs no more of these rows."""
     triangle: Any = np.linalg.qr(rows, mode="r")
     return triangle
 
@@ -255,7 +257,7 @@ def _fitted(balance: _Balance, matrix: Callable[[float], Array], periodic: list[
 
 
 def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[float, _Pair]:
-    """Return the gain and the pair that explains most of what `columns` (rows, p) leave of `residual` (rows,)."""
+    """Return the gain and the pair that explains most of `residual` (rows,) beside `columns` (rows, p)."""
     q = np.linalg.qr(columns)[0]
     left, most, strongest = residual - q @ (q.T @ residual), 0.0, pairs[0]
     for pair in pairs:
@@ -287,7 +289,7 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
 
 
 def _scatter(fit: _Fit, force: Array) -> Array:
-    """Return the covariance (p, p) of the free parameters from fits without each of _BLOCKS parts of the record."""
+    """Return the jackknife covariance (p, p) of the parameters: each fit leaves out one of _BLOCKS parts."""
     rows, group = np.column_stack([fit.columns, force]), np.arange(len(force)) * _BLOCKS // len(force)
     triangles = [_triangle(rows[group == g]) for g in range(_BLOCKS)]
     others = [_solve(_triangle(np.vstack(triangles[:g] + triangles[g + 1 :]))) for g in range(_BLOCKS)]
@@ -322,7 +324,7 @@ def _speed_window(step: float, T: float) -> float:
     return max(T, (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3))
 
 
-#: figures at the hand [m], times this power of the radius, are those of the rotary axis [rad]
+#: power of the radius that converts a figure in metres at the hand to one in radians of the axis
 _SQUARED = "mass viscous stiffness delta thinning thinning_error lasting motor_mass handle_mass motor_mass_min"
 _SQUARED += " transmission_stiffness transmission_stiffness_max"
 _SQUARED += " transmission_damping transmission_damping_min transmission_damping_max"
@@ -332,7 +334,7 @@ _Figures = TypeVar("_Figures")  # a dataclass of figures
 
 
 def at_radius(figures: _Figures, r: float) -> _Figures:
-    """Return the figures of an axis that a hand holds at the radius r [m], from those in metres at the hand."""
+    """Convert figures in metres at the hand to radians of the axis, for a hand at the radius r [m]."""
 
     def turned(values: dict[str, Any]) -> dict[str, Any]:
         return {

@@ -1,6 +1,6 @@
 """The messages between host and device, as tuples of integers, and the frames that carry them.
 
-A frame on the wire is payload + CRC-32, COBS-stuffed, ended by 0x00; docs/protocol.md draws every byte. A payload is a
+A frame on the wire is payload + CRC-32, COBS-stuffed, ended by 0x00; docs/protocol.md lists every byte. A payload is a
 type byte, fixed fields, then one group of fields per axis: the number of axes follows from the length. All integers are
 little-endian; there is no float, so no NaN can travel. The longest frame has fewer than 254 bytes before stuffing, so
 COBS costs exactly one byte and the size of a frame does not depend on its content.
@@ -19,8 +19,8 @@ from zlib import crc32
 PROTOCOL = 2
 _MAX_AXES = 8
 MAX_THETA = 15
-MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: 12 N for 20 ms bring a free 0.25 kg to 1 m/s
-NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the STATE before
+MAX_RELEASE_NS = 20_000_000  # longest sum of hold and ramp: in 20 ms, 12 N bring a free mass of 0.25 kg to 1 m/s
+NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the last STATE
 DEADMAN = 0x80  # in State.status: the deadman at the device is held
 
 
@@ -41,8 +41,8 @@ class Cause(IntEnum):
 
     NONE = 0
     HOST = 1  # a STOP from the host
-    WATCHDOG = 2  # more than `hold` ticks without a force
-    COMMAND = 3  # a FORCE with a command that is not allowed while armed
+    WATCHDOG = 2  # more than `hold` ticks in a row without a FORCE
+    COMMAND = 3  # a FORCE with IDLE while armed
     DEVICE = 4  # the firmware found a fault of its own
     ESTOP_DEVICE = 5  # the emergency stop at the device
     ESTOP_HOST = 6  # a STOP with reason ESTOP
@@ -53,7 +53,7 @@ _PHASES, _CAUSES = {int(phase): phase for phase in Phase}, {int(cause): cause fo
 
 
 class Command(IntEnum):
-    """What a FORCE asks for; only RUN may carry a force other than zero."""
+    """Command in a FORCE; only RUN may carry a force other than zero."""
 
     IDLE = 0
     ARM = 1
@@ -68,13 +68,13 @@ class Refused(IntEnum):
     ESTOP = 2
     AXES = 3
     THETA = 4
-    RELEASE = 5  # a ramp of no ticks, or hold and ramp longer than MAX_RELEASE_NS
+    RELEASE = 5  # a ramp of zero ticks, or hold + ramp longer than MAX_RELEASE_NS
     CAP = 6
     SLEW = 7
 
 
 class Reason(IntEnum):
-    """Why the host stops. The device stops for any reason; it latches ESTOP."""
+    """Why the host sends STOP. Every reason stops the device; after ESTOP it stays stopped until its reset."""
 
     DONE = 0
     OPERATOR = 1
@@ -83,11 +83,11 @@ class Reason(IntEnum):
 
 
 class SafetyStop(Exception):
-    """A reason to stop, in the words of the log."""
+    """Raised to stop a session. The message is the cause that the log shows."""
 
 
 class Hello(NamedTuple):
-    """Host to device: who are you?"""
+    """Host to device: request INFO."""
 
     version: int = PROTOCOL
 
@@ -114,7 +114,7 @@ class Config(NamedTuple):
     """Host to device: the parameters of a run. Tuples have one entry per axis."""
 
     theta: int  # a force answers tick k and is latched at tick k + theta; 0: as soon as it comes, within tick k
-    hold: int  # ticks that the last force is held for when frames are missing
+    hold: int  # ticks for which the last force is held when frames are missing
     ramp: int  # ticks of the ramp from the held force to zero
     ramp_in: int  # ticks over which the cap grows from zero after arming; 0: at once
     cap: tuple[int, ...]  # [steps]
@@ -126,13 +126,14 @@ class Config(NamedTuple):
 
     @property
     def due(self) -> int:
-        """The ticks from a sample to the STATE that shows its force; the force may come until then."""
+        """Ticks from a sample to the STATE that shows its force. The force must come before that STATE."""
         return max(1, self.theta)
 
     def limited(self, run: int, last: Sequence[int], asked: Sequence[int]) -> tuple[int, ...]:
-        """Return the forces [steps] that the device applies for `asked` after `last`, as the `run`-th since arming.
+        """Return the forces [steps] that the device applies for the `run`-th FORCE since arming.
 
-        They are within the cap, which grows from zero after arming, and differ from `last` by at most the slew rate.
+        The forces `asked` are clipped to the cap, which grows from zero after arming. Then each change from the `last`
+        applied force is clipped to the slew rate.
         """
         caps: Sequence[int] = self.cap
         if run < self.ramp_in:
@@ -145,24 +146,24 @@ class Config(NamedTuple):
 
 
 class Ack(NamedTuple):
-    """Device to host: the CRC-32 of the CONFIG payload it answers, and why that was refused (0: accepted)."""
+    """Device to host: the CRC-32 of a CONFIG payload, and why that CONFIG was refused (0: accepted)."""
 
     crc: int
     refused: int
 
 
 class State(NamedTuple):
-    """Device to host, every tick."""
+    """Device to host, every tick: state, encoder counts and applied forces."""
 
     status: int  # phase, cause and deadman
     tick: int
     echo: int  # the source of the last FORCE that came
     margin_us: int  # time from the last FORCE to its latch, negative: too late; NO_MARGIN: none since the last STATE
     crc_errors: int  # frames that the device rejected, modulo 256
-    misses: int  # ticks for which no FORCE was there in time, modulo 256
+    misses: int  # ticks without a FORCE in time, modulo 256
     t_us: int  # the device's clock at this tick, modulo 2^32
     counts: tuple[int, ...]  # encoders, sampled at this tick
-    applied: tuple[int, ...]  # the force from this tick on [steps]
+    applied: tuple[int, ...]  # forces that act from this tick on [steps]
 
     @property
     def axes(self) -> int:
@@ -178,7 +179,7 @@ class State(NamedTuple):
 
     @property
     def drives(self) -> bool:
-        """True if the motors are driven as if no STOP had come. A ramp to zero does not count."""
+        """True if the device is armed, or applies a force other than that of a ramp to zero."""
         return self.phase in (Phase.ARMED, Phase.HOLDING) or (self.phase != Phase.RAMP and any(self.applied))
 
     @property
@@ -201,7 +202,7 @@ class Force(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """Host to device: go to zero force now."""
+    """Host to device: ramp forces to zero, or drop them at once if the reason is ESTOP."""
 
     reason: int
 
@@ -211,7 +212,7 @@ Message = Hello | Info | Config | Ack | State | Force | Stop
 
 _U8, _U16, _U32 = (0, 0xFF), (0, 0xFFFF), (0, 0xFFFFFFFF)
 _I16, _I32 = (-0x8000, 0x7FFF), (-0x80000000, 0x7FFFFFFF)
-_TEXT = 16  # bytes of Info.firmware, ASCII, filled up with zeros
+_TEXT = 16  # bytes of Info.firmware, which is ASCII, padded with zeros
 
 
 class _Layout(NamedTuple):
@@ -268,7 +269,7 @@ _CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent, so every field is ch
 
 
 def wire_bytes(kind: type, axes: int) -> int:
-    """Return the length of a frame with its delimiter: STATE 20 + 6N, FORCE 12 + 2N."""
+    """Return the length of a frame with its delimiter; for N axes, STATE has 20 + 6N bytes and FORCE 12 + 2N."""
     f = _FORMS.get((kind, axes if _LAYOUTS[kind].axis else 0))
     if f is None:
         raise ValueError(f"axes: {axes}; the protocol carries 1 to {_MAX_AXES}")
@@ -284,7 +285,7 @@ def encode(message: Message) -> bytes:
     return b"".join([_CODES[len(block)] + block for block in raw.split(b"\0")]) + b"\0"
 
 
-#: first byte of a COBS block, its length plus one, by length; the zero after the block is not sent
+#: by the length of a COBS block, its first byte: the length plus one; the zero after the block is not sent
 _CODES = [bytes((n + 1,)) for n in range(254)]
 
 
@@ -359,13 +360,13 @@ def config_crc(config: Config) -> int:
 
 
 class Decoder:
-    """Decode bytes in any pieces to messages. Unreadable bytes are counted and dropped up to the next delimiter."""
+    """Decode messages from bytes, in pieces of any length. Unreadable frames are counted and dropped."""
 
     def __init__(self) -> None:
         self.crc_errors = 0
         self.malformed = 0  # frames with inconsistent COBS codes, or of a type and length that no message has
-        self.oversize = 0  # longer than any frame
-        self.tail = b""  # never longer than _MAX_WIRE
+        self.oversize = 0  # frames that are longer than any message's
+        self.tail = b""  # bytes of a frame without its end yet, at most _MAX_WIRE
         self.skipping = False  # inside an oversize frame that is already counted
 
     @property
