@@ -78,7 +78,7 @@ _SETTINGS = (
     *(("mujoco", "implicitfast", n) for n in (1, 4, 12)),
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
-_REPEATS = 3  # number of runs; the least CPU time is the cost
+_REPEATS = 3  # number of runs; the shortest wall time is the cost
 _TAIL = 4000  # ticks at the end of a run, in which a limit cycle is measured
 
 
@@ -224,7 +224,7 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """The time at which a run first leaves the limits within which the devices' model is credible, and the peaks.
+    """The time at which a run first leaves the limits of the devices' linear model, and the peaks of force and speed.
 
     Each list has one entry per channel; the transmission force of a rigid device is None.
     """
@@ -418,7 +418,7 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """Difference of a run from the same run by another integrator."""
+    """Difference between a run and the same run with another integrator."""
 
     integrator: str
     substeps: int
@@ -429,9 +429,10 @@ class CrossCheck:
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
-    """Repeat the run with RK4, or with the exponential integrator if RK4 ran; RK4 shares no matrix with other engines.
+    """Repeat the run with RK4, or with the exponential integrator if RK4 ran, and compare both.
 
-    `simulation` is the loop that ran, with its net. Positions are compared up to the end of the shorter run.
+    RK4 uses no matrix of the other engines, except for impedances of hands. `simulation` is the loop that ran, with its
+    net. Positions are compared up to the end of the shorter run.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even

@@ -51,14 +51,14 @@ class ScenarioRun:
 
     simulation: Simulation  # the loop without a net
     ran: Simulation  # the loop with its net, as it ran
-    period: Period | None  # of the worst switching of the delays; None for constant delays
+    period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # with defaults filled in
     remarks: list[str]  # remarks on the number of substeps that the user requested
     trace: Trace
     wall_s: float
     seed: int
-    unsolved: int  # number of ticks' force vectors for which the limiter found no solution
+    unsolved: int  # number of force vectors that were set to 0 because the limiter found no solution
 
     @cached_property
     def exact(self) -> Trace | None:

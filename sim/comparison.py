@@ -51,7 +51,7 @@ class Alternative:
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
-    force_error_percent: float | None = None  # as in a run's report; None where the loop grows or has walls
+    force_error_percent: float | None = None  # None if the loop grows, or has walls or friction
     required_damping: dict[str, tuple[float, ...]] = field(default_factory=dict)  # [N s/m], by condition
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)

@@ -148,10 +148,10 @@ class Findings:
         clipped: (n,) number of ticks with a force at its limit, on that trace.
         energy: (n,) least energy W(N) on the exact trace [J].
         audited: (n,) sum of the magnitudes of the terms of W [J].
-        settling: (n,) rms speed of the handles, last quarter over second quarter of the exact trace, no unit.
-        contacts: (n,) how often a wall was touched on the exact trace.
-        mass: (n,) geometric mean over channels of all mass of a hand [kg].
-        damping: (n,) geometric mean over channels of the least damping of a hand [N s/m].
+        settling: (n,) ratio of the handles' rms speeds in the last and the second quarter of the exact trace.
+        contacts: (n,) number of times that a wall was touched on the exact trace.
+        mass: (n,) geometric mean over channels of a hand's total mass [kg].
+        damping: (n,) geometric mean over channels of a hand's least damping [N s/m].
         switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
         switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace for `switching`; nan also if the trace was clipped.
         simulated: The duration of all traces together [s].

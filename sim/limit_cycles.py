@@ -1,8 +1,8 @@
 """Limit cycles of loops in human hands: eigenvalues for every human, and MuJoCo for the worst human.
 
 A cell is a force map F and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
-human and gives the growth of the dominant mode. `simulate_cells` runs many cells as one MuJoCo batch, with encoder
-steps, friction and walls.
+human and gives the growth of the dominant mode. `simulate_cells` runs cells in MuJoCo batches, with encoder steps,
+friction and walls.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the hand's force grows to its constant value
-_START = 1e-3  # [m] displacement of the motor or handle that moves most, at the start
+_START = 1e-3  # [m] initial displacement of the motor or handle that moves most
 _BLOCK = 64  # ticks in one block
-DECIDED = 0.2  # [1/s] a linear growth rate nearer to zero cannot be seen within a trace
+DECIDED = 0.2  # [1/s] a linear growth rate closer to zero than this cannot be seen within a trace
 UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear growth is nearer to zero than DECIDED
 
 
@@ -238,7 +238,7 @@ class _Trial:
 
     process: Process
     links: Array  # (m, links, 3) as in Crowd
-    start: Array  # (2n + order,) plant state, then the state of the linear process
+    start: Array  # (states + order,) plant state, then the state of the linear process
 
 
 def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:

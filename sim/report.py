@@ -213,7 +213,7 @@ class _DelaysMet:
     lost_packets: list[int]
     held_ticks: list[int]
     growth_rate_per_s: float
-    verdict: str | None  # None where the rate is too small for the time
+    verdict: str | None  # None if the rate is too small for the trace's duration
     judged_s: float  # duration of the trace that gave the growth
     period: _PeriodGrowth | None
 

@@ -36,11 +36,11 @@ from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, unstable
 
 _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
-_LONGEST_PERIOD = 250  # [ticks]
+_LONGEST_PERIOD = 250  # [ticks] of a searched window
 _STARTS = 6  # number of ticks of the greedy sequence at which windows begin
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
 _SHORTEST = 4  # least number of ticks, because a growth rate compares quarters of the trace
-_STREAM = 5  # separates these draws from those of the humans with the same seed and index
+_STREAM = 5  # random stream of these draws, independent of the humans' stream with the same seed and index
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +200,7 @@ def switched_crowd(
     """Run the impulse test for every set of humans, each under the delays of its index.
 
     Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other` makes the second engine from the numbers of its sets. Sets whose rate is too slow for the
+    for all sets. `other` makes the second engine for sets of these numbers. Sets whose rate is too slow for the
     duration run longer; if the sign changes, the longer traces of both engines count.
     """
     scenario, scene = simulation.scenario, held_by.scene

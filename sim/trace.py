@@ -66,7 +66,8 @@ class Trace(ReadOnly):
         w: (N, outside) forces from outside on the hands [N].
         meta: Settings and verdicts of the run, as in its JSON; `meta["stability"]`, `meta["assessment"]`.
         z: (N, order) states of the controller.
-        s: (N, 2 n) states of the plant: positions [m], then velocities [m/s].
+        s: (N, states) states of the plant: positions [m], velocities [m/s], states of the hands' impedances, and with
+            latencies the held forces [N].
         diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
         interrupted: Whether the run was stopped from the keyboard.
         net: The passivity layer between controller and devices, in its final state; None without one.
@@ -224,7 +225,7 @@ class Trace(ReadOnly):
 
 _PERIODS = 4  # least periods of an octave in a window; with fewer the window function mixes neighbouring octaves
 _TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of a motion of 15 mm at 0.6 Hz
-SUSTAINED = 0.95
+SUSTAINED = 0.95  # least ratio of a lasting oscillation's amplitude in the last window to that in the first
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
@@ -329,9 +330,9 @@ class Growth:
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     """Measure how fast displacements x (N, m) [m] grow, sampled every T [s] by encoders of steps (m,) [m].
 
-    The second half of x is examined first. If a fast growing mode is seen there too briefly, the last quarter is
-    examined, and so on. The strongest growing octave is reported, or the strongest one if none grows. `first` is the
-    number of the first tick.
+    The second half of x is examined first. If no oscillation is seen there for long enough, the last quarter is
+    examined, and so on, because a fast growing mode may appear late. The strongest growing octave is reported, or the
+    strongest one if none grows. `first` is the number of the first tick.
     """
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:

@@ -254,7 +254,7 @@ class Growing(Generic[_Met]):
 class Attacked:
     """The result of a search, and the loop's distance from its required damping."""
 
-    found: bool  # whether the human destabilises
+    found: bool  # whether the worst human destabilises the loop
     spectral_radius: float
     growth_rate_per_s: float
     frequency_hz: float

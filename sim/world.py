@@ -352,7 +352,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
-    """Return the least sum of f'(u - u_-) [J] of ten runs of 1 s in which the springs' ends stop and turn at random."""
+    """Return the least energy at the port [J] in ten runs of 1 s in which the springs' ends stop and turn at random."""
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
         for _ in range(10):

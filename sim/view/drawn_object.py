@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # --help does not load MuJoCo
 # Distances [m] from handles to contacts, between columns of nodes, and from the floor to the object.
 _FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03
 _RADIUS = {"contact": 0.012, "node": 0.008, "mass": 0.02}  # [m]; a mass is a cube
-SPRING = 0.002  # [m] radius
+SPRING = 0.002  # [m] radius of a drawn spring
 _WALL = (0.03, 0.03, 0.002)  # [m] half the sides of a wall; the last is along its normal
 _COLOUR: dict[str, tuple[float, float, float, float]] = {
     "contact": (0.95, 0.9, 0.3, 1.0),

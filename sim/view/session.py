@@ -80,7 +80,7 @@ class _Restart:
 
 _Event = Couple | _Delay | _Push | _Restart
 
-#: GLFW's key codes that the viewer does not use; it uses 0 to 5 and the letters
+#: GLFW's code -> (name, event) of keys that MuJoCo's viewer does not use (it uses 0 to 5 and the letters)
 KEYS: dict[int, tuple[str, _Event]] = {
     ord("6"): ("6", Couple("none")),
     ord("7"): ("7", Couple("published")),
@@ -360,7 +360,7 @@ class LiveLoop:
 
     @property
     def state(self) -> Array:
-        """The plant state: positions [m], then velocities [m/s]."""
+        """The plant state: positions [m], velocities [m/s], then states of the hands' impedances."""
         return self._buffer.s[0, :, 0].copy()
 
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
