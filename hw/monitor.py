@@ -2,9 +2,9 @@
 
 The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the clocks of
 device and host are compared with the tick number, and late and missing answers are counted. The force that the device
-reports is compared with the force that it was sent. docs/protocol.md determines the applied force: in ARMED the device
-moves from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps its last
-force; in DISARMED it applies none.
+reports is compared with the force that the host sent. docs/protocol.md determines the applied force: in ARMED the
+device moves from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps
+its last force; in DISARMED it applies none.
 """
 
 from __future__ import annotations
@@ -25,71 +25,71 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import Scenario
 
-_STATES_PER_ANSWER = 8  # most STATEs per measured age: a USB frame may bring several FORCEs, but one margin is told
-_INFERRED = 0.005  # largest share of inferred ages: half of what the usual quantile leaves out
-_MEASURED_TOLERANCE = 0.01  # relative error of the device's clock against T, over the measurement
-_UNTOLD = 0.9  # largest share of STATEs without a margin; a USB frame may carry several FORCEs
-_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # relative clock error over a block; a busy host blurs its own
+_STATES_PER_ANSWER = 8  # most STATEs per measured age: of several FORCEs in a USB frame, only one margin is reported
+_INFERRED = 0.005  # largest share of inferred ages: half of the 1 % that the default quantile leaves out
+_MEASURED_TOLERANCE = 0.01  # largest relative difference between the device's mean tick and T
+_UNTOLD = 0.9  # largest share of STATEs without a margin, of which USB frames with several FORCEs cause some
+_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
 _BLOCK = 200  # ticks over which a clock is compared
-_CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
-_REMEMBERED = 64  # latest forces that are stored, of which at most theta still matter
-_ROUNDING = 1  # [steps] by which the rounding of a firmware may differ
+_CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of the device
+_REMEMBERED = 64  # most forces or latches that are stored; at most the last theta still matter
+_ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
 _PATIENCE = 5  # wrong ticks in a row at which a session stops
-_CHANGE = 1.0  # [N] change of force that moves any handle, unless it is against a stop
-_IMPULSE = 0.1  # [N s] most of such a change over time without a motion: 100 ms of 1 N, 20 ms of 5 N
+_CHANGE = 1.0  # [N] change of force that moves any handle that is not at a stop
+_IMPULSE = 0.1  # [N s] largest time integral of such changes without a motion: 1 N for 100 ms, 5 N for 20 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
-_TEST_BEFORE = 0.012  # [s] at zero force before the test
+_TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
-_DEGREE = 5  # degree of the polynomials that remove a hand's own motion; 1 % of a motion at 2 Hz is left
-_FIT = 0.8  # least share of power with the expected shape: free handles in a moving hand have 0.93, held ones up to 0.5
-_LATE = 0.75  # [ticks] largest hidden delay: amplifiers have one, but no certificate covers a whole tick
-_CROSS = 0.25  # largest share of the expected motion on another axis; less may pass through a table
+_DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
+_FIT = 0.8  # least share of power with the expected shape: loosely moved handles have 0.93, held handles at most 0.5
+_LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short one, but no certificate covers a whole tick
+_CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a table may transmit less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
 _STRONG = 2  # first block of the test at the end of a session
-_REST = 0.1  # [s] The noise of an encoder at rest is measured for this time.
+_REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force [N], and the longest time [s] for which an encoder may stand still under it
-_FORGETTING = 8  # right ticks that cancel a wrong one; with fewer in between, scattered wrong ticks stop a session, too
+_FORGETTING = 8  # right ticks that cancel one wrong tick; wrong ticks that come more often stop a session, too
 
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """How a session judges its link, and how it arms."""
+    """Settings by which a session judges its link and arms."""
 
-    baud: int | None = None  # of a UART; None for a link without one (USB, pseudo-terminal)
+    baud: int | None = None  # baud rate of a UART; None for a link without one (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
     window: int = 200  # ticks over which misses are judged
-    late: float = 0.1  # part of late answers above which the coupling is too fast for the link
-    missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
+    late: float = 0.1  # largest share of late answers; above it the link is slower than the coupling is certified for
+    missed: float = 0.2  # largest share of missing answers; beyond it loops lose mean-square stability
     test_encoders: bool = True  # whether a small force tests the encoders at every arming
-    held: bool = True  # whether the scenario's hands hold the handles in this test, as in a rehearsal; else none does
+    held: bool = True  # whether the scenario's hands hold the handles in that test (rehearsals), or nobody does
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
     deadman: bool = False  # forces act only while the deadman at the device is held
-    behind: tuple[int, ...] = ()  # with several boards, ticks by which axes act later than the link (hw/boards.py)
+    behind: tuple[int, ...] = ()  # (m,) with several boards, ticks added to the link's delay (hw/boards.py)
     elsewhere: tuple[int, ...] | None = None  # [counts] places that every handle must have left before arming
 
 
-# the delay, timed at zero force
+# Measurement of the delay at zero force
 
 
 @dataclass(frozen=True)
 class Ages:
-    """The ages [us] of forces when they reach the device, counted from their sample, and the number that never do."""
+    """Ages [us] of forces when they reach the device, counted from their sample, and the number of lost forces."""
 
     values: tuple[int, ...]
     missing: int = 0
     ticks: tuple[int, ...] = ()  # [us] lengths of the device's ticks by its own clock
 
     def longest_tick(self, T_us: float, q: float = 1.0) -> float:
-        """Return the length [us] that a fraction q of the ticks does not exceed, or T if the clock cannot tell them."""
+        """Return the quantile q of the ticks' lengths [us], or T if it exceeds T by at most the clock's error."""
         ordered = sorted(self.ticks)
         longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(longest) if longest > T_us + _CLOCK_US else T_us
 
     def quantile(self, q: float) -> int:
-        """Return the least age that a fraction q of forces does not exceed. Raises SafetyStop where fewer arrived."""
+        """Return the least age that a fraction q of forces does not exceed. Raises SafetyStop if fewer arrived."""
         ordered, everything = sorted(self.values), len(self.values) + self.missing
         place = min(everything - 1, int(q * everything))
         if place >= len(ordered):
@@ -108,19 +108,19 @@ class Ages:
 
 
 class AnswerAges:
-    """The ages of answers by the number of the tick that they answer, derived from STATEs.
+    """Ages of answers, derived from STATEs, by the number of the tick that each answers.
 
-    A STATE tells the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
-    advances by n, and the answers that it skips are up to (n-1) T older. They count with that age, because the delay
-    must cover them too.
+    A STATE reports the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
+    advances by n, and the n-1 skipped answers are up to (n-1) T older. The skipped answers count with these ages,
+    because the delay must cover them too.
     """
 
     def __init__(self, due: int, T_us: float) -> None:
-        """Take the ticks `due` from a sample to the latch of its answer."""
+        """Take `due`, the number of ticks from a sample to the latch of its answer."""
         self._due, self._T_us = due, T_us
         self.by_tick: dict[int, int] = {}  # [us]
         self.inferred: set[int] = set()  # ticks whose answer was skipped, so that its age is inferred
-        self._unanswered: set[int] = set()  # ticks whose answer was not there at its latch
+        self._unanswered: set[int] = set()  # ticks whose answer had not come at its latch
         self._youngest: int | None = None  # tick of the youngest answer that came
 
     def age(self, margin: int) -> int:
@@ -128,7 +128,7 @@ class AnswerAges:
         return round(self._due * self._T_us) - margin
 
     def note_unanswered(self, ticks: range) -> None:
-        """Remove the ages of answers that were not there at their latch: they are late or lost."""
+        """Remove the ages of answers to `ticks`, which had not come at their latch because they are late or lost."""
         self._unanswered.update(ticks)
         for tick in ticks:
             self.by_tick.pop(tick, None)
@@ -138,7 +138,7 @@ class AnswerAges:
         """Record the age of the answer to `tick`, and of the answers that it skips."""
         age = self.age(margin)
         after = tick - 1 if self._youngest is None else self._youngest
-        for skipped in range(max(after + 1, tick - 2 * self._due), tick):  # older ones were missed long ago
+        for skipped in range(max(after + 1, tick - 2 * self._due), tick):  # older answers were missed long ago
             if skipped not in self._unanswered:
                 self.by_tick[skipped] = age + round((tick - skipped) * self._T_us)
                 self.inferred.add(skipped)
@@ -148,13 +148,13 @@ class AnswerAges:
 
 
 class Measurement:
-    """Measure the ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
+    """Measure the ages of answers at zero force, until `needed` answers have arrived or are missing.
 
-    Where too many ages are inferred, answers may have overtaken each other: a late answer that comes together with a
-    younger one leaves no trace. Then a second round measures half as many ages exactly. Every STATE is still answered,
-    so that the load of the link is the same. But most answers are for a wrong tick, so that the device ignores them.
-    The answers that it takes are farther apart than the longest age. Their distances are random, so that bursts meet
-    all of them alike.
+    A limit on the number of STATEs ends the measurement in any case. Where too many ages are inferred, answers may
+    have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
+    round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
+    same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are farther
+    apart than the longest age, at random distances, so that a burst meets each of them with the same probability.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
@@ -163,19 +163,19 @@ class Measurement:
         self._last: State | None = None
         self._tick = 0  # number of the last STATE, without wrap-around
         self._ticks: list[int] = []  # [us] lengths of ticks
-        self._apart = 1  # least distance of answers that the device takes; above 1 in the second round
+        self._apart = 1  # [ticks] least distance of accepted answers; above 1 in the second round
         self._begin()
 
     def _begin(self) -> None:
         """Begin a round."""
         self._answers = AnswerAges(self._theta, self._T_us)
         self._missed = self._states = 0
-        self._sent: set[int] | None = None if self._apart == 1 else set()  # ticks whose answer the device takes
+        self._sent: set[int] | None = None if self._apart == 1 else set()  # ticks whose answer is accepted
         self._next, self._distances = self._tick + 2 * self._theta, np.random.default_rng(0)
         self.ignored: deque[int] = deque(maxlen=_REMEMBERED)  # latches whose answer the device ignores, modulo 2^16
 
     def delay(self) -> int:
-        """Return the ticks from the last STATE to its answer's latch: theta, or theta + 1, which the device ignores."""
+        """Return the delay [ticks] to send with the next answer: theta, or theta + 1 so that the device ignores it."""
         if self._sent is None or self._last is None:
             return self._theta
         meant = False
@@ -189,7 +189,7 @@ class Measurement:
         return self._theta + 1
 
     def note(self, state: State, margin: int | None, missed: int) -> bool:
-        """Process a STATE and return whether it was the last one. Raises SafetyStop where the link cannot be used."""
+        """Process a STATE and return whether the measurement is complete. Raises SafetyStop for an unusable link."""
         self._first = self._first or state
         passed = distance(state.tick, self._last.tick) if self._last else 0
         if self._last and passed == 1:
@@ -248,26 +248,26 @@ class Measurement:
             raise SafetyStop(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
 
 
-# lateness
+# Lateness of answers
 
 
 @dataclass
 class Counters:
-    """Counts since the session began. Those of the device are sums of differences modulo 256."""
+    """Counts since the session began. The device's own counts are sums of differences modulo 256."""
 
     states: int = 0  # STATEs that were acted upon
-    gaps: int = 0  # ticks of which no STATE came
-    duplicates: int = 0  # the same tick again
-    stale: int = 0  # an older tick than the last: late or reordered
+    gaps: int = 0  # ticks without a STATE
+    duplicates: int = 0  # STATEs of the same tick as the last one
+    stale: int = 0  # STATEs of an older tick than the last one: late or reordered
     unexpected: int = 0  # messages of a type that no session expects
     late: int = 0  # answers that reached the device after their latch
     misses: int = 0  # ticks without an answer in time, by the device's count
     device_errors: int = 0  # frames that the device rejected
     host_errors: int = 0  # frames of the device that could not be read
-    clipped: int = 0  # ticks with a force at the cap, by the limiter or by being cut
-    slowed: int = 0  # forces at the slew limit
+    clipped: int = 0  # ticks with a force at its cap, by the limiter or by clipping
+    slowed: int = 0  # ticks with a force at the slew rate limit
     limited: int = 0  # ticks in which the energy budget made forces smaller
-    unlike: int = 0  # ticks at which the device applied another force than it was sent in time
+    unlike: int = 0  # ticks at which the device applied a force that the host did not send
 
 
 class LinkMonitor:
@@ -281,15 +281,15 @@ class LinkMonitor:
     def restart(self) -> None:
         """Clear the window after a new delay was configured."""
         self.last: State | None = None
-        self.margin: int | None = None  # [us] of the answer that the last fresh STATE tells; None: no answer came
-        self.missed = 0  # missed ticks that the last fresh STATE reports
+        self.margin: int | None = None  # [us] margin in the last new STATE; None: it reports none
+        self.missed = 0  # missed ticks that the last new STATE reports
         self._window: deque[_Tick] = deque()
-        self._late = self._missed = self._untold = self._gaps = 0  # sums over the window; sum() takes too long
+        self._late = self._missed = self._untold = self._gaps = 0  # sums over the window, updated tick by tick
 
     def take(self, state: State, ignored: Container[int] = ()) -> int:
         """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick.
 
-        A latch among those `ignored` (modulo 2^16) is no miss, because the device was told to ignore its answer.
+        A latch in `ignored` (modulo 2^16) is no miss, because the host sent its answer for a wrong tick on purpose.
         """
         ahead = 1 if self.last is None else distance(state.tick, self.last.tick)
         if ahead <= 0:
@@ -341,10 +341,10 @@ class LinkMonitor:
             raise SafetyStop(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
         if self._gaps / window > most:
             part = f"{100 * self._gaps / window:.0f} % of {window} ticks"
-            raise SafetyStop(f"no STATE came of {part}: nobody can say what the device did")
+            raise SafetyStop(f"no STATE in {part}: the device's forces are unknown")
         if self._untold / window > _UNTOLD:
             raise SafetyStop(
-                f"{100 * _UNTOLD:g} % of the last {window} STATEs told no margin: nobody can say how late answers are"
+                f"{100 * _UNTOLD:g} % of the last {window} STATEs had no margin: the lateness of answers is unknown"
             )
         if late > self.settings.late:
             return f"{100 * late:.0f} % of the last {window} answers were late"
@@ -352,13 +352,13 @@ class LinkMonitor:
 
 
 class _Tick(NamedTuple):
-    """What one new STATE says about the link."""
+    """One new STATE's facts about the link."""
 
     margin: int | None  # [us]
     missed: int
-    gap: int  # ticks before it of which no STATE came
+    gap: int  # ticks without a STATE before this one
     late: bool
-    odd: bool  # whether it counts in any of the sums
+    odd: bool  # whether this tick counts in any sum of the window
 
 
 # The clocks of device and host are both compared with the tick number. Only the host's clock reveals a device that
@@ -372,14 +372,14 @@ class _ClockDrift:
     whose: str
     T_us: float
     tolerance: float  # largest drift, as a part of a block
-    forgiven_us: float  # longest freeze that is left out
+    forgiven_us: float  # largest part of a freeze that is excluded
     _last: int | None = None
     _ticks: int = 0
     _behind: float = 0.0  # [us] time of the clock minus ticks * T
     _freeze: float = 0.0  # [us] longest delay of a single call in the block
 
     def note(self, at_us: int, ticks: int) -> None:
-        """Process the clock `at_us` (modulo 2^32), `ticks` after the last call. Raises SafetyStop if it drifts."""
+        """Process a reading of the clock (modulo 2^32), `ticks` after the last. Raises SafetyStop if it drifts."""
         if self._last is not None:
             elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
             late = elapsed - ticks * self.T_us
@@ -415,15 +415,15 @@ class ClockMonitor:
         self._host.note(now, ticks)
 
 
-# the force that the device reports
+# Check of the force that the device reports
 
 
 class CommandMonitor:
-    """Keep the forces that a device was sent, and check that it applies them."""
+    """Store the forces that the host sends, and check that the device applies them."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
+        self._forces: dict[int, tuple[int, ...]] = {}  # [steps] forces by the tick of their latch
         self._last: State | None = None
         self._ready = False  # whether the last STATE was not DISARMED
         self._run = (0, 0)  # least and largest possible number of forces latched since arming
@@ -436,9 +436,9 @@ class CommandMonitor:
             self._forces.pop(next(iter(self._forces)))
 
     def unlike(self, state: State, ticks: int) -> bool:
-        """Return whether the device applies a force that it was not sent. A STATE after a gap is not judged.
+        """Return whether the device applies a force that the host did not send. A STATE after a gap is not judged.
 
-        Raises SafetyStop if the device continues to do so.
+        Raises SafetyStop if the device continues to do so, or holds a force for longer than agreed.
         """
         phase = state.phase
         self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
@@ -476,18 +476,19 @@ class CommandMonitor:
         )
 
 
-# Encoders. A hand that holds still looks like a disconnected cable, but no hand is as stiff as a dead encoder.
+# Checks of the encoders. A dead encoder looks like a handle at rest, but no hand holds a handle perfectly still while
+# the force changes.
 
 
 class EncoderNoise:
     """The noise of every encoder at rest, while no force acts.
 
-    It is the least range of counts over windows of 100 ms. So a person may move a handle, if it also rests for one.
+    It is the least range of counts over windows of 100 ms. So a person may move a handle that rests for one window.
     """
 
     def __init__(self, axes: int, T: float) -> None:
         self._recent = [deque[int](maxlen=max(8, round(_REST / T))) for _ in range(axes)]
-        self.range: list[int | None] = [None] * axes  # [counts] least range of a full window; None before there is one
+        self.range: list[int | None] = [None] * axes  # [counts] least range of a full window; None before the first
 
     def note(self, counts: Sequence[int]) -> None:
         """Process the counts (m,) of a tick."""
@@ -499,17 +500,17 @@ class EncoderNoise:
 
     @property
     def still(self) -> tuple[int, ...]:
-        """Return the counts (m,) within which an encoder stands still: 1 without noise, as one channel may be broken.
+        """Return the range (m,) [counts] of an encoder at rest: 1 without noise, as a broken channel toggles by 1.
 
-        In a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
+        Over a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
         """
         return tuple(2 * least if least and least > 1 else 1 for least in self.range)
 
 
 class Expected:
-    """How the encoders move under a force while the handles are free, or held by the scenario's hands.
+    """Predict how the encoders move under a force while the handles are free, or held by the scenario's hands.
 
-    For free handles, it also tells how they would move under hands that weigh as much as the devices.
+    For free handles, also predict their motion in hands that weigh as much as the devices.
     """
 
     def __init__(self, scenario: Scenario, held: bool) -> None:
@@ -522,17 +523,17 @@ class Expected:
             hands = [Human((Link(0.0, 0.0, 0.0),))] * len(devices), [Human((weight,)) for weight in weights]
             scenes = [build(devices, each) for each in hands]
         plants = [hold(scene.plant, scenario.T) for scene in scenes]
-        #: A and B of each plant; the wire carries -f
+        #: A and B of each plant, with B for the motors' force -f
         self._plants = [(p.A, -p.B[:, scene.outside :]) for p, scene in zip(plants, scenes, strict=True)]
         self.mass = [sum(device.bodies.values()) for device in scenario.axis_devices]  # (m,) [kg]
         self.rest()
 
     def rest(self) -> None:
-        """Begin at rest."""
+        """Set all plants to rest."""
         self._states = [np.zeros(len(A)) for A, _ in self._plants]
 
     def advance(self, axis: int, force: float) -> tuple[float, float]:
-        """Hold a motor's force [N] for a tick and return the positions [m] of its axis, as expected and with a load."""
+        """Apply a motor's force [N] for a tick and return its axis' positions [m], as expected and in a heavy hand."""
         states = zip(self._plants, self._states, strict=True)
         self._states = [A @ state + B[:, axis] * force for (A, B), state in states]
         return float(self._states[0][axis]), float(self._states[-1][axis])
@@ -542,16 +543,16 @@ class EncoderTest:
     """Test whether encoders answer a small force that acts on one axis after the other.
 
     The force changes its sign every 30 ms, in blocks of 120 ms; each block is twice as strong as the one before. After
-    a block, polynomials of degree 5 are removed from all positions: they contain what a hand does on purpose in this
-    time, such as 50 mm at 2 Hz, and little of the answer. The rest must have the shape of the expected motion (`_FIT`
-    of its sum of squares), its sign, and its size within a factor of 2. A reversed motor or encoder has the wrong sign,
-    a wrong scale the wrong size. A dead encoder, and a moved or a held handle, have another shape. A motion that comes
-    later than expected shows a hidden delay, because friction and hands make it come earlier.
+    a block, a polynomial of degree 5 is subtracted from every position. It contains the intended motion of a hand in
+    this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion in shape
+    (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder gives the
+    wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
+    comes later than expected shows a hidden delay, because friction and hands advance its phase.
 
     At the end of a session (`alive`) unknown hands may hold the handles and move them. Then it suffices that the axis
-    swings in the rhythm of the force at any phase. An axis with a dead motor does not. A smaller motion is refused only
-    where it has the shape of a free handle and not that of one whose hand weighs as much as the device: the mode of a
-    transmission tells them apart, and a rigid device does not.
+    swings at the frequency of the force, at any phase. An axis with a dead motor does not swing. Too small a motion is
+    refused only where it has the shape of a free handle and not that of a handle in a hand as heavy as the device. The
+    mode of a transmission makes these shapes differ; for a rigid device they are equal.
     """
 
     def __init__(
@@ -566,7 +567,7 @@ class EncoderTest:
     ) -> None:
         """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
-        A STATE tells the force that acts after it, or with `at_once` (theta = 0) the one that acted before it.
+        A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
         """
         self._at_once, self._strongest = at_once, [min(cap, _TEST_FORCE * limits.lever) for cap in limits.cap]
         self._T, self._units, self._still, self._expected, self._alive = T, units, still, expected, alive
@@ -582,7 +583,7 @@ class EncoderTest:
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.
 
-        Raises SafetyStop, naming the axis, where an encoder answers in a wrong way, or not even to 1 N.
+        Raises SafetyStop, naming the axis, where an encoder answers wrongly, or not even to the strongest test force.
         """
         acted: State | None = state if self._at_once else self._last
         pushed = acted.applied[self._axis] * self._units.force_step[self._axis] if acted else 0.0
@@ -610,8 +611,8 @@ class EncoderTest:
     def _compare(self) -> tuple[Array, Array, float, float, bool]:
         """Compare all motions with the expected one.
 
-        Returns size and fit (m,) of all motions; of the tested axis the size at any phase, the delay [ticks], and
-        whether it moves as the expected handle does and as no handle with a load.
+        Returns size and fit (m,) of all motions, and for the tested axis the size at any phase, the delay [ticks], and
+        whether its motion has the shape of the expected handle but not that of a handle in a heavy hand.
         """
         t, expected, loaded, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
@@ -621,7 +622,7 @@ class EncoderTest:
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
-        rounding = len(t) * np.square(self._units.encoder_step) / 12  # sum of squares without a motion
+        rounding = len(t) * np.square(self._units.encoder_step) / 12  # sum of squares of the rounding errors
         own = np.maximum((moved**2).sum(axis=0) - rounding, rounding)
         fit = size**2 * power / own
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
@@ -641,7 +642,7 @@ class EncoderTest:
         moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
-        loose = self._alive and not self._expected.held  # an unknown hand may hold it
+        loose = self._alive and not self._expected.held  # an unknown hand may hold the handle
         if others and not moves[axis]:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
         if follows[axis] and size[axis] < 0:
@@ -664,7 +665,7 @@ class EncoderTest:
         at = f"a test force of up to {most:g} N"
         if self._pushed < _PUSHED * most:
             tested = f"motor and encoder of axis {axis} are not tested"
-            return f"energy left for {self._pushed:.2g} of {most:g} N: {tested}. Give more (--energy-budget)"
+            return f"the energy left allows {self._pushed:.2g} of {most:g} N: {tested}. Raise --energy-budget"
         if self._alive:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
@@ -677,9 +678,9 @@ class EncoderMonitor:
 
     No living hand holds a handle within one count under a changing force; an encoder with one broken channel still
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
-    of more than 1 N, or of half of a weak motor's force, are summed up over time. A mass M that a change F turns around
-    stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force of more
-    than 0.3 N, no hand holds still for half a second: its tremor shows.
+    of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
+    reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
+    of more than 0.3 N, no hand holds still for half a second, because it has a tremor.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
@@ -693,7 +694,7 @@ class EncoderMonitor:
         self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
-        """Raise SafetyStop where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
+        """Raise SafetyStop where an encoder is dead. `applied` (m,) [steps] acts from these `counts` (m,) on."""
         if self._band is None:
             self._band = [[n, n] for n in counts]
         for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):

@@ -187,7 +187,7 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
         silent += 1
     assert silent == 181
     assert session.stage == Stage.STOPPED
-    assert session.cause == "90 % of the last 200 STATEs told no margin: nobody can say how late answers are"
+    assert session.cause == "90 % of the last 200 STATEs had no margin: the lateness of answers is unknown"
 
 
 def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
@@ -201,7 +201,7 @@ def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
         told += 1
     assert told == 41
     assert session.stage == Stage.STOPPED
-    assert session.cause == "no STATE came of 20 % of 200 ticks: nobody can say what the device did"
+    assert session.cause == "no STATE in 20 % of 200 ticks: the device's forces are unknown"
 
 
 def test_devices_holding_too_long_are_stopped(scenario, rungs):

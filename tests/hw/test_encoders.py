@@ -140,8 +140,8 @@ def cut(test, most):
 
 @pytest.mark.parametrize("alive", [False, True])
 def test_a_force_cut_short_is_no_test(alive):
-    """An energy budget lets 0.1 N of 1 N through: nobody can say that the motor is dead."""
-    with pytest.raises(SafetyStop, match=r"energy left for 0.1 of 1 N: motor and encoder of axis 1 are not tested"):
+    """An energy budget that allows 0.1 N of 1 N does not show that the motor is dead."""
+    with pytest.raises(SafetyStop, match=r"the energy left allows 0.1 of 1 N: motor and encoder of axis 1 are not"):
         cut(arming_test(alive=alive), 0.1)
 
 
