@@ -508,7 +508,7 @@ def _positions(
 def _require_motion(positions: Array) -> None:
     """Raise InputError if nothing moves, because a relative error is then undefined."""
     if not positions.any():
-        raise InputError("--error is relative to the motion, and nothing moves: give a tap, or a human an amplitude")
+        raise InputError("--error is relative to the motion, but nothing moves: add a tap or a voluntary motion")
 
 
 def _apart(own: Array, truth: Array) -> float:

@@ -392,7 +392,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
     forces, percent = ideal
     label = "pale: the force of the object itself for this motion"
     if percent is not None:  # The report compares forces before the motors' limits.
-        label += " (the motors were asked for the same)" if percent < _SAME else f" (force error {percent:.2g} %)"
+        label += " (equal to the commanded force)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
         for i, force in enumerate(forces[part].T):
@@ -520,7 +520,7 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
 #: E, F and M in every panel of singular values
 _PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_E", "E, the environment", _IDEAL),
-    ("sigma_F", "F, what the devices see", STYLES[0]),
+    ("sigma_F", "F, felt at the devices", STYLES[0]),
     ("sigma_M", "M, the mismatch", STYLES[1]),
 )
 _HIGHEST = 20.0  # largest required damping in a picture, relative to the available one
@@ -572,7 +572,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
         words, holds = TITLES.get(str(condition), str(condition)), parts[0].requirement.guarantee
-        words += " (with a multiplier of this one)" if words == ANY != holds else ""
+        words += " (with a multiplier for this environment)" if words == ANY != holds else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)
     axes[0, 0].set_ylabel(f"required damping{unit}")

@@ -107,7 +107,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if self.unit == "m":
                 raise ValueError(f'radius is {self.radius:g}, which is for unit = "rad" only')
         if self.unit == "rad" and is_world(self):
-            raise ValueError('unit is "rad", a world in MuJoCo is in metres')
+            raise ValueError('unit is "rad", but a MuJoCo world is in metres')
         require("duration", self.duration, self.T, 1e6, "s")
         if self.psi is _UNSAID:
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)

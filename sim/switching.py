@@ -252,7 +252,7 @@ def _crowd_delays(
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
 
 
-# ---- certificates for varying delays: from the coupling's file, or judged anew
+# ---- certificates for varying delays: from the coupling's file, or made here
 
 
 @dataclass(frozen=True)
@@ -271,11 +271,11 @@ class DelaysCovered:
         certified = any(need.certified for need in constant_delays)
         varying, span = scenario.varying_delay, scenario.delay_range
         assert varying is not None
-        constants = "certificates are about constant delays"
+        constants = "certificates are for constant delays"
         if not certified:
             constants = "nothing is certified, even for constant delays"
         if not scenario.switches:
-            text = "the delay is constant after all (theta): the certificates cover it"
+            text = "the delay stays constant at theta, and the certificates cover it"
             return cls(certified, text if certified else constants)
         loop = scenario.loop("I").switching(span)  # the case does not matter to stability
         on_file = on_file if on_file and on_file.contains(span) else None
@@ -283,7 +283,7 @@ class DelaysCovered:
         lossy = scenario.loses_packets
         if proof := _how_proved(figures, on_file):
             cover = "any switching of the delays within their range is covered"
-            losses = ", but a lost packet makes a force older than hi, which is not" if lossy else ""
+            losses = ", but not forces that lost packets make older than hi" if lossy else ""
             words = f"certified for switching delays in this environment ({proof}): {cover}{losses}"
             return cls(not lossy, words, figures, on_file)
         buffered = figures.playout is not None and figures.playout.certified

@@ -324,7 +324,7 @@ class Growth:
         if self.reason or self.amplitude_m is None:
             return f"{where}: {self.reason}{above}"
         rate = f"{self.growth_rate_per_s:+.4g} ± {self.error_per_s:.2g} 1/s at {self.frequency_hz:.4g} Hz"
-        return f"{where}: {rate}{above}, {1e3 * self.amplitude_m:.2g} mm at last: {self.trend}"
+        return f"{where}: {rate}{above}, {1e3 * self.amplitude_m:.2g} mm when last seen: {self.trend}"
 
 
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:

@@ -164,7 +164,7 @@ class Traces:
         stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
         decay = largest(-1 / findings.exact[findings.exact < 0])
         decides = decay is None or duration >= _SETTLING * decay
-        slow = f"the slowest mode decays in {decay or 0:.3g} s: in {duration:g} s its hands need not be slower"
+        slow = f"the slowest mode decays in {decay or 0:.3g} s, so hands may still move as fast after {duration:g} s"
         return cls(
             duration_s=duration,
             humans=findings.index.size,
@@ -186,7 +186,7 @@ class Traces:
         yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
         some = f"{self.witnessed} of {self.humans}: random ones, the nearest to the limit, all lossless ones"
         yield "traces by both engines", some if 0 < self.witnessed < self.humans else None
-        undecided = f"not decidable in {self.duration_s:g} s: {self.undecided} of {self.measured}, left to eigenvalues"
+        undecided = f"undecided in {self.duration_s:g} s: {self.undecided} of {self.measured}, see their eigenvalues"
         yield "growth on traces", undecided if self.undecided else None
         yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
 

@@ -404,7 +404,7 @@ class LiveLoop:
             except Empty:
                 return
             if isinstance(event, Couple | _Delay):
-                self._note = f"{words(event)}: being made"
+                self._note = f"{words(event)}: being prepared"
                 self._wanted.append((event, self._executor.submit(self._make, event)))
             else:
                 self._happen(event)

@@ -346,8 +346,8 @@ def test_what_the_finest_run_misses_is_no_chance():
 @pytest.mark.parametrize(
     ("scenario", "error", "message"),
     [
-        (RESTING, 1e-3, "nothing moves: give a tap, or a human an amplitude"),
-        (RESTING.replace(device=RUBBING.device), 1e-3, "nothing moves: give"),
+        (RESTING, 1e-3, "nothing moves: add a tap or a voluntary motion"),
+        (RESTING.replace(device=RUBBING.device), 1e-3, "nothing moves: add"),
         (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
         (SCENARIO, 1e-18, "--error 1e-18: the nearest setting, exponential x 1, has error"),
         (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),

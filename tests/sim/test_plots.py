@@ -190,13 +190,13 @@ def test_binding_frequencies_are_marked(drawn):
     assert "soft (no curve: see the notes)" in lines(anywhere)
     here, anywhere = drawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
     assert here.get_ylabel() == "required damping over available damping"
-    assert anywhere.get_title() == "any passive environment (with a multiplier of this one)"
+    assert anywhere.get_title() == "any passive environment (with a multiplier for this environment)"
 
 
 def test_drawn_singular_values_are_the_reported_ones(drawn):
     figure = drawn(plots.plot_singular_values, report())
     assert [axis.get_title() for axis in figure.axes] == ["soft", "stiff"]
-    assert legend(figure) == ["E, the environment", "F, what the devices see", "M, the mismatch"]
+    assert legend(figure) == ["E, the environment", "F, felt at the devices", "M, the mismatch"]
     assert [text.get_text() for text in figure.axes[0].texts] == ["M = 0"]
     np.testing.assert_array_equal(lines(figure.axes[0])["E, the environment"], np.transpose([HZ, [4.0] * 3]))
     figure = drawn(plots.plot_perceived, report())

@@ -223,7 +223,7 @@ def test_the_loop_runs_during_a_design(none):
     running = LiveLoop(none, later)
     press(running, "7", "Up")
     frame = running.frame(0.1)
-    assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being made")
+    assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being prepared")
     later.work()
     made = running.frame(0.2).prepared
     assert (made.label, made.scenario.theta) == ("published", (1, 2))
