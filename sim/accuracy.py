@@ -650,5 +650,5 @@ def simulated_growth(
     """Return the growth rate [1/s] of an engine's loop; with walls, that of the worst contact state."""
     held = _measured_hold(simulation, engine, integrator, substeps)
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
-        raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")
+        raise InputError(f"engine {engine_name(engine)}: a tick from rest gives numbers that are not finite")
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())

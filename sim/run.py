@@ -251,7 +251,7 @@ def _room(width: int, ticks: int, T: float) -> Array:
     for needed, there, what in ((8 * _COLUMNS, free, "memory"), (2 * each, disk, tempfile.gettempdir())):
         if needed * ticks > there:
             needs = f"{ticks * T:g} s need {ticks * needed / 2**30:.3g} GiB of {what}, {there / 2**30:.3g} are free"
-            raise InputError(f"duration: {needs}: allowed are {there / needed * T:.3g} s; sim.validate keeps no traces")
+            raise InputError(f"duration: {needs}: allowed are {there / needed * T:.3g} s; sim.validate stores none")
     with tempfile.TemporaryFile() as file:
         return np.memmap(file, np.float64, "w+", shape=shape).view(np.ndarray)
 

@@ -473,9 +473,9 @@ def is_world(scenario: Scenario) -> bool:
 def require_no_world(scenario: Scenario, what: str) -> None:
     """Raise InputError if the environment is a MuJoCo scene, for commands that cannot use one."""
     if is_world(scenario):
-        able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge take worlds"
+        able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge accept worlds"
         raise InputError(
-            f"environment.world: {what} takes networks only; {able}, linearise(world, pose) gives a network"
+            f"environment.world: {what} accepts networks only; {able}; linearise(world, pose) gives a network"
         )
 
 
@@ -673,7 +673,7 @@ def _require_keys(raw: dict[str, Any]) -> None:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace each name of a device in the catalogue, in `device` or in a [[device]], by the fields of that device."""
+    """Replace each name of a device in the catalogue by the device's fields, in `device` and in [[device]] tables."""
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -901,7 +901,7 @@ def _checked_own(value: Any) -> Any:
         with np.errstate(all="ignore"):
             force = np.asarray(human.voluntary_force(_TIMES))
         if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
-            raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected as many forces in N")
+            raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected two forces in N")
     return tuple(value)
 
 

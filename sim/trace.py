@@ -427,5 +427,5 @@ def growths(trace: Trace) -> list[Growth]:
     if n > 1 and not 0 < T < np.inf:
         raise InputError(f"the trace's samples are {T:g} s apart")
     if not np.abs(np.diff(trace.t) - T).max(initial=0.0) <= _EVEN * T:
-        raise InputError(f"the trace's samples are not evenly spaced: t steps by {T:g} s at first, not everywhere")
+        raise InputError(f"the trace's samples are not evenly spaced: t first steps by {T:g} s, later otherwise")
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]

@@ -183,7 +183,7 @@ def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
 
 
 class Lost:
-    """An engine whose tick ends outside the range of numbers."""
+    """An engine whose tick ends with numbers that are not finite."""
 
     def __init__(self, simulation):
         pass
@@ -199,5 +199,5 @@ class Lost:
 
 
 def test_diverging_engines_are_named(simulation):
-    with pytest.raises(InputError, match=r"engine .*:Lost: a tick from rest leaves the range of numbers"):
+    with pytest.raises(InputError, match=r"engine .*:Lost: a tick from rest gives numbers that are not finite"):
         simulated_growth(simulation, None, None, Lost)

@@ -372,7 +372,7 @@ def test_a_design_that_needs_a_model_names_another(tmp_path):
 @pytest.mark.parametrize("words", ["zwidth", "compare", "accuracy"])
 def test_other_commands_refuse_a_world_in_one_line(words):
     name, *options = words.split()
-    with pytest.raises(InputError, match="takes networks only") as caught:
+    with pytest.raises(InputError, match="accepts networks only") as caught:
         import_module(f"haptic_loop.cli.{name}").main([*options, "--scenario", "world-door"])
     assert "\n" not in str(caught.value)
 
