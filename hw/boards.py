@@ -20,10 +20,10 @@ from haptic_loop.hw.control import CLOCK_TOLERANCE
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.monitor import CommandMonitor
 
-_CLEARLY_FASTER = 1e-4  # relative difference of two clocks that a measurement over _COMPARED ticks tells from jitter
+_CLEARLY_FASTER = 1e-4  # relative difference of two clocks that stands out from jitter after _COMPARED ticks
 _EARLY = 1 / 16  # [periods] least lead of a sample over the leading board's, so that no step waits because of jitter
 _TOO_EARLY = 1.5  # [periods] largest lead of a sample; with a longer one, the board's force may come too late
-_SMOOTHED = 31  # leads in a median, which a host that freezes for a few ticks does not change
+_SMOOTHED = 31  # leads in a median; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
 _LONGEST = 5e-4  # [s] longest wait of one call
@@ -56,7 +56,7 @@ class _Board:
         self._steps = self._shifted = 0  # steps since the board was first paired; their number at the last shift
 
     def configure(self, config: wire.Config) -> None:
-        """Reset the board and send its part of a configuration."""
+        """Forget all samples and store the board's part of a configuration."""
         theta = min(wire.MAX_THETA, config.theta + self.behind)
         self.config = config._replace(theta=theta, cap=config.cap[self.axes], slew=config.slew[self.axes])
         self.told = CommandMonitor(self.config)
@@ -69,7 +69,7 @@ class _Board:
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
-        """Receive a STATE. Raises SafetyStop if the board applies a force that it was not sent."""
+        """Receive a STATE. Raises SafetyStop if the board applies a force that the host did not send."""
         ticks = wire.distance(state.tick, self.last.tick) if self.last else 1
         if ticks <= 0:
             return
@@ -88,7 +88,7 @@ class _Board:
         return (step + self.offset - shifted) & 0xFFFF
 
     def sample(self, step: int, at: int) -> wire.State | None:
-        """Return the sample of a step that began at `at` [us], if it has come."""
+        """Return the sample for a step that began at `at` [us], or None if that sample has not come."""
         if self.offset is None:  # pair the step with the newest sample that is early enough
             early = [tick for tick, (_, came) in self.states.items() if at - came >= _EARLY * self.period]
             if self.behind and not early:
@@ -138,7 +138,7 @@ class _Board:
                 raise wire.SafetyStop(f"its clock is {-100 * faster:.2g} % slower than the leading one")
 
     def due(self, step: int) -> int | None:
-        """Return the tick at which the force of a step acts, or None where that tick has no length."""
+        """Return the tick at which the force of a step acts, or None if that tick has no length."""
         later = (step + self.config.theta) & 0xFFFF
         tick = self.tick_of(later)
         return None if tick == self.tick_of((later + 1) & 0xFFFF) else tick
@@ -162,7 +162,7 @@ def _forget(entries: dict[int, Any], count: int) -> None:
 
 
 class Boards:
-    """Several boards at serial ports as one device with all their axes."""
+    """Drive several boards at serial ports as one device with all their axes."""
 
     def __init__(
         self,
@@ -309,7 +309,7 @@ class Boards:
         )
 
     def _margin(self, samples: Sequence[wire.State]) -> int:
-        """Return the least margin of the boards' answers; before forces act, without their waits for other boards."""
+        """Return the least margin of the boards' answers. Until forces act, waits for other boards do not count."""
         margins = []
         for board, state in zip(self._boards, samples, strict=True):
             if state.margin_us == wire.NO_MARGIN:

@@ -1,11 +1,11 @@
 """The device's side of the link, without clock or port: safety states, and forces latched at tick k + theta.
 
-With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
+With theta = 0 a force is latched as soon as it comes, within the tick that it answers. The caller must then set the
+motors to `applied` at once.
 
 This state machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
-There are two implementations because rehearsals and Force Dimension devices, which it also drives, must not need a
-compiler, and because each tests the other.
-docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
+There are two implementations because each tests the other, and because rehearsals and Force Dimension devices run this
+one without a compiler. docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
 """
 
 from haptic_loop.hw import protocol as wire
@@ -18,12 +18,12 @@ class Device:
     """One microcontroller. Call tick() once per period, receive() when bytes come, estop() and fault() at any time."""
 
     def __init__(self, info: wire.Info) -> None:
-        """Begin silent. Raises ValueError where a field of `info` does not fit into its frame."""
+        """Begin in the state SILENT. Raises ValueError where a field of `info` does not fit into its frame."""
         self.info = info
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
-        self.unexpected = 0  # well-formed frames that this device has no use for
-        self.deadman = False  # whether a hand holds it; a firmware with a deadman sets it
+        self.unexpected = 0  # well-formed frames that this device cannot use
+        self.deadman = False  # whether a hand holds the deadman; set by the caller if the device has one
         self.phase, self.cause = wire.Phase.SILENT, wire.Cause.NONE
         self.config: wire.Config | None = None
         self.k, self.now = 0, 0  # number of the current tick, and the clock [us] at its start
@@ -131,7 +131,7 @@ class Device:
                 self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
-        """Store a force until its tick, if that tick is ahead, is theta after the answered one and has no force."""
+        """Store the first force for a tick that is ahead and theta after the source; apply it at once if theta = 0."""
         known = frame.command == wire.Command.RUN or (
             frame.command in (wire.Command.IDLE, wire.Command.ARM) and not any(frame.force)
         )
@@ -141,7 +141,8 @@ class Device:
         if self.config is None or wire.distance(frame.apply_at, frame.source) != self.config.theta:
             return
         at_once = not self.config.theta
-        ahead, slot = wire.distance(frame.apply_at, self.k) + at_once, frame.apply_at % _SLOTS  # ticks until it is late
+        # `ahead`: ticks until the force is late
+        ahead, slot = wire.distance(frame.apply_at, self.k) + at_once, frame.apply_at % _SLOTS
         if ahead > self.config.due or (ahead > 0 and self.slots[slot] is not None):
             return
         since = (now_us - self.now) & 0xFFFFFFFF

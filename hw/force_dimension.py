@@ -1,8 +1,8 @@
-"""Drive devices of Force Dimension by their maker's library and its Python package. They have no clock.
+"""Drive Force Dimension devices, which have no clock, through the maker's library and its Python package.
 
 The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
-after the sample (theta = 0). The certificate is for the periods up to T_max and the latencies within [t1, t2] that the
-host kept in a measurement at zero force.
+after the sample (theta = 0). The certificate covers periods up to T_max and latencies within [t1, t2], which the
+host measures at zero force.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SHORTEST = 0.75  # a period that follows a late one lasts at least this share o
 
 
 class _Library:
-    """Look up the package's calls, some of which are in a module for experts. They return -1 for an error."""
+    """Look up the package's calls, some of which are in a module for experts. The calls return -1 for an error."""
 
     def __init__(self) -> None:
         self._modules = import_module(f"{_PACKAGE}.dhd"), import_module(f"{_PACKAGE}.dhd.expert")
@@ -105,7 +105,7 @@ class ForceDimension:
         ]
 
     def info(self) -> wire.Info:
-        """Return INFO; the library does not tell damping and encoder step, so these are the scenario's."""
+        """Return INFO; the library does not report damping and encoder step, so these are the scenario's."""
         return self._info
 
     def configure(self, config: wire.Config) -> int:
@@ -164,7 +164,7 @@ class ForceDimension:
         return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
 
     def _strongest(self, config: wire.Config, index: str) -> float:
-        """Return the length [N] of the largest force that a device may be asked for, plus 1 % for rounding."""
+        """Return the length [N] of the largest force that a device may have to make, plus 1 % for rounding."""
         each = enumerate(zip(self._where, config.cap, self._info.force_step, strict=True))
         caps = {i: 1e-6 * cap * step for i, ((own, _), cap, step) in each if own == index and i not in self._shared}
         return 1.01 * math.hypot(*caps.values())

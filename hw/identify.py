@@ -28,16 +28,16 @@ from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, starts, viscosit
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
-_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length in `seconds`
-_LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest
+_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length over `seconds`
+_LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as shares of the largest
 _CYCLES = 3  # cycles of the swing at each amplitude
 _LEAD = 0.3  # [s] of zero force, while the gain rises
 _BAND_HZ = (20.0, 300.0)  # band in which the motion shows a transmission
-_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # least log m1, log m2, log k, log d, b, lag and delay
-_STEPS = 40  # most evaluations of a fit
-_VAGUE = 0.3  # largest unexplained part of the motion; with more, the fitted transmission is rejected
-_SPRUNG = 5.0  # [N/m] largest stiffness of a free axis with its cable; a hand has more
-_SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
+_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # lower limits of log m1, log m2, log k, log d, b, lag, delay
+_STEPS = 40  # largest number of evaluations in a fit
+_VAGUE = 0.3  # largest unexplained share of the motion with which a fitted transmission is accepted
+_SPRUNG = 5.0  # [N/m] largest stiffness of a free axis with its cable; a hand is stiffer
+_SUSPICIOUS = 0.1  # relative excess of damping up to which no hand is suspected
 
 
 # the excitation, a force that does not depend on the motion
@@ -45,7 +45,7 @@ _SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """A program for a session that plays forces fed back. In open loop it can make no passive person unstable."""
+    """A program that plays given forces in a session. Without feedback it can make no passive person unstable."""
 
     signal: Array  # (ticks, m) [N]
     T: float  # [s]
@@ -121,11 +121,12 @@ def chirp(
 ) -> Excitation:
     """Return the force to play to a device: cosines of exponentially rising frequency, a swing, then silence.
 
-    The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each
-    takes `seconds`, and the silence takes half of that. Two slow motions at two levels of force show friction that is
-    not viscous, and the swing between them shows it at the speed of a session. A long cosine at the swing's force
-    follows the swing and shows how damping changes with frequency. Each part ends at a whole cycle, so that a free mass
-    does not drift away. The last one ends a quarter of a cycle later, so that the device is released while it moves.
+    The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each of
+    these three takes `seconds`, and the silence takes half of that. Two slow motions at two levels of force show
+    friction that is not viscous, and the swing between them shows it at the speed of a session. A long cosine at the
+    swing's force follows the swing and shows how damping changes with frequency. Each part ends at a whole cycle, so
+    that a free mass does not drift away. The last one ends a quarter of a cycle later, so that the device is released
+    while it moves.
     """
 
     def sweep(low: float, high: float, further: float = 0.0, times: int = 1) -> Array:
@@ -152,7 +153,7 @@ class _Transmission:
     motor_mass: float  # [kg]
     handle_mass: float  # [kg]
     stiffness: float  # [N/m]
-    mode_hz: float  # free at both ends
+    mode_hz: float  # [Hz] natural frequency with both ends free
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ class Estimate:
 
     @property
     def delta(self) -> float:
-        """The bound [N s/m] at every speed and frequency."""
+        """Lower bound of the damping [N s/m] at every speed and frequency."""
         return min(self.friction.delta, self.viscosity.lasting)
 
 
@@ -195,7 +196,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
     if law.delta <= 0:
         raise ValueError(
             f"the record does not tell viscous from dry friction: {law.viscous:.3g} N s/m viscous, "
-            f"{law.coulomb:.3g} N dry, {1e3 * law.rms:.2g} mN unexplained; take one with more force or a longer one"
+            f"{law.coulomb:.3g} N dry, {1e3 * law.rms:.2g} mN unexplained; record with more force, or for longer"
         )
     examined = at_radius(viscosity(*hand, lever * step, found), lever)
     if reason := doubt(examined, law):
@@ -247,12 +248,12 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
     """Return one estimate per axis from two or more recordings, and warnings if a hand damped only some of them.
 
-    Each axis has the estimate of its least damped sitting, and the least bound of all sittings. A passive hand adds
-    damping to a device and takes none away (docs/hardware.md), so one sitting without a hand is enough. Raises
-    ValueError where no other sitting agrees with the least damped one, because that one may not be free of a hand.
+    Each axis gets the estimate of its least damped recording, and the least bound of all recordings. A passive hand
+    adds damping to a device and takes none away (docs/hardware.md), so one recording without a hand is enough. Raises
+    ValueError where no other recording agrees with the least damped one, because a hand may have damped that one, too.
     """
     if len(sittings) < 2:
-        raise ValueError("one sitting tells no hand that only damps from more damping of the device: take two")
+        raise ValueError("one sitting cannot tell a hand's damping from the device's: take two (--sittings)")
     axes, words = [], []
     for i, axis in enumerate(zip(*sittings, strict=True), start=1):
         least, *others = sorted(axis, key=lambda e: e.viscous)
@@ -274,7 +275,7 @@ def unbounded(estimates: Sequence[Estimate]) -> str:
         if e.delta <= 0:
             return (
                 f"axis {i}: the record does not exclude that all damping is gone beyond "
-                f"{1 / (2 * np.pi * e.viscosity.memory):.2g} Hz: take a longer one (--seconds), or use a finer encoder"
+                f"{1 / (2 * np.pi * e.viscosity.memory):.2g} Hz: record for longer (--seconds), or use a finer encoder"
             )
     return ""
 
@@ -292,7 +293,7 @@ def _declared(scenario: Scenario, session: Session) -> list[float]:
 
 
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
-    """Limit the bounds to the declared damping, because more may come from a hand."""
+    """Limit the bounds to the declared damping, because any excess may come from a hand."""
     said = _declared(scenario, session)
     return [
         replace(e, friction=replace(e.friction, delta=min(e.delta, limit)))

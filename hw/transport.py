@@ -1,4 +1,4 @@
-"""Run a session in real time over a serial port (pyserial), in one thread that waits for the port only.
+"""Run a session in real time over a serial port (pyserial), in one thread that waits only for the port.
 
 A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So gc.freeze() excludes the loaded objects, and the
 collector is off during the session.
@@ -26,7 +26,7 @@ from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
-_UNUSED = 9600  # baud set on a port without UART: it has no effect, whereas 1200 resets many boards
+_UNUSED = 9600  # baud rate for a port without UART, where it has no effect; but 1200 resets many boards
 _STALL_SECONDS, _STALL_MS = 2.0, 2.0  # duration of the measurement of stalls; the least stall that gives a warning
 _GRACE_US = 50_000  # time after the end in which a lost STOP is repeated
 
@@ -45,7 +45,7 @@ class SerialPort:
             self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise InputError(f"--port {path}: {error}") from None
-        with suppress(Exception):  # not all drivers have it; the latency timer of FTDI chips goes from 16 ms to 1 ms
+        with suppress(Exception):  # if the driver has it; on FTDI chips it lowers the latency timer from 16 ms to 1 ms
             self._serial.set_low_latency_mode(True)
 
         self._fd = self._serial.fileno()
@@ -107,7 +107,7 @@ def preflight(paths: Sequence[str]) -> str:
 
 def _stalls() -> str:
     stall = 1e3 * _worst_stall()
-    busy = " (close what is busy; a real machine, no virtual one)" if stall > _STALL_MS else ""
+    busy = " (close busy programs; use a real machine, not a virtual one)" if stall > _STALL_MS else ""
     return f"worst stall in {_STALL_SECONDS:g} s {stall:.1f} ms{busy}"
 
 
@@ -117,7 +117,7 @@ def _scheduling() -> str:
     policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     if policy in (os.SCHED_FIFO, os.SCHED_RR):
         return f"real-time scheduling, priority {os.sched_getparam(0).sched_priority}"
-    return "no real-time scheduling (allow it: `rtprio 20` in /etc/security/limits.conf, or start by chrt -f 10)"
+    return "no real-time scheduling (allow it: `rtprio 20` in /etc/security/limits.conf, or start with chrt -f 10)"
 
 
 def _locked_memory() -> str:
@@ -158,7 +158,7 @@ class Live(Driver):
         plan: Callable[[Ages], Sequence[Armable]],
         operator: Operator,
         keyboard: int | None = None,  # a file descriptor with single keys
-        watch: Callable[[Session], None] = lambda session: None,  # called a few times a second
+        watch: Callable[[Session], None] = lambda session: None,  # called ten times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
     ) -> None:
         super().__init__(session, device, self._designed, lambda: int(time.monotonic_ns() * pace) // 1000)
@@ -210,8 +210,8 @@ class Live(Driver):
             self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
-        """Design a coupling; SIGINT interrupts the design. Keys typed meanwhile are read before it can be armed."""
-        self._watch(self.session)  # the design takes a while
+        """Design a coupling; SIGINT interrupts the design. Keys typed meanwhile are handled before arming."""
+        self._watch(self.session)  # call it now, because the design takes a while
         try:
             with _interruptible():
                 programs = self._design(ages)
@@ -220,7 +220,7 @@ class Live(Driver):
             raise SafetyStop("SIGINT during the design") from None
         if self._typed():
             self._pressed()
-        gc.collect()  # the design has loaded the solver
+        gc.collect()  # freeze the solver that the design has loaded
         gc.freeze()
         return programs
 

@@ -5,15 +5,15 @@ that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no su
 and frequencies where a session needs the damping. A record that shows either kind of friction is refused.
 
 Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the work of the
-motor is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, and l is the lag of an
-amplifier. For viscous and dry friction q = 0 at every amplitude. Where friction thins, q < 0, and the damping at the
-speed v is b + q v.
+motor is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, c is dry friction, f0 a
+constant force, k a spring's stiffness and l the lag of an amplifier. For viscous and dry friction q = 0 at every
+amplitude. Where friction thins, q < 0, and the damping at the speed v is b + q v.
 
 Frequency: a model is fitted to the motion under the force less dry friction. It has a transmission, an amplifier's lag
 and, for each of several tau, a Maxwell element (c, tau) beside b. The element's damping c/(1 + (w tau)^2) acts in the
 record's slow strokes and vanishes at high frequency, where only b is left. A certificate uses the damping at every
-frequency, so only b counts. The bound is the least lower end of b over all tau. A memory that the record cannot
-exclude, for example because of a coarse encoder, therefore lowers the bound.
+frequency, so only b counts. The bound is the least lower confidence limit of b over all tau. A memory that the record
+cannot exclude, for example because of a coarse encoder, therefore lowers the bound.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
-_FAST = 0.25  # a stroke counts from this part of the highest speed on, where dry friction is saturated
+_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed: dry friction is saturated
 _FEW = 8  # least number of strokes
-_SIGMAS = 2.0  # standard errors of the thinning that are allowed for
+_SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
 #: [s] time constants of a memory; a shorter one counts as damping: an encoder of 5 um at 0.25 kg cannot exclude 1 ms
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
-_BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um sees nothing of 1 N
-_LOUD = 0.05  # least force at a frequency, as a part of the strongest in the band
+_BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um does not resolve the motion by 1 N
+_LOUD = 0.05  # least force at a frequency, as a share of the strongest in the band
 _POINTS = 200  # frequencies of a first, rough fit
 _ALIASES = (-1, 0, 1)  # sampling adds frequencies at multiples of 1/T; further ones add less than 1e-3
 _MODES_HZ = np.geomspace(20.0, 300.0, 40)  # initial frequencies of a transmission's mode
 _PARTS = (0.15, 0.3, 0.5, 0.65)  # initial shares of the motor in the mass
-_STEPS = 30  # most evaluations of a fit
-_VAGUE = 3.0  # prior standard deviation of a logarithm
+_STEPS = 30  # largest number of evaluations in a fit
+_VAGUE = 3.0  # prior standard deviation of log m1, log m2, log k and log d
 _B, _C = 4, 7  # places of b and c among the parameters
 _MUCH = 0.15  # largest share of a memory in the damping for which the linear fit suffices
 _QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
@@ -54,10 +54,10 @@ class Viscosity:
     """The loss of damping with speed and with frequency that a record shows."""
 
     speed: float  # [m/s] highest speed of the record
-    thinning: float  # [N s/m] damping that is lost from slow motion to that speed; 0 where friction does not thin
-    thinning_error: float  # [N s/m] its standard error
-    lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left beyond a memory
-    memory: float  # [s] time constant of the memory that this bound allows for
+    thinning: float  # [N s/m] damping lost between slow motion and that speed; 0 if friction does not thin
+    thinning_error: float  # [N s/m] standard error of `thinning`
+    lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left at high frequency
+    memory: float  # [s] time constant of the memory that this bound assumes
     remembers: bool  # whether the record shows a memory, not only fails to exclude one
 
 
@@ -141,7 +141,7 @@ class Spectra:
         band: tuple[float, float] = _BAND_HZ,
         points: int = _POINTS,
     ) -> None:
-        """Compare at about `points` frequencies within `band` [Hz]; `held` where the handle is clamped."""
+        """Compare at about `points` frequencies within `band` [Hz]; `held` if the handle is clamped."""
         self.T, self.ticks, self.held = T, len(x), held
         F, hz = np.fft.rfft(force), np.fft.rfftfreq(len(x), T)
         steps = np.fft.rfft(np.diff(x, append=x[-1]))
@@ -158,7 +158,7 @@ class Spectra:
     def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
 
-        The motion at the end of the record counts as stopped by a force `end` [N] in one more tick.
+        The model assumes that a force `end` [N] in one more tick stops the motion left at the end of the record.
         """
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
         link = k + d * s
@@ -167,7 +167,7 @@ class Spectra:
         return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * (self.force + end)
 
     def error(self, p: Array, tau: float, end: float = 0.0) -> Array:
-        """Return motion less model, real and imaginary parts."""
+        """Return the real and imaginary parts of motion less model, over the largest motion."""
         error = self.motion - self.model(p, tau, end)
         return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
 
@@ -188,18 +188,18 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
 
 
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
-    """Return the least lower end of b [N s/m] over all tau, that tau [s], and whether the record shows a memory.
+    """Return the least lower limit of b [N s/m] over all tau, its tau [s], and whether the record shows a memory.
 
     `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. A small
     Maxwell element changes the motion little beside the mass, so its effect is linear in c, and each tau takes one
     linear fit. But the lag and the transmission of the model without memory may imitate a large element. So all
     parameters are also fitted from a start with most of the damping in the element. Such a fit counts if it explains
-    the record about as well.
+    the record about as well as the model without memory.
     """
     import scipy
 
     few, every = Spectra(x, force, T), Spectra(x, force, T, points=len(x))
-    low = np.array([-20.0] * 4 + [0.0, 0.0, -T, 0.0, -np.inf])  # an encoder may be read later than forces latch
+    low = np.array([-20.0] * 4 + [0.0, 0.0, -T, 0.0, -np.inf])  # delay >= -T: an encoder may be read after forces latch
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf, np.inf])
 
     def error_of(spectra: Spectra, tau: float, p: Array) -> Array:

@@ -305,7 +305,7 @@ def test_undetectable_hands_add_no_damping(odd):
         assert words == []
         assert (found.delta, found.viscous) == (odd["ideal"].delta, odd["ideal"].viscous)
         assert found.delta <= 1
-    with pytest.raises(ValueError, match="one sitting tells no hand that only damps from more damping"):
+    with pytest.raises(ValueError, match="one sitting cannot tell a hand's damping from the device's"):
         settled([sitting(odd, "ideal")])
 
 

@@ -272,7 +272,7 @@ def test_the_preflight_says_what_the_machine_can_do():
 def test_a_busy_machine_is_told_what_to_do(monkeypatch):
     for stall, told in ((5e-4, False), (5e-3, True)):
         monkeypatch.setattr(transport, "_worst_stall", lambda stall=stall: stall)
-        assert ("close what is busy" in transport._stalls()) == told
+        assert ("close busy programs" in transport._stalls()) == told
 
 
 # the whole command in virtual time
