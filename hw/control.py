@@ -3,7 +3,7 @@
 The link takes `link` ticks from a sample to the latch of its force, for every axis. Where a channel's delay theta_i
 in the scenario is longer, the host delays its force by the remaining theta_i - link ticks. The loop therefore has the
 scenario's delays unless the link is slower; then it has longer ones. Where the device latches a force on arrival,
-`link` is 0 and the scenario's latency is the measured one.
+`link` is 0, and the measured latency replaces the scenario's.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, scene_of
 
-#: relative difference of boards' clocks that a certificate covers by a longer T_max: that of ceramic resonators
+#: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
-_SPEED_SECONDS = 0.01  # window of a speed estimate, in which one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # most ticks in a row whose speed changes by over 0.6 mm/tick: one way, ten make 5 m/s at T = 1.2 ms
-_FALLBACK = ("spring-damper", "any-environment")  # a reserve, where the requested kind is not certified
+_SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
+_SHAKING = 10  # most ticks in a row with a speed change above 0.6 mm/tick; ten one way reach 5 m/s at T = 1.2 ms
+_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of a reserve of the last resort
 
 
 class Controller(Protocol):
@@ -84,8 +84,8 @@ def host_controller(
 
     With several boards, the link adds `link` + `behind` (m,) ticks.
 
-    With `lag`, the limiter's rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces. The channels of each slice
-    in `balls` are limited as one vector. Raises ValueError where the link is slower than a delay of the loop.
+    With `lag`, the rho (m,) [N/m] of a limiter, forces are limited to `cap` (m,) [N]. The channels of each slice in
+    `balls` are limited as one vector. Raises ValueError where the link is slower than a delay of the loop.
     """
     waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
     return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
@@ -117,8 +117,9 @@ class BudgetPlan:
     def of(cls, start: float, cap: float, delta: Sequence[float], units: Units, config: Config, T: float) -> BudgetPlan:
         """Return the plan for a device of this configuration.
 
-        The device holds a force for `hold` missed ticks, then ramps it to zero. Its slew rate lets an older force act
-        for ceil(cap / slew) further ticks that are not missed. After them, the force lies between forces sent since.
+        The device holds a force for `hold` missed ticks, then ramps it to zero. Because of its slew rate, an older
+        force acts for up to ceil(cap / slew) more ticks with an answer. After those ticks, the applied force lies
+        between forces that were sent later.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -127,7 +128,7 @@ class BudgetPlan:
 
 
 class SentBudget:
-    """The energy budget that limits shaped forces before they are sent. Limited forces are cut to whole steps."""
+    """The energy budget that limits shaped forces before they are sent. It truncates limited forces to whole steps."""
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
@@ -155,11 +156,11 @@ class SentBudget:
 
     @property
     def spent(self) -> float:
-        """The most energy [J] that the forces sent so far take from the start; at least 0."""
+        """Upper bound [J] of the energy that the forces sent so far take from W0; at least 0."""
         return max(0.0, self.plan.start - float((self._budget.energy - self._budget.reserved)[0]))
 
     def figures(self) -> BudgetFigures:
-        """Return what the budget has done since arming."""
+        """Return the figures of the budget since arming."""
         loss = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
         dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
         return self._budget.figures(f"no passive hand is given {loss} {dissipated}")
@@ -185,13 +186,13 @@ class WorldController:
         scene = scene_of(scenario, coupling)  # raises InputError for a coupling without V
         assert V is not None
         self.T, self.port, self.shell = scenario.T, scene.port(cap, scenario.balls), Shell(V, start=start)
-        self.least = 0.0  # [J] least value so far of the sum of f'(u - u_-)
+        self.least = 0.0  # [J] least sum so far over ticks of f'(u[k] - u[k-1]), with positions u of the contacts
         self.seconds: list[float] = []  # CPU time of each step of the scene
         self._start, self._sent = start, np.zeros((len(waits), 1))
         self._open = False  # whether the force of the current tick is still to be booked
         self._lines = [deque([0] * n) for n in waits]
         self._test: SentBudget | None = None
-        self._tested = 0.0  # [J] charged for tests of motors
+        self._tested = 0.0  # [J] energy charged for motor tests
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Return the scene's forces (m,) [N] for displacements x (m,) [m]."""
@@ -218,9 +219,10 @@ class WorldController:
     def limit_test(
         self, plan: BudgetPlan, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int
     ) -> tuple[int, ...]:
-        """Return the steps of a test force that the energy of the shell allows.
+        """Return the steps of a test force that the energy of the shell allows, in place of `steps`.
 
-        The arguments beside `plan` are those of SentBudget.limit.
+        The handles are at x (m,) [m], f = `applied` (m,) [N] acts from this tick on, and the `missed` ticks before it
+        had no STATE. `plan` has the parameters of the energy budget.
         """
         if self._test is None:
             start, missed = float(self.shell.energy[0]), 0
@@ -228,7 +230,7 @@ class WorldController:
         return self._test.limit(steps, x, applied, missed)
 
     def end_test(self) -> None:
-        """Charge the shell with the energy that a test gave, if one has ended."""
+        """Charge the shell with the energy of the motor test that has ended, if any."""
         if self._test is not None:
             self.shell.charge(self._test.spent)
             self._tested, self._test = self._tested + self._test.spent, None
@@ -263,7 +265,7 @@ class Arming:
     program: Armable
     config: Config  # configuration of the device
     budget: SentBudget | None = None
-    test_plan: BudgetPlan | None = None  # for motor tests in a world; None where its shell limits them
+    test_plan: BudgetPlan | None = None  # plan for motor tests in a world; None if the shell limits them
 
 
 class Drive:
@@ -280,12 +282,12 @@ class Drive:
         expected: monitor.Expected,
         still: Sequence[int],
     ) -> None:
-        """Take `still` (m,) [counts], the encoders' noise, and `expected`, which predicts motions in its test."""
+        """Take `still` (m,) [counts], the encoders' noise, and `expected`, which predicts motions in encoder tests."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
         self.gain = Gain(limits, T)
-        self.ended = False  # whether the gain has fallen to 0, and the motors have passed their last test
+        self.ended = False  # whether the gain has fallen to 0 and the last motor test, if any, is passed
         self.force = (0.0,) * config.axes  # [N] last force sent
         self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
@@ -302,7 +304,7 @@ class Drive:
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # each board has its own
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # else each board has one
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
@@ -366,7 +368,7 @@ class Drive:
         ticks: int,
         test: tuple[float, ...] | None,
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return force (m,) [N] and steps that a world's energy accounts allow. During a test the scene sends none."""
+        """Return the force (m,) [N] and steps that a world's energy accounts allow. A test suppresses scene forces."""
         nothing, plan = (0,) * len(steps), self._test_plan
         pushes = plan is not None and test is not None and any(test)
         allowed = world.limit(nothing if pushes else steps, self.units.force_step)
@@ -390,7 +392,7 @@ class Drive:
                 self._shaking = self._shaking + 1 if shakes else 0
                 if self._shaking > _SHAKING:
                     raise SafetyStop(
-                        f"encoder {shakes} shakes: at every tick its speed changes as no hand can change it"
+                        f"encoder {shakes} shakes: at every tick its speed changes by more than a hand can cause"
                     )
         recent = self._recent
         if ticks == 1 or self.x is None:
@@ -442,7 +444,7 @@ class Armable(Protocol):
     @property
     def name(self) -> str: ...  # name in the log
     @property
-    def margin_us(self) -> float: ...  # [us] by which a force must precede its latch, or the end of its tick
+    def margin_us(self) -> float: ...  # [us] least time from a force to its latch, or if theta = 0, to its tick's end
     def controller(self, cap: Sequence[float]) -> Controller: ...  # return a new controller for `cap` (m,) [N]
 
 
@@ -488,7 +490,7 @@ class CertifiedCoupling:
         return host_controller(loop, self.chosen.coupling, self.link, cap, lag, self.behind, balls)
 
     def capped(self, cap: Sequence[float]) -> Assessment:
-        """Return the assessment with the force cap (m,) [N] of a session in its report; no proof depends on it."""
+        """Return the assessment with the force cap (m,) [N] of a session; no proof depends on this cap."""
         return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
 
     def remarks(self) -> list[str]:
@@ -498,7 +500,7 @@ class CertifiedCoupling:
             said.append(f"held torques: {torques}")
         if self.scenario.balls and self.scenario.environment.walls:
             said.append(
-                "before walls forces are limited axis by axis, to the box inside the limit of each force vector"
+                "in front of walls, forces are limited axis by axis, to the box inside the limit of each force vector"
             )
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
@@ -522,7 +524,7 @@ def certified_coupling(
     start: float = START_J,
     behind: tuple[int, ...] = (),
 ) -> CertifiedCoupling:
-    """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: host clock).
+    """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: latch on arrival).
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
     them, with W0 = `start` [J]. With several boards, forces act `behind` (m,) ticks later than `link`, and each board
@@ -564,7 +566,7 @@ def certified_couplings(
     spare: int = 2,
     **more: Any,
 ) -> tuple[CertifiedCoupling, ...]:
-    """Return the coupling for the measured delay and up to `spare` reserves, each certified for one tick more.
+    """Return the coupling for the measured delay, and up to `spare` reserves that are each certified for one tick more.
 
     `more` are the other arguments of `certified_coupling`.
 
@@ -590,10 +592,10 @@ _EQUAL = 1e-6  # relative difference of static stiffnesses that counts as none: 
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
-    """Return whether `reserve` is softer at rest than `than` at longer delays, nowhere stiffer, and needs less damping.
+    """Return whether `reserve` needs less damping than `than`, is nowhere stiffer, and softer at longer delays.
 
-    Both couplings are compared in the loop with the reserve's delays. The stiffness is K, or, where
-    a coupling has no K, the static stiffness that the devices feel.
+    The damping is that of the loop with the reserve's delays. The stiffness is K, or, if one of the couplings has no K,
+    the static stiffness that the devices feel.
     """
     own, other = (each.assessment.gains for each in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))
@@ -608,7 +610,7 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
 
 
 def _felt_at_rest(certified: CertifiedCoupling) -> Array:
-    """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, that against fixed bodies."""
+    """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, that of the coupling alone."""
     loop = certified.scenario.loop(certified.case)
     V = certified.chosen.coupling.compliance(loop.T) if is_world(certified.scenario) else None
     return loop.F(certified.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())

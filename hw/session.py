@@ -1,4 +1,4 @@
-"""One session with a device. It computes forces and stops from messages and times, without port, clock or thread.
+"""One session with a device. It computes forces and stop messages from messages and times, without port or clock.
 
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
@@ -59,7 +59,7 @@ class Session:
         self.config: wire.Config | None = None  # the last configuration for the device
         self.programs: tuple[Armable, ...] = ()
         self.program: Armable | None = None
-        self.drive: Drive | None = None  # that of the last arming; None before the first and after the end
+        self.drive: Drive | None = None  # controller of the last arming; None before the first arming and after the end
         self.armings: list[Arming] = []
         self.worlds: list[WorldController] = []  # one per arming in a world
         self.record: Callable[[TraceRow], None] = lambda row: None
@@ -74,17 +74,17 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """Return the factor in front of every force; it is 0 unless forces act."""
+        """The factor that scales every force; 0 unless forces act."""
         return self.drive.gain.value if self.drive else 0.0
 
     @property
     def held(self) -> bool:
-        """Return whether the deadman at the device lets forces act."""
+        """Whether the deadman at the device allows forces."""
         return not self.settings.deadman or (self.link.last is not None and self.link.last.deadman)
 
     @property
     def hindrance(self) -> str | None:
-        """Return why the session cannot be armed at the moment, or None."""
+        """The reason why the session cannot be armed at the moment, or None."""
         if not self.held:
             return "the deadman at the device is not held"
         last, before = self.link.last, self.settings.elsewhere
@@ -98,24 +98,24 @@ class Session:
             for i, (n, then, step) in enumerate(places, 1)
             if abs(n - then) * step < _ELSEWHERE / self.limits.lever
         ]
-        where = f"within {1e3 * _ELSEWHERE / self.limits.lever:.3g} mm of where it was in the sitting before"
-        return f"handle {', '.join(near)} is {where}: take it elsewhere and let go" if near else None
+        where = f"within {1e3 * _ELSEWHERE / self.limits.lever:.3g} mm of its place in the previous sitting"
+        return f"handle {', '.join(near)} is {where}: move it farther and let go" if near else None
 
     @property
     def units(self) -> Units:
-        """Return the units of a device that has sent its INFO."""
+        """The units of the device, which must have sent its INFO."""
         assert self._units
         return self._units
 
-    # calls of a person and of the driver
+    # Calls by a person and by the driver
 
     def start(self, now: int) -> None:
-        """Wait for the device's INFO."""
+        """Begin to wait for the device's INFO."""
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
 
     def load(self, programs: Sequence[Armable], now: int) -> Said:
-        """Take the couplings for the measured delay, the one of least delay first, and configure its theta."""
+        """Take the couplings for the measured delay, sorted by delay, and configure the device for the first one."""
         self.now = now
         if self.stage != Stage.MEASURED:
             return ()
@@ -139,7 +139,7 @@ class Session:
             self.drive = Drive(arming, *told, self._expected, self._noise.still)
             if self.drive.world:
                 self.worlds.append(self.drive.world)
-            self._enter(Stage.ARMING, "asked to")
+            self._enter(Stage.ARMING, "requested")
         return ()
 
     def _accounts(self, config: wire.Config) -> tuple[SentBudget | None, BudgetPlan | None]:
@@ -177,24 +177,24 @@ class Session:
         return () if self.stage in ENDED else self._end(stage, cause)
 
     def retract(self, doubt: str) -> None:
-        """Count a session that ended as planned as stopped, because of `doubt` about its forces."""
+        """Change the end of a session from finished to stopped, because of `doubt` about its forces."""
         self._enter(Stage.STOPPED, f"{self.cause}, but {doubt}")
 
     def estop(self, cause: str, now: int) -> Said:
-        """Latch zero force on both sides at once, also where the session has ended."""
+        """Latch zero force on both sides at once, also after the session has ended."""
         self.now = now
         if self.stage == Stage.ESTOP:
             return ()
         return self._end(Stage.ESTOP, cause, wire.Reason.ESTOP)
 
-    # calls when the device answers
+    # Calls with the device's answers
 
     def met(self, info: wire.Info, now: int) -> Said:
         """Take the device's INFO."""
         return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
-        """Take the result in ACK, with which the device accepts `config` or refuses it."""
+        """Process the device's ACK: `refused` says whether the device accepts `config`."""
         return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
@@ -223,7 +223,9 @@ class Session:
             )
         silence = now - self.heard
         if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
-            return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms: hung, or reset by a brown-out?")
+            return self._end(
+                Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms: the device hangs, or a brown-out reset it"
+            )
         return ()
 
     def _no_answer(self) -> Said:
@@ -261,7 +263,7 @@ class Session:
         self.link.needed = self.program.margin_us
         return self._configure(self.program.link, f"{self.program.name}: {cause}")
 
-    # the stream of STATEs
+    # Answers to STATEs
 
     def _on_state(self, state: wire.State) -> Said:
         if self.info is None or state.axes != self.info.axes:
@@ -318,7 +320,7 @@ class Session:
     def _answer(
         self, state: wire.State, command: wire.Command, steps: tuple[int, ...] = (), theta: int | None = None
     ) -> Said:
-        """Return the FORCE for a STATE; it is zero without `steps`, and for the configured `theta` unless given."""
+        """Return the FORCE that answers a STATE: zero without `steps`, for the configured delay without `theta`."""
         assert self.config
         apply_at = (state.tick + (self.config.theta if theta is None else theta)) & 0xFFFF
         return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
@@ -333,7 +335,7 @@ class Session:
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
         return ()
 
-    # ramps and the end
+    # Ramps and the end
 
     def _soften(self, late: str) -> None:
         """Ramp out, and continue with the next coupling if there is one."""
@@ -377,7 +379,7 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
         raise wire.SafetyStop(f"the device is in {phase.name.lower()}, cause {state.cause.name.lower()}")
     armed = phase in (wire.Phase.ARMED, wire.Phase.HOLDING)
     if armed and stage not in DRIVING:
-        raise wire.SafetyStop("the device is armed, and nobody asked it to")
+        raise wire.SafetyStop("the device is armed without a command")
     if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
         raise wire.SafetyStop("the device has disarmed itself")
     if not armed and any(state.applied):
@@ -385,9 +387,9 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 
 def axis_by_axis(scenario: Scenario) -> Scenario:
-    """Return the scenario with a diagonal matrix below each full delta, because INFO states one number per axis.
+    """Replace each full damping matrix Delta by a smaller diagonal one, because INFO has one number per axis.
 
-    It is d diag(Delta) <= Delta with the least eigenvalue d of D^-1/2 Delta D^-1/2, D = diag(Delta).
+    The diagonal matrix is d D <= Delta with D = diag(Delta) and the least eigenvalue d of D^-1/2 Delta D^-1/2.
     """
     devices = []
     for device in scenario.device:
@@ -395,7 +397,7 @@ def axis_by_axis(scenario: Scenario) -> Scenario:
         own = np.diag(Delta)
         if (Delta != np.diag(own)).any():
             share = np.linalg.eigvalsh(Delta / np.sqrt(np.outer(own, own)))[0]
-            level = np.floor(1e6 * share * own) / 1e6  # INFO has uN s/m
+            level = np.floor(1e6 * share * own) / 1e6  # INFO has whole uN s/m
             device = msgspec.structs.replace(device, delta=tuple(level.tolist()))
         devices.append(device)
     return scenario.replace(device=tuple(devices)) if devices != [*scenario.device] else scenario
@@ -425,7 +427,7 @@ class _Shutdown:
     """Repeat STOP until the device rests, or an emergency stop until the device has latched it."""
 
     def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
-        """Take `acted`: whether the session was armed, so that STOP is repeated to a silent device every T [s]."""
+        """Repeat STOP to a silent device every T [s] if the session was armed (`acted`) or stops in an emergency."""
         self._stop, self._latch = (wire.Stop(reason),), reason == wire.Reason.ESTOP
         self._repeat, self._every = acted or self._latch, 1e6 * T
         self._began = self._sent = now
@@ -437,7 +439,7 @@ class _Shutdown:
         return () if self._rests else self._stop
 
     def again(self, now: int) -> Said:
-        """Repeat STOP where no STATE has confirmed it for a tick, because messages may be lost."""
+        """Return STOP again if no STATE has confirmed it for a tick, because messages may be lost."""
         due = now - self._sent >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
             return ()
@@ -449,4 +451,4 @@ class _Shutdown:
         if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
         self._obeys = False
-        return f"told to stop, the device still drives after {_OBEYING_US // 1000} ms: cut its power"
+        return f"the device still drives {_OBEYING_US // 1000} ms after STOP: cut its power"

@@ -372,7 +372,7 @@ def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     rehearsal.run(0.6)
     assert session.stage == Stage.DISARMED
     session.arm(session.now)
-    assert session.log[-1].cause.startswith(f"handle {axis + 1} is within 5 mm of where it was in the sitting before")
+    assert session.log[-1].cause.startswith(f"handle {axis + 1} is within 5 mm of its place in the previous sitting")
     for mm, seconds in ((5.1, 0.7), (4.9, 0.8), (5.1, 0.99)):
         put(sign * mm, axis)
         rehearsal.run(seconds)

@@ -141,7 +141,7 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
     last = session.link.last
     assert last
     session.take(last._replace(tick=(last.tick + 1) & 0xFFFF, status=Phase.ARMED), session.now)
-    assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed without a command")
 
 
 def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
