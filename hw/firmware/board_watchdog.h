@@ -1,6 +1,6 @@
-/* The board's own watchdog resets the board when nobody feeds it for so many ms. Without a watchdog a loop that hangs leaves
- * the last PWM standing, and the tick, which would take it away, never comes. After a reset the pins float and ENABLE is
- * pulled down. */
+/* watchdogStart(ms) starts the board's own watchdog (15 or 30 ms on AVR), which resets the board if watchdogFeed() is not
+ * called for this time. Without a watchdog, a loop that hangs keeps the last PWM for ever. After a reset the pins float and
+ * ENABLE is pulled down. */
 #ifndef BOARD_WATCHDOG_H
 #define BOARD_WATCHDOG_H
 
@@ -24,7 +24,7 @@ static inline void watchdogFeed() { WDOG3_CNT = 0xB480A602u; }
 #include <avr/wdt.h>
 static inline void watchdogStart(uint32_t ms) { wdt_enable(ms > 15 ? WDTO_30MS : WDTO_15MS); }
 static inline void watchdogFeed() { wdt_reset(); }
-#elif defined(BOARD_WATCHDOG) /* yours: void BOARD_WATCHDOG(uint32_t ms) starts it with ms > 0, and feeds it with 0 */
+#elif defined(BOARD_WATCHDOG) /* yours: void BOARD_WATCHDOG(uint32_t ms) starts the watchdog if ms > 0, feeds it if 0 */
 static inline void watchdogStart(uint32_t ms) { BOARD_WATCHDOG(ms); }
 static inline void watchdogFeed() { BOARD_WATCHDOG(0); }
 #else

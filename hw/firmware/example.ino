@@ -1,13 +1,14 @@
 /* A two-axis device on the serial link: quadrature encoders, PWM and direction to two motor drivers, an enable line and
- * an emergency stop. Written for Teensy 4, whose Serial is native USB. On another board check three things: that Serial is
- * the port you plug in (some boards call their native USB SerialUSB), that its core has availableForWrite() and it returns
- * more than 0 on an idle line (print it once: where it is always 0, nothing is ever sent), and what it returns then. Two
- * axes send an INFO of 68 bytes and STATEs of 32; where the idle line takes less than both at once, they wait in `queue`
- * and leave piece by piece, which delays a STATE: the host measures that as part of the round trip. Put haptic_link.h,
- * haptic_frame.h and board_watchdog.h beside it.
+ * an emergency stop. Put haptic_link.h, haptic_frame.h and board_watchdog.h into the same folder.
  *
- * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
- * the functions below them. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
+ * The sketch is written for Teensy 4, whose Serial is native USB. On another board check:
+ *   1. Serial is the port that you plug in (some boards call their native USB SerialUSB).
+ *   2. Serial.availableForWrite() exists and returns more than 0 on an idle line. If it returns 0, nothing is ever sent.
+ *   3. It returns at least 100 on an idle line. Two axes send an INFO of 68 bytes and STATEs of 32 bytes. With less room they
+ *      wait in `queue`, which delays a STATE. The host measures this delay as part of the round trip.
+ *
+ * Adapt the pins, the numbers of INFO (measure them; docs/protocol.md has their units) and the functions below them. The
+ * safety states are in haptic_link.h: do not change that file. */
 #include <Arduino.h>
 
 #include "board_watchdog.h"
@@ -17,21 +18,21 @@ static const uint8_t AXES = 2;
 static const uint32_t PERIOD_US = 1200;
 static const uint8_t ENCODER_A[AXES] = {2, 4}, ENCODER_B[AXES] = {3, 5};
 static const uint8_t MOTOR_PWM[AXES] = {9, 10}, MOTOR_DIRECTION[AXES] = {7, 8};
-static const uint8_t ENABLE = 6;       /* of both drivers; pulled down outside: an unpowered board means no force */
-static const uint8_t STOP_BUTTON = 11; /* normally closed, to ground: pressed, unplugged and broken all read HIGH */
-static const uint8_t DEADMAN = 12;     /* closed to ground while it is held: let go, unplugged and broken all read HIGH */
-/* A step of force is a step of the PWM, no finer: what INFO says of it, the host's limits rest on. Teensy 4 has up to 15
- * bits; a board whose analogWrite knows no more than 8 has steps of 47 mN at 12 N, and no analogWriteResolution(). */
+static const uint8_t ENABLE = 6;       /* of both drivers; with an external pull-down: without power there is no force */
+static const uint8_t STOP_BUTTON = 11; /* normally closed to ground: pressed, unplugged and broken all read HIGH */
+static const uint8_t DEADMAN = 12;     /* closes to ground while it is held: released, unplugged and broken all read HIGH */
+/* One step of force must be one step of the PWM, because the host computes its limits from the force step in INFO. Teensy 4
+ * has up to 15 bits. A board with 8 bits has steps of 47 mN at 12 N, and no analogWriteResolution(). */
 static const uint8_t PWM_BITS = 12;
 static const uint16_t FULL_STEPS = (uint16_t)((1UL << PWM_BITS) - 1);
 static const uint32_t FULL_FORCE_UN = 12000000; /* at full PWM, from your motor's constant */
-static const uint32_t WATCHDOG_MS = 20;         /* the board resets itself where no tick came for so long */
+static const uint32_t WATCHDOG_MS = 20;         /* the board resets itself after this time without a tick */
 
 static hl_device device;
 static volatile int32_t position[AXES];
 static uint32_t due;
-static uint8_t queue[HL_MAX_OUT]; /* bytes that the board's buffer had no room for yet */
-static size_t queued, gone;       /* how many there are, and how many of them have left */
+static uint8_t queue[HL_MAX_OUT]; /* bytes that wait for room in the board's buffer */
+static size_t queued, gone;       /* number of bytes in `queue`, and how many of them were sent */
 
 static void edge(uint8_t axis) /* one count for every edge of channel A */
 {
@@ -41,7 +42,7 @@ static void edge(uint8_t axis) /* one count for every edge of channel A */
 static void edge0() { edge(0); }
 static void edge1() { edge(1); }
 
-/* ---- the functions: what only you know -------------------------------------------------------------------------- */
+/* ---- functions: adapt them to your device ----------------------------------------------------------------------- */
 
 static void readEncoders(int32_t *counts)
 {
@@ -50,7 +51,7 @@ static void readEncoders(int32_t *counts)
   interrupts();
 }
 
-/* A force in steps, positive towards growing counts. */
+/* Sets the motors to forces in steps, positive towards growing counts. */
 static void writeForces(const int16_t *force)
 {
   for (uint8_t a = 0; a < AXES; a++) {
@@ -61,10 +62,10 @@ static void writeForces(const int16_t *force)
   digitalWrite(ENABLE, hl_running(&device) ? HIGH : LOW);
 }
 
-/* The next byte, -1 where none waits. */
+/* Returns the next byte, or -1 if there is none. */
 static int serialRead() { return Serial.available() > 0 ? Serial.read() : -1; }
 
-/* As much of the queue as the board takes now, and never waiting: a device that waits for its host has no watchdog. */
+/* Sends as much of the queue as the board takes now, without waiting: while a sketch waits, its link watchdog cannot act. */
 static void serialPump()
 {
   int room = Serial.availableForWrite();
@@ -73,8 +74,8 @@ static void serialPump()
   gone += Serial.write(queue + gone, n);
 }
 
-/* All of it or nothing, so that no frame is ever cut in two: it is dropped while older bytes are on their way, and takes
- * the place of older bytes of which none has left. */
+/* Sends all n bytes or none, so that no frame is cut in two. Drops them while the queue is partly sent; otherwise they
+ * replace the queue. */
 static void serialWrite(const uint8_t *data, size_t n)
 {
   serialPump();
@@ -87,7 +88,7 @@ static void serialWrite(const uint8_t *data, size_t n)
 
 static uint32_t timeUs() { return (uint32_t)micros(); }
 
-/* ---- the loop: leave as it is ----------------------------------------------------------------------------------- */
+/* ---- the loop: do not change it --------------------------------------------------------------------------------- */
 
 void setup()
 {
@@ -109,7 +110,7 @@ void setup()
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[1]), edge1, CHANGE);
   if (PWM_BITS > 8) analogWriteResolution(PWM_BITS);
   Serial.begin(2000000); /* boards with native USB ignore the rate */
-  if (!hl_init(&device, &info)) /* a number above is impossible: ENABLE stays low */
+  if (!hl_init(&device, &info)) /* a number in `info` is impossible: ENABLE stays low */
     for (;;) delay(1000);
   watchdogStart(WATCHDOG_MS);
   due = timeUs() + PERIOD_US;
@@ -118,7 +119,7 @@ void setup()
 void loop()
 {
   int byte = 0;
-  for (uint8_t n = 0; n < 64 && (byte = serialRead()) >= 0; n++) /* a flood of bytes must not keep the tick waiting */
+  for (uint8_t n = 0; n < 64 && (byte = serialRead()) >= 0; n++) /* a flood of bytes must not delay the tick */
     if (hl_receive(&device, (uint8_t)byte, timeUs())) writeForces(device.applied);
   serialPump();
   if (digitalRead(STOP_BUTTON) == HIGH) {
@@ -128,7 +129,7 @@ void loop()
 
   uint32_t late = timeUs() - due;
   if (late >= 0x80000000u) return; /* not due yet */
-  if (late > PERIOD_US) {          /* a whole period was lost: say so, and do not catch up */
+  if (late > PERIOD_US) {          /* a whole period was lost: stop, and do not catch up */
     hl_fault(&device);
     due += late;
   }
@@ -138,9 +139,9 @@ void loop()
   int16_t force[AXES];
   uint8_t out[HL_MAX_OUT];
   readEncoders(counts);
-  hl_deadman(&device, digitalRead(DEADMAN) == LOW); /* --deadman device: without it the host ramps forces out */
+  hl_deadman(&device, digitalRead(DEADMAN) == LOW); /* with --deadman device, the host ramps out on release */
   size_t n = hl_tick(&device, timeUs(), counts, force, out);
   writeForces(force);
-  watchdogFeed(); /* here and nowhere else: a loop that turns without ticks must not feed it */
+  watchdogFeed(); /* only here: a loop that runs without ticks must not feed the watchdog */
   serialWrite(out, n);
 }

@@ -1,11 +1,11 @@
-/* A Hapkit-like device (ATmega328P at 16 MHz, one axis) that runs an exported tick by itself: an analog magnetic sensor that
- * wraps twice per motor turn, a capstan, PWM and direction, 115200 baud. Beside it: haptic_alone.h, board_watchdog.h, and
- * coupling-process.c from
+/* Runs an exported tick on a Hapkit-like device (ATmega328P at 16 MHz, one axis) without a host: an analog magnetic sensor
+ * that wraps twice per motor turn, a capstan, PWM and direction, 115200 baud. Put into the same folder haptic_alone.h,
+ * board_watchdog.h, and coupling-process.c from
  *
  *     python -m design.export coupling.json --process --without-theta --float --force-limit 4.8 --out coupling-process.c
  *
  * Keys over the serial line: h home (hold the handle against the stop at HOME), a arm, s stop. Forces act only while the
- * dead-man switch is held. Yours to change: the numbers below, which are of one device. Measure them. */
+ * dead-man switch is held. The numbers below are those of one device: measure yours. */
 #include <Arduino.h>
 
 #include "board_watchdog.h"
@@ -15,24 +15,24 @@
 
 static const uint8_t SENSOR = A2, PWM = 5, DIRECTION = 8, DEADMAN = 12; /* the switch closes to ground while it is held */
 static const int16_t SPAN = 1024; /* counts from wrap to wrap, half a turn of the motor */
-/* [m/rad] of the handle per motor angle: handle radius times motor radius over sector radius, the capstan's ratio */
+/* [m/rad] path of the handle per motor angle: handle radius times the capstan's ratio, motor radius over sector radius */
 static const float METRES_PER_RADIAN = 0.09f * 0.005f / 0.073f;
 static const float METRES_PER_COUNT = METRES_PER_RADIAN * 3.14159265f / SPAN;
 static const float FULL_TORQUE = 0.03f; /* [N m] of the motor at full PWM: 4.9 N at the handle */
-static const float HOME = -0.045f;      /* [m] the handle stands there when it is homed */
+static const float HOME = -0.045f;      /* [m] position of the handle when it is homed */
 static const ha_limits LIMITS = {0.05f, 1.0f, 4.8f, METRES_PER_COUNT};
-static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* of timer 1 */
+static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* cycles / 8 of timer 1 */
 
 static ha_runner runner;
 static int16_t last;
 static int32_t wrapped, home_counts;
-static uint16_t longest, ticks; /* [cycles / 8] of the longest tick since the last report */
+static uint16_t longest, ticks; /* longest: [cycles / 8] of the longest tick since the last report */
 
 #ifndef MARK
 #define MARK(what) /* the tests count cycles between marks */
 #endif
 
-/* Counts of the motor, continued over the wraps: between two ticks it turns less than a quarter. */
+/* Returns the counts of the motor without wraps. The motor must turn by less than a quarter between two ticks. */
 static int32_t readSensor()
 {
   int16_t raw = (int16_t)analogRead(SENSOR);
@@ -42,7 +42,7 @@ static int32_t readSensor()
   return wrapped + raw;
 }
 
-/* A force at the handle [N], positive towards positive x. */
+/* Sets a force at the handle [N], positive towards positive x. */
 static void writeForce(float force)
 {
   float size = (force < 0 ? -force : force) * (255.0f * METRES_PER_RADIAN / FULL_TORQUE) + 0.5f;
@@ -50,8 +50,8 @@ static void writeForce(float force)
   OCR0B = size > 255.0f ? 255 : (uint8_t)size; /* pin 5 */
 }
 
-/* Phase, cause, position [10 um] and longest tick [us]. Printing takes 0.5 ms of this processor, so nothing is printed while the
- * coupling runs, nor where the line is busy. */
+/* Sends phase, cause, position [10 um] and longest tick [us]. Printing takes 0.5 ms of this processor, so nothing is printed
+ * while the coupling runs or the line is busy. */
 static void report()
 {
   if (runner.phase >= HA_RUNNING || Serial.availableForWrite() < 40) return;
@@ -70,11 +70,11 @@ void setup()
   pinMode(DIRECTION, OUTPUT);
   pinMode(DEADMAN, INPUT_PULLUP);
   Serial.begin(115200);
-  TIMSK0 = 0;                                         /* no interrupt of timer 0: it makes PWM, not time */
+  TIMSK0 = 0;                                         /* no interrupts of timer 0: millis() stands still */
   TCCR0A = _BV(COM0B1) | _BV(WGM01) | _BV(WGM00);     /* fast PWM on pin 5 */
   TCCR0B = _BV(CS00);                                 /* at 62.5 kHz */
   OCR0B = 0;
-  TCCR1A = 0;                                         /* timer 1 counts the period, cycles / 8 */
+  TCCR1A = 0;                                         /* timer 1 counts the period in cycles / 8 */
   TCCR1B = _BV(WGM12) | _BV(CS11);
   OCR1A = PERIOD_CYCLES - 1;
   last = (int16_t)analogRead(SENSOR);
@@ -88,7 +88,7 @@ void loop()
   TIFR1 = _BV(OCF1A);
   MARK(1);
   watchdogFeed();
-  writeForce(runner.force[0]); /* of the sample before: theta = 1 */
+  writeForce(runner.force[0]); /* computed from the last sample: theta = 1 */
   int32_t counts = readSensor();
   float x = METRES_PER_COUNT * (float)(counts - home_counts) + HOME;
   int key = Serial.read();

@@ -1,13 +1,13 @@
-/* Runs an exported tick on the board itself, without a host, and takes the force away when something is wrong.
+/* Runs an exported tick on a board without a host, and removes the force if something goes wrong.
  *
  * Include the exported file first (python -m design.export FILE.json --process --without-theta, with --float on boards
  * without double). Once per period the sketch sets the motors to the last `force`, samples the handles, and calls ha_tick:
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
- *   ha_home   the handles stand at their reference; before it no force acts
- *   ha_arm    test each axis by a small force, then raise the gain
- *   ha_stop   ramp out (HA_ASKED, HA_DEADMAN) or drop the force at once (every other cause)
- *   ha_tick   once per period: forces for the next one
+ *   ha_home   call while the handles stand at their reference; no force acts before
+ *   ha_arm    tests each axis by a small force, then raises the gain
+ *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN), or drops the force at once (every other cause, and during a test)
+ *   ha_tick   call once per period; it computes the forces for the next period
  */
 #ifndef HAPTIC_ALONE_H
 #define HAPTIC_ALONE_H
@@ -16,31 +16,31 @@
 #include <stdint.h>
 
 #ifndef HA_REAL
-#define HA_REAL double /* float where the file was exported with --float */
+#define HA_REAL double /* float if the file was exported with --float */
 #endif
 typedef HA_REAL ha_real;
 
 #define HA_RISE 0.25f   /* [s] from zero to full gain */
 #define HA_FALL 0.1f    /* [s] from full gain to zero */
-#define HA_TEST_MAX 0.8f /* [N] without an answer to so much, or to half the cap, the axis is dead */
-#define HA_TEST 0.2f    /* [s] in which the force that tests an axis grows to it */
-#define HA_SWING 0.03f  /* [s] after which the testing force changes its sign */
+#define HA_TEST_MAX 0.8f /* [N] an axis is dead if neither this force nor half the cap moves it */
+#define HA_TEST 0.2f    /* [s] in which the test force grows to its maximum */
+#define HA_SWING 0.03f  /* [s] after which the test force changes its sign */
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
 enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD };
 
 typedef struct {
     ha_real range; /* [m] a handle beyond +-range stops the session */
-    ha_real speed; /* [m/s] so does a faster one */
-    ha_real cap;   /* [N] no force exceeds this, and no test half of it */
-    ha_real count; /* [m] encoder step; the test waits for a path of 12 steps */
+    ha_real speed; /* [m/s] a faster handle stops the session */
+    ha_real cap;   /* [N] largest force; a test force is at most half of it */
+    ha_real count; /* [m] encoder step; a test ends after a path of 12 steps */
 } ha_limits;
 
 typedef struct {
     process_state process;
-    uint8_t phase, cause, axis; /* axis: under test */
-    uint16_t tick;              /* of the test */
-    ha_real gain, path, work;   /* [m] and [J] of the axis under test */
+    uint8_t phase, cause, axis; /* axis: the one under test */
+    uint16_t tick;              /* ticks of the test so far */
+    ha_real gain, path, work;   /* path [m] and work [J] of the axis under test */
     ha_real before[PROCESS_CHANNELS], reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
 } ha_runner;
 
@@ -82,8 +82,8 @@ static inline void ha_stop(ha_runner *r, uint8_t cause)
     for (i = 0; i < PROCESS_CHANNELS; i++) r->force[i] = 0;
 }
 
-/* The force that tests an axis changes its sign and grows until the handle has moved. Its work on a passive handle is
- * positive; a wrong sign of motor or sensor makes it negative. */
+/* The test force changes its sign and grows until the handle has moved. Its work on a passive handle is positive; a wrong
+ * sign of motor or sensor makes the work negative. */
 static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
     ha_real step = x[r->axis] - r->before[r->axis], most = l->cap / 2 < (ha_real)HA_TEST_MAX ? l->cap / 2 : (ha_real)HA_TEST_MAX;
@@ -111,7 +111,7 @@ static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
     }
 }
 
-/* Positions x [m] sampled at this tick; afterwards r->force [N] acts from the next tick on, positive towards positive x. */
+/* Takes the positions x [m] of this tick and computes r->force [N] for the next tick, positive towards positive x. */
 static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
     const ha_real rise = (ha_real)(PROCESS_PERIOD / HA_RISE), fall = (ha_real)(PROCESS_PERIOD / HA_FALL);
@@ -133,7 +133,7 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
             r->phase = HA_READY;
         }
         for (i = 0; i < PROCESS_CHANNELS; i++) {
-            ha_real force = -r->gain * f[i]; /* the devices get -f */
+            ha_real force = -r->gain * f[i]; /* the devices feel -f */
             r->force[i] = force > l->cap ? l->cap : force < -l->cap ? -l->cap : force;
         }
     }

@@ -1,5 +1,5 @@
 /* Bytes and frames of the serial link in portable C99 (and C++11): little-endian integers, CRC-32, COBS.
- * A frame on the wire is COBS(payload | CRC-32), then a zero (docs/protocol.md). Knows no message. */
+ * A frame on the wire is COBS(payload | CRC-32), then a zero (docs/protocol.md). This file does not depend on the messages. */
 #ifndef HAPTIC_FRAME_H
 #define HAPTIC_FRAME_H
 
@@ -8,12 +8,12 @@
 #include <stdint.h>
 
 #define HL_MAX_FRAME 175        /* longest frame of the protocol without its delimiter: INFO for eight axes */
-#define HL_RESIDUE 0x2144DF1Cu  /* the CRC-32 of a payload and its own CRC-32 behind it, whatever the payload */
+#define HL_RESIDUE 0x2144DF1Cu  /* CRC-32 of any payload followed by its own CRC-32 */
 
-/* Collects a frame; once it is whole, the payload is at bytes[1]. */
+/* Collects a frame; once the frame is complete, its payload begins at bytes[1]. */
 typedef struct {
     uint8_t bytes[HL_MAX_FRAME], length;
-    bool skipping; /* too long: up to the next delimiter nothing is kept */
+    bool skipping; /* the frame is too long: drop all bytes up to the next delimiter */
 } hl_receiver;
 
 static inline uint8_t *hl_put16(uint8_t *p, uint16_t v)
@@ -32,7 +32,7 @@ static inline uint16_t hl_get16(const uint8_t *p) { return (uint16_t)(p[0] | ((u
 
 static inline int16_t hl_signed(uint16_t v) { return (int16_t)(v < 0x8000u ? (int32_t)v : (int32_t)v - 0x10000); }
 
-/* CRC-32 as in zlib and Ethernet, four bits at a time: 64 bytes of table. */
+/* CRC-32 as in zlib and Ethernet, four bits at a time, with a table of 64 bytes. */
 static inline uint32_t hl_crc(const uint8_t *p, size_t n)
 {
     static const uint32_t table[16] = {0x00000000u, 0x1DB71064u, 0x3B6E20C8u, 0x26D930ACu, 0x76DC4190u, 0x6B6B51F4u,
@@ -47,7 +47,7 @@ static inline uint32_t hl_crc(const uint8_t *p, size_t n)
     return ~crc;
 }
 
-/* Makes a frame of the n payload bytes at frame[1], in place; its length. */
+/* Turns the n payload bytes that begin at frame[1] into a frame, in place, and returns the length of the frame. */
 static inline size_t hl_stuff(uint8_t *frame, size_t n)
 {
     size_t code = 0, i;
@@ -63,8 +63,8 @@ static inline size_t hl_stuff(uint8_t *frame, size_t n)
     return n + 2;
 }
 
-/* Takes one byte from the wire: the length of the payload that it completes, 0 where it completes none, -1 where a frame
- * has to be dropped. */
+/* Takes one byte from the wire. Returns the length of the payload that the byte completes, 0 if it completes none, or -1 if
+ * a frame must be dropped. */
 static inline int hl_collect(hl_receiver *r, uint8_t byte)
 {
     size_t i = 0, n = r->length;

@@ -1,13 +1,13 @@
 /* The device's side of the serial link in portable C99 (and C++11): no floats, no malloc, no clock and no port.
- * The rules and every byte: docs/protocol.md; the frames: haptic_frame.h. The tests hold it to hw/device_state.py, the same
- * machine, byte for byte.
+ * docs/protocol.md states the rules and every byte; haptic_frame.h has the frames. The tests compare this state machine with
+ * hw/device_state.py byte for byte.
  *
- *   hl_init     once; the device is silent and its motors carry nothing
- *   hl_receive  for every byte that comes; where it returns true, give the motors d->applied at once (theta = 0)
- *   hl_tick     once per period: what the motors carry from now on, and the bytes to send
- *   hl_estop, hl_fault, hl_deadman   at any time, from the context that calls hl_tick (not from an interrupt)
+ *   hl_init     call once; the device is then silent and its motors carry no force
+ *   hl_receive  call for every byte that comes; if it returns true, set the motors to d->applied at once
+ *   hl_tick     call once per period; it writes the forces that act from now on, and the bytes to send
+ *   hl_estop, hl_fault, hl_deadman   call at any time in the context that calls hl_tick (not in an interrupt)
  *
- * Where memory is scarce, define HL_MAX_AXES (1 to 8) before including this file. */
+ * If memory is scarce, define HL_MAX_AXES (1 to 8) before including this file. */
 #ifndef HAPTIC_LINK_H
 #define HAPTIC_LINK_H
 
@@ -24,7 +24,7 @@
 #define HL_PROTOCOL 2
 #define HL_MAX_THETA 15
 #define HL_SLOTS 16                 /* forces that wait for their tick: a power of two above HL_MAX_THETA */
-#define HL_MAX_RELEASE_NS 20000000u /* longest hold and ramp together */
+#define HL_MAX_RELEASE_NS 20000000u /* longest sum of hold and ramp */
 #define HL_NO_MARGIN (-32767 - 1)   /* no FORCE came since the last STATE */
 #define HL_MAX_OUT (HL_MAX_FRAME + 1 + 12 + 20 + 6 * HL_MAX_AXES) /* INFO, ACK and STATE in one tick */
 
@@ -87,7 +87,7 @@ static inline void hl_clear(hl_device *d)
     d->margin = HL_NO_MARGIN;
 }
 
-/* To zero force: by a ramp while armed, at once before. The first cause stays. */
+/* Goes to zero force, by a ramp while armed. The first cause stays. */
 static inline void hl_halt(hl_device *d, uint8_t cause)
 {
     if (d->phase == HL_ARMED || d->phase == HL_HOLDING) {
@@ -111,10 +111,10 @@ static inline void hl_latch_estop(hl_device *d, uint8_t cause)
 
 static inline void hl_fault(hl_device *d) { hl_halt(d, HL_BY_DEVICE); }
 static inline void hl_estop(hl_device *d) { hl_latch_estop(d, HL_ESTOP_DEVICE); }
-/* Whether somebody holds the deadman; a device that never says so has none. */
+/* Sets whether somebody holds the deadman. Without any call with true, the host assumes that there is no deadman. */
 static inline void hl_deadman(hl_device *d, bool held) { d->deadman = held; }
 
-/* False, and a device that never runs, where the info cannot be right. */
+/* Returns false, and leaves the device in ESTOP, if a value of the info is impossible. */
 static inline bool hl_init(hl_device *d, const hl_info *info)
 {
     bool good = info->axes >= 1 && info->axes <= HL_MAX_AXES;
@@ -160,7 +160,7 @@ static inline void hl_latch(hl_device *d, const hl_slot *slot)
     }
 }
 
-/* The force for this tick, if there is one, may act from now on. */
+/* Applies the force for this tick while armed, or arms if the command is ARM. */
 static inline void hl_take(hl_device *d, const hl_slot *slot)
 {
     if (d->phase == HL_ARMED || d->phase == HL_HOLDING) hl_latch(d, slot);
@@ -208,12 +208,12 @@ static inline void hl_configure(hl_device *d, const uint8_t *p, size_t n)
     d->cause = HL_NONE;
 }
 
-/* A force waits for its tick where that is ahead, answers the right tick, and is the first for it. */
+/* Stores the first force for a tick that is ahead and theta after the source; applies it at once if theta = 0. */
 static inline void hl_accept(hl_device *d, const uint8_t *p, size_t n, uint32_t now)
 {
     uint16_t apply_at = hl_get16(p + 2), source = hl_get16(p + 4);
     bool at_once = d->config.theta == 0;
-    int16_t ahead = hl_signed((uint16_t)(apply_at - d->k + at_once)); /* ticks until it is late */
+    int16_t ahead = hl_signed((uint16_t)(apply_at - d->k + at_once)); /* ticks until the force is late */
     hl_slot *slot = &d->slot[apply_at % HL_SLOTS];
     bool zero = true;
     int64_t margin;
@@ -248,8 +248,8 @@ static inline void hl_understand(hl_device *d, const uint8_t *p, size_t n, uint3
     else d->rejected++;
 }
 
-/* One byte that came at `now` [us]. Whatever cannot be read is counted and dropped. True where d->applied may have
- * changed: a force that is latched as it comes, or an emergency stop. */
+/* Takes a byte that came at `now` [us]. Unreadable frames are counted and dropped. Returns true if d->applied may have
+ * changed, by a force with theta = 0 or by an emergency stop. */
 static inline bool hl_receive(hl_device *d, uint8_t byte, uint32_t now)
 {
     int n = hl_collect(&d->in, byte);
@@ -306,12 +306,12 @@ static inline size_t hl_write_state(const hl_device *d, const int32_t *counts, u
     return hl_stuff(out, (size_t)(p - out - 1));
 }
 
-/* A period begins at `now` [us]; `counts` was sampled just before. Writes what the motors carry from now on [steps],
- * and up to HL_MAX_OUT bytes to send; returns how many. */
+/* Begins a period at `now` [us]; `counts` was sampled just before. Writes the forces that act from now on [steps] to `force`
+ * and at most HL_MAX_OUT bytes to send to `out`; returns the number of these bytes. */
 static inline size_t hl_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *force, uint8_t *out)
 {
     bool at_once = d->configured && d->config.theta == 0;
-    hl_slot *slot = &d->slot[(uint16_t)(++d->k - at_once) % HL_SLOTS]; /* of the tick before, latched, where at once */
+    hl_slot *slot = &d->slot[(uint16_t)(++d->k - at_once) % HL_SLOTS]; /* theta = 0: that of the last tick, already applied */
     size_t n = 0;
     d->now = now;
     if (d->phase == HL_DISARMED || d->phase == HL_ARMED || d->phase == HL_HOLDING) {

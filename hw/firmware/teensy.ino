@@ -1,9 +1,9 @@
-/* Two axes on a Teensy 4 that run an exported tick by themselves: quadrature encoders, PWM and direction, an enable line and a
- * dead-man switch. Beside it: haptic_alone.h, board_watchdog.h, and coupling-process.c from
+/* Runs an exported tick for two axes on a Teensy 4 without a host: quadrature encoders, PWM and direction, an enable line and
+ * a dead-man switch. Put into the same folder haptic_alone.h, board_watchdog.h, and coupling-process.c from
  *
  *     python -m design.export coupling.json --process --without-theta --force-limit 8 --out coupling-process.c
  *
- * Keys over USB: h home (the handles stand in the middle of their travel), a arm, s stop. Yours to change: the numbers below. */
+ * Keys over USB: h home (with the handles in the middle of their travel), a arm, s stop. Adapt the numbers below. */
 #include <Arduino.h>
 
 #include "board_watchdog.h"
@@ -12,10 +12,10 @@
 
 static const uint8_t AXES = PROCESS_CHANNELS;
 static const uint8_t ENCODER_A[] = {2, 4}, ENCODER_B[] = {3, 5}, MOTOR_PWM[] = {9, 10}, MOTOR_DIRECTION[] = {7, 8};
-static const uint8_t ENABLE = 6;   /* of both drivers; pulled down outside: an unpowered board means no force */
-static const uint8_t DEADMAN = 12; /* closed to ground while it is held: let go, unplugged and broken all read HIGH */
+static const uint8_t ENABLE = 6;   /* of both drivers; with an external pull-down: without power there is no force */
+static const uint8_t DEADMAN = 12; /* closes to ground while it is held: released, unplugged and broken all read HIGH */
 static const uint8_t PWM_BITS = 12;
-static const double FULL_FORCE = 12.0, METRES_PER_COUNT = 10e-6; /* [N] at full PWM */
+static const double FULL_FORCE = 12.0, METRES_PER_COUNT = 10e-6; /* FULL_FORCE: [N] at full PWM */
 static const ha_limits LIMITS = {0.05, 1.0, 8.0, METRES_PER_COUNT};
 static const uint32_t PERIOD_US = (uint32_t)(1e6 * PROCESS_PERIOD + 0.5);
 
@@ -43,7 +43,7 @@ static void writeForces(const double *force)
   digitalWrite(ENABLE, runner.phase >= HA_TESTING ? HIGH : LOW);
 }
 
-static void report() /* phase and cause; left out where the line is busy */
+static void report() /* sends phase and cause unless the line is busy */
 {
   const uint8_t line[3] = {(uint8_t)('0' + runner.phase), (uint8_t)('0' + runner.cause), '\n'};
   if (Serial.availableForWrite() >= 3) Serial.write(line, 3);
@@ -77,7 +77,7 @@ void loop()
   }
   due += PERIOD_US;
   watchdogFeed();
-  writeForces(runner.force); /* of the sample before: theta = 1 */
+  writeForces(runner.force); /* computed from the last sample: theta = 1 */
   double x[PROCESS_CHANNELS];
   int key = Serial.available() > 0 ? Serial.read() : -1;
   noInterrupts();
