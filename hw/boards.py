@@ -26,7 +26,7 @@ _TOO_EARLY = 1.5  # [periods] largest lead of a sample; with a longer one, the b
 _SMOOTHED = 31  # leads in a median; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
-_LONGEST = 5e-4  # [s] longest wait of one call
+_LONGEST = 5e-4  # [s] longest time for which one call waits
 _EXCHANGE = "exchange the ports, or the delays (--theta)"
 _FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SILENT, wire.Phase.DISARMED)
 
@@ -101,7 +101,7 @@ class _Board:
     def follow(self, step: int, at: int, driving: bool) -> None:
         """Shift the pairing of steps so that samples precede the leading board's by less than a period.
 
-        Raises SafetyStop where this clock is faster than the leading one, or slower by more than CLOCK_TOLERANCE.
+        Raises SafetyStop if this clock is faster than the leading one, or slower by more than CLOCK_TOLERANCE.
         """
         assert self.offset is not None
         if self._shift_at is not None and wire.distance(step, self._shift_at) >= 0:
@@ -124,7 +124,7 @@ class _Board:
             self._shifted, self._shift_at = self._steps, (step + self.config.theta + 1) & 0xFFFF
 
     def _compare(self, step: int, lead: float) -> None:
-        """Raise SafetyStop where this clock is faster than the leading one, or much slower."""
+        """Raise SafetyStop if this clock is faster than the leading one, or much slower."""
         assert self.offset is not None
         if self._start is None or (elapsed := wire.distance(step, self._start[0])) < 0:
             self._start = step, lead, self.offset

@@ -18,7 +18,7 @@ class Device:
     """One microcontroller. Call tick() once per period, receive() when bytes come, estop() and fault() at any time."""
 
     def __init__(self, info: wire.Info) -> None:
-        """Begin in the state SILENT. Raises ValueError where a field of `info` does not fit into its frame."""
+        """Begin in the state SILENT. Raises ValueError if a field of `info` does not fit into its frame."""
         self.info = info
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
@@ -47,7 +47,7 @@ class Device:
         """Begin a period: return the forces that act from now on, and the bytes to send. `counts` was just sampled."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
         at_once = self.config is not None and not self.config.theta
-        slot = (self.k - at_once) % _SLOTS  # with theta = 0, a force of the tick before was latched as it came
+        slot = (self.k - at_once) % _SLOTS  # with theta = 0, a force of the last tick was latched when it came
         frame, self.slots[slot] = self.slots[slot], None
         if self.phase in (wire.Phase.DISARMED, wire.Phase.ARMED, wire.Phase.HOLDING):
             self.misses += frame is None

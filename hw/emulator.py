@@ -36,7 +36,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
 _BLOCK = 1000  # ticks for which outside forces are computed at once
-_SUBSTEPS = 8  # steps of the plant per tick where there is Coulomb friction
+_SUBSTEPS = 8  # steps of the plant per tick if there is Coulomb friction
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximum
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
@@ -60,8 +60,8 @@ _LINE = {
 #: faults of the device: kind -> (meaning, minimum, maximum and default of VALUE)
 _DEVICE = {
     "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
-    "unplug": ("no value", 0.0, 0.0, 0.0),
-    "reset": ("no value", 0.0, 0.0, 0.0),
+    "unplug": ("no value: the cable is pulled", 0.0, 0.0, 0.0),
+    "reset": ("no value: the device restarts", 0.0, 0.0, 0.0),
     "leap": ("ticks by which the device's tick number leaps", 1.0, 32000.0, 300.0),
     "stuck": (
         "no value: the device holds its force and ignores its watchdog and every STOP except ESTOP",
@@ -70,8 +70,8 @@ _DEVICE = {
         0.0,
     ),
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
-    "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
-    "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
+    "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
+    "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
     "cross": ("share of motor 1's force that motor 2 adds to its own", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),

@@ -50,7 +50,7 @@ def library() -> Any:
 
 
 class ForceDimension:
-    """Axes of one or several Force Dimension devices, clocked by this host.
+    """Drive axes of one or several Force Dimension devices. This host is their clock.
 
     The state machine is the firmware's (hw/device_state.py): it arms on ARM, limits forces and their slew rate, and
     ramps out.
@@ -170,7 +170,7 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop where a device has an error, was reset or has switched its forces off."""
+        """Raise SafetyStop if a device has an error, was reset or has switched its forces off."""
         for index, ID in self._ids.items():
             status = self._status[index]
             self._heeded(self._sdk.getStatus(status, ID=ID))

@@ -1,4 +1,4 @@
-"""Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
+"""Estimate mass, friction and transmission of one axis from a record of forces and displacements; bound its damping.
 
 The excitation is a chirp of a small force, slow motions, a swing that reaches the speed of a session, a chirp of the
 swing's force, and silence (see `chirp`). It does not depend on the motion, so it closes no loop and needs no
@@ -158,10 +158,10 @@ class _Transmission:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate of one axis."""
+    """The estimated friction and transmission of one axis, and how its damping varies."""
 
     friction: Friction
-    transmission: _Transmission | None  # None for a rigid device, and where none explains the record
+    transmission: _Transmission | None  # None for a rigid device, or if none explains the record
     viscosity: Viscosity
 
     @property
@@ -190,8 +190,8 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
     # also refuse a stiffness that is too uncertain to exclude a hand
     if (most := law.stiffness + 2 * law.errors["stiffness"]) > allowed:
         raise ValueError(
-            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, at most {allowed:.3g} may be): a hand "
-            "or a finger rests on it? Its damping would be taken for the device's; let go, or loosen the spring"
+            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, allowed {allowed:.3g}): a hand "
+            "or a finger rests on it? The fit would count its damping as the device's; let go, or loosen the spring"
         )
     if law.delta <= 0:
         raise ValueError(

@@ -285,7 +285,7 @@ def encode(message: Message) -> bytes:
     return b"".join([_CODES[len(block)] + block for block in raw.split(b"\0")]) + b"\0"
 
 
-#: by the length of a COBS block, its first byte: the length plus one; the zero after the block is not sent
+#: first byte of a COBS block of each length: the length plus one; the zero after the block is not sent
 _CODES = [bytes((n + 1,)) for n in range(254)]
 
 
