@@ -1,4 +1,4 @@
-"""An operator, which decides when a session is armed and stopped, and a driver, which makes its calls of the device."""
+"""An operator decides when a session is armed and stopped. A driver calls the device for the session."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.session import Said, Session
 
 _DEADMAN_US = 1_000_000  # longest time without a sign of the user
-_LET_GO_US = 5_000_000  # time in which a person lets go of a handle before the session arms by itself
+_LET_GO_US = 5_000_000  # time to let go of a handle before the session arms by itself
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 @dataclass
 class Operator:
-    """Decide for a person when to arm and when to end a session, and act on keys. It arms by itself at most once.
+    """Decide for a person when to arm and when to end a session, and act on keys. Arm without a key at most once.
 
-    With a `deadman`, forces act only while the user gives a sign every second: any key, or a true answer of `deadman`.
+    With a `deadman`, forces act only while the user gives a sign every second: a key, or `deadman` returns True.
     """
 
     auto_arm: bool
-    seconds: float  # of forces at full gain, from each arming on
+    seconds: float  # time of forces at full gain in each arming
     deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
-    _asked: bool = False  # whether it or a key has armed the session
+    _asked: bool = False  # whether the operator or a key has armed the session
     _armed_at: int | None = None  # [us]
-    _seen_at: int | None = None  # [us] when the user gave a sign last
-    _free_at: int = 0  # [us] time from which on it may arm by itself
+    _seen_at: int | None = None  # [us] time of the user's last sign
+    _free_at: int = 0  # [us] earliest time of arming without a key
 
     def decide(self, session: Session, now: int) -> Said:
         """Return the messages that are due at `now` [us] in this stage."""
@@ -53,7 +53,7 @@ class Operator:
         return ()
 
     def press(self, key: str, session: Session, now: int) -> Said:
-        """Take a key, which tells that a person is there. `a` arms a disarmed session only."""
+        """Act on a key, which also counts as a sign of the user. The key `a` arms only a disarmed session."""
         self._seen_at = now
         match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:
@@ -68,13 +68,13 @@ class Operator:
     def _arm_once(self, session: Session, now: int) -> Said:
         if self._asked:  # a softer coupling is ready, and nobody is there to arm it
             softer = session.program.name if session.program else "none"
-            return session.end(Stage.REFUSED, f"nobody to arm the softer coupling, {softer}", now)
+            return session.end(Stage.REFUSED, f"nobody is there to arm the softer coupling, {softer}", now)
         self._asked = True
         return session.arm(now)
 
 
 class Driver:
-    """Make a session's calls of its device, turn by turn."""
+    """Call the device for a session, once per turn."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Driver:
         self._force: wire.Force | None = None
 
     def do(self, said: Said) -> None:
-        """Carry out what the session asks for."""
+        """Stop the device, or store a force for the next call, as the session's messages say."""
         for message in said:
             if isinstance(message, wire.Force):
                 self._force = message

@@ -1,8 +1,8 @@
-"""The four calls that a session needs of a device. `Driver` in hw/driver.py makes them.
+"""The four calls to a device that a session needs. `Driver` in hw/driver.py makes them.
 
 There are two implementations: a device at a serial port (docs/protocol.md), and a device that the host clocks
-(hw/force_dimension.py). No call waits for longer than a tick, because keys, signals and time-outs are handled between
-two calls.
+(hw/force_dimension.py). Calls wait for at most 0.5 ms or a tick, because keys, signals and time-outs are handled
+between two calls.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Protocol
 
 from haptic_loop.hw import protocol as wire
 
-_RESEND = 0.1  # [s] after which an unanswered question is sent again
+_RESEND = 0.1  # [s] time after which an unanswered question is sent again
 _STOPPING = 0.05  # [s] longest time from STOP until the device is at rest
 _LONGEST_WAIT = 5e-4  # [s] longest wait of one call
 
@@ -23,7 +23,7 @@ class PortLost(OSError):
 
 
 class HapticDevice(Protocol):
-    """A device that can be driven. Numbers are those of the wire: counts and steps, with their units in INFO."""
+    """A device that can be driven. Positions are in counts and forces in steps, whose units INFO states."""
 
     @property
     def errors(self) -> int:
@@ -31,11 +31,11 @@ class HapticDevice(Protocol):
         ...
 
     def info(self) -> wire.Info | None:
-        """Return the device's INFO, or None until it has answered."""
+        """Return the device's INFO, or None until it has come."""
         ...
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send a configuration. Return Refused.ACCEPTED or the reason for a refusal, or None until it has answered."""
+        """Send a configuration. Return Refused.ACCEPTED or the reason for a refusal; None until an answer comes."""
         ...
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
@@ -43,7 +43,7 @@ class HapticDevice(Protocol):
         ...
 
     def stop(self, reason: wire.Reason) -> None:
-        """Go to zero force: by the device's ramp, or at once for an emergency stop."""
+        """Bring the device to zero force: by its ramp, or at once for an emergency stop."""
         ...
 
 
@@ -75,7 +75,7 @@ class SerialDevice:
         self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
         self._question: wire.Hello | wire.Config | None = None
         self._begun = self._asked = 0.0  # [s] when the question was asked first, and last
-        self.dropped = 0  # bytes that the port would not take at once
+        self.dropped = 0  # bytes that the port did not accept
 
     @property
     def errors(self) -> int:
@@ -86,7 +86,7 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send CONFIG, repeatedly while the device ramps to zero. Raises SafetyStop if it drives by itself."""
+        """Send CONFIG, again while the device ramps to zero. Raises SafetyStop if it drives without a command."""
         answer = self._answer(config)
         if (
             not isinstance(answer, wire.Ack)
@@ -111,20 +111,20 @@ class SerialDevice:
         self._write(wire.encode(wire.Stop(reason)))
 
     def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
-        """Repeat a question and return its answer. A device that drives meanwhile gets STOP."""
+        """Repeat a question and return the next message, if any. Send STOP to a device that drives meanwhile."""
         now = self._clock()
-        if question != self._question:  # no answer to this question can have come before it
+        if question != self._question:  # earlier bytes cannot answer this question
             self._port.discard()
             self._waiting.clear()
             self._question, self._begun, self._asked = question, now, now - _RESEND
         if now - self._asked >= _RESEND:
             self._asked = now
-            self._write(b"\0" + wire.encode(question))  # the zero ends an incomplete frame in the line
+            self._write(b"\0" + wire.encode(question))  # the zero ends an incomplete frame on the line
         message = self._next()
         if isinstance(message, wire.State) and message.drives:
             self.stop(wire.Reason.FAULT)
             if isinstance(question, wire.Config) and now - self._begun > _STOPPING:
-                raise wire.SafetyStop("the device drives, and nobody asked it to")
+                raise wire.SafetyStop("the device drives without a command")
         return message
 
     def _next(self) -> wire.Message | None:

@@ -33,7 +33,7 @@ _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
 _COARSEST = 0.1  # largest encoder count, as a part of the largest displacement in a tick that a hand can make
 _LARGEST_MARGIN_US = 30_000  # ages are computed from margins, which are i16 in microseconds
-_ROUNDED = 1e-12  # relative error of the length of a vector that is limited
+_ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
 _HOLD, _RAMP_US = 4, 5000  # [ticks] for which a device without answers holds a force, then [us] of its ramp to zero
 
 
@@ -68,7 +68,7 @@ class _Shaped(NamedTuple):
 
 
 def _require_finite(force: Sequence[float]) -> None:
-    """Raise SafetyStop where a force (m,) [N] is not a number or infinite."""
+    """Raise SafetyStop where a force (m,) [N] is infinite or not a number."""
     if not all(map(math.isfinite, force)):
         raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
@@ -84,10 +84,10 @@ class SafetyLimits:
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
     speed: float = 1.0  # [m/s] fastest motion while forces act
-    continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold for ever; empty: no heat check
+    continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole
-    lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the allowed ranges
+    lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the limits; else 1
 
     def __post_init__(self) -> None:
         r = self.lever
@@ -117,6 +117,7 @@ class SafetyLimits:
 
         A vector that is capped keeps its direction. A vector with an axis above the slew rate moves straight towards
         its goal, with that axis at the slew rate.
+
         `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
         `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
         """
@@ -148,14 +149,14 @@ class SafetyLimits:
         return _Shaped(tuple(force), clipped, slowed)
 
     def capped(self, forces: NDArray[np.float64], at: float = 1.0) -> NDArray[np.bool_]:
-        """Return where forces (ticks, m) [N] reach the share `at` of their caps; axes of a vector count as one."""
+        """Return where forces (ticks, m) [N] reach the share `at` of their caps; a vector counts by its length."""
         size = np.abs(forces)
         for first, end in self.vectors:
             size[:, first:end] = (1 + _ROUNDED) * np.linalg.norm(forces[:, first:end], axis=1, keepdims=True)
         return size >= at * np.array(self.cap)
 
     def check_jump(self, x: Sequence[float], previous: Sequence[float], ticks: int) -> None:
-        """Raise SafetyStop where an encoder moved from `previous` to x (m,) [m] in `ticks` ticks faster than a hand."""
+        """Raise SafetyStop where no hand can have moved an axis from `previous` to x (m,) [m] in `ticks` ticks."""
         most = self.jump * ticks
         for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
             if not abs(now - before) <= most:
@@ -163,11 +164,11 @@ class SafetyLimits:
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
     def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> int | None:
-        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass can do.
+        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass allows.
 
         `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
-        whose speed changed by more than a fifth of `jump` per tick, or None. Two counts of the coarsest allowed encoder
-        are a fifth.
+        whose speed changed by more than a fifth of `jump` per tick, or None. A fifth is two counts of the coarsest
+        allowed encoder.
         """
         shaken = None
         for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
@@ -202,7 +203,7 @@ class SafetyLimits:
         if baud is not None:
             seconds, arithmetic = _wire_time(baud, m)
             if seconds > scenario.T:
-                more = f"more than T = {1e6 * scenario.T:g} us (of a link without UART say --baud none)"
+                more = f"more than T = {1e6 * scenario.T:g} us (for a link without UART, give --baud none)"
                 reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
         for i in range(m):
             if wrong := _impossible(i, info):
@@ -214,7 +215,7 @@ class SafetyLimits:
                 )
             reasons += _coarse(i, info, self, scenario.T)
             if strongest < self.cap[i] * (1 - 1e-3):
-                reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {self.cap[i]:g} N")
+                reasons.append(f"axis {i + 1} can apply {strongest:g} N, the force limit is {self.cap[i]:g} N")
         return reasons
 
     def configuration(self, info: Info, theta: int) -> Config:
@@ -238,7 +239,7 @@ class SafetyLimits:
 class Gain:
     """The factor that scales every force. It starts at 0, changes linearly in time and never jumps.
 
-    Any constant gain within [0, 1] keeps a certificate: if this-environment holds for F, it holds for g F.
+    Any constant gain g within [0, 1] preserves a certificate: if this-environment holds for F, it holds for g F.
     """
 
     limits: SafetyLimits
@@ -277,7 +278,7 @@ class Heat:
                 )
 
 
-# Checks of the device and the line before anything moves.
+# Units, and checks of the device and the line before anything moves
 
 
 @dataclass(frozen=True)
@@ -350,23 +351,23 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """Return theta [ticks] for the measurement: the longest for which a margin can state every age.
+    """Return theta [ticks] for the measurement: the largest for which a margin can state every age.
 
     Raises ValueError where T [s] is too long for theta = 1.
     """
     theta = min(MAX_THETA, int(_LARGEST_MARGIN_US / (1e6 * T)))
     if theta < 1:
-        raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * _LARGEST_MARGIN_US:g} s")
+        raise ValueError(f"T is {T:g} s, a serial link allows at most {1e-6 * _LARGEST_MARGIN_US:g} s")
     return theta
 
 
 def watchdog_for(T: float) -> int:
     """Return the longest silence [us] of a device that ticks every T [s]: five ticks, and at least 6 ms (busy host).
 
-    Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a handle may be pushed unasked.
+    Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a device may push without a new force.
     """
     silence = max(6000, math.ceil(round(5e6 * T, 3)))
     if silence > MAX_RELEASE_NS // 1000:
         most = MAX_RELEASE_NS / 5e9
-        raise ValueError(f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog is five ticks")
+        raise ValueError(f"T is {T:g} s, a serial link allows at most {most:g} s: the host's watchdog is five ticks")
     return silence

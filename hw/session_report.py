@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
 from haptic_loop.sim.world import SceneRecord, WorldRecord
 
-_AT_CAP = 1 - 1e-6  # part of the cap above which a force counts as cut
+_AT_CAP = 1 - 1e-6  # share of the cap from which a force counts as cut
 _PERCENTILES = (50, 90, 99, 100)
 _PIECE = 100_000  # ticks whose ages are computed at a time, to save memory
 
@@ -88,7 +88,7 @@ class _Ended:
 
 @dataclass(frozen=True)
 class _Link:
-    """The figures of the link during its measurement and while forces acted (None if they never did)."""
+    """Figures of the link during its measurement, and while forces acted (None if none ever acted)."""
 
     measured_age_us: dict[str, float] | None
     measured_missing: int
@@ -125,7 +125,7 @@ class _Ran:
     duration_s: float
     T_s: float
     scenario_digest: str
-    pace: float  # below 1: slow motion, in which a link looks faster than it is
+    pace: float  # speed relative to real time; below 1, the link looks faster than it is
     encoder_step_m: list[float] | None
     steady_ticks: list[list[int]]
 
@@ -162,11 +162,11 @@ class _WorldSession(WorldRecord):
 
 @dataclass(frozen=True)
 class SessionReport:
-    """The result of a session without a verdict: the coupling with its certificates, the log, the link."""
+    """The report of a session: its coupling with certificates, its log and its link. It has no verdict."""
 
     case: str
     scenario: str
-    kind: str | None  # kind of the coupling; null, like the next four, in a session without a coupling
+    kind: str | None  # kind of the coupling; null, like the next three, in a session without a coupling
     assessment: Assessment | None
     link_delay: int | None = off_table()
     remarks: list[str] | None = off_table()
@@ -180,7 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """Return the report of a session that has ended. One that ended as planned, but in doubt, becomes stopped."""
+    """Return the report of a session that has ended. A finished session with doubtful forces becomes stopped."""
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
     steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []
@@ -219,7 +219,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
     capped = session.limits.capped(link["gain"][:, None] * link["asked"], _AT_CAP)
     cut = np.convolve(capped.any(axis=1), np.ones(second) / second, "valid").max() if ticks else 0.0
     if cut > 0.5:
-        advice = "raise --force-cap, or ask for less; or a sign has changed"
+        advice = "raise --force-cap, request smaller forces, or look for a reversed sign"
         return f"{100 * cut:.0f} % of its forces were cut in a second: {advice}"
     for i, growth in enumerate(growths, start=1):
         if growth.trend == "grows":
@@ -228,13 +228,13 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
 
 
 def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
-    """Return the ages [us] of all answers, also of those that an `echo` skipped; `dues` [ticks] has one per arming."""
+    """Return the ages [us] of all answers, also of those that `echo` skipped; `dues` [ticks] has a delay per arming."""
     ages: list[int] = []
     for i, due in enumerate(dues):
         rows = link["arming"] == i
         tick, received = np.unwrap(link["tick"][rows], period=65536), link["received"][rows]
         source = tick + (link["echo"][rows] - tick + 32768) % 65536 - 32768
-        late = received & (link["status"][rows] & 0xF == Phase.HOLDING)  # the answer that was due was not there
+        late = received & (link["status"][rows] & 0xF == Phase.HOLDING)  # the answer for this tick had not come
         columns = tick, source, np.where(received, link["margin_us"][rows], NO_MARGIN), received, late
         for begin in range(0, len(tick), _PIECE):
             answers = AnswerAges(due, T_us)
@@ -262,7 +262,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
         result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay}, names)
         files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
         if not plot:
-            remove(out / "figure.png")  # of an earlier session
+            remove(out / "figure.png")  # the picture of an earlier session
         else:
             from haptic_loop.sim.plots import draw_run, save
 

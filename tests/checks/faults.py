@@ -304,7 +304,7 @@ CASES = (
         info=lambda i: i._replace(**{n: getattr(i, n)[:1] for n in i._fields[4:]}),
     ),
     Fault("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
-    Fault("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
+    Fault("a weak motor", G.REFUSED, "can apply 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
     Fault("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
     Fault(
         "coarse motors",

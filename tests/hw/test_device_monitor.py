@@ -241,7 +241,7 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
     port.now, port.coming = 70_000, encode(driving._replace(tick=70))
     driver.turn()
     if configuring:
-        assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives, and nobody asked it to")
+        assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives without a command")
 
 
 def test_fake_device_clocks_are_found(scenario, rungs):

@@ -200,7 +200,7 @@ def test_115200_baud_is_refused_with_the_arithmetic():
     reasons = SafetyLimits((12.0, 12.0)).objections(INFO, load(), 115_200)
     assert reasons == [
         "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us "
-        "(of a link without UART say --baud none)"
+        "(for a link without UART, give --baud none)"
     ]
 
 
@@ -212,7 +212,7 @@ def test_every_objection_is_named():
     poor = INFO._replace(period_ns=10**6, osp_damping=(1_370_000, 10**6), hard_limit=(15000, 30000))
     reasons = SafetyLimits((12.0, 12.0)).objections(poor, load(), 115_200)
     assert len(reasons) == 4
-    for reason, word in zip(reasons, ("1000000 ns", "baud", "axis 1 can do 6 N", "axis 2 guarantees 1"), strict=True):
+    for reason, word in zip(reasons, ("1000000 ns", "baud", "axis 1 can apply 6", "axis 2 guarantees 1"), strict=True):
         assert word in reason
 
 

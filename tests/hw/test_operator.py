@@ -27,7 +27,7 @@ def test_a_session_arms_by_itself_once(scenario, rungs, start):
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
     session = rehearsal.run_until_armed(2.0)
     assert session.stage == Stage.REFUSED
-    assert "nobody to arm the softer coupling" in session.cause
+    assert "nobody is there to arm the softer coupling" in session.cause
     assert stages(session).count(Stage.ARMING) == 1
 
 
