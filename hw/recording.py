@@ -29,11 +29,11 @@ from haptic_loop.sim.trace import Trace
 
 #: names of the link's arrays in a trace, each with one entry per tick
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")
-_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers of which a row has one, not one per axis
+_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers with one entry per row, not one per axis
 
 
 class Recorder:
-    """Collect rows as bytes, about 100 per tick."""
+    """Collect the rows of a trace as bytes, about 100 bytes per tick."""
 
     def __init__(self, channels: int) -> None:
         m = self.channels = channels
@@ -56,7 +56,7 @@ class Recorder:
         return len(self._rows) // self._form.size
 
     def link(self) -> dict[str, NDArray[Any]]:
-        """Return arrays by the names of _LINK, with `x` (N, m) [m], `applied` (N, m) [steps] and `echo` beside them."""
+        """Return arrays by the names of _LINK, with `x` (N, m) [m], `applied` (N, m) [steps] and `echo` as well."""
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 
@@ -77,7 +77,7 @@ class Recorder:
         return stretches
 
     def trace(self, units: Units, T: float, meta: dict[str, Any], names: tuple[str, ...] = ()) -> Trace:
-        """Return a trace in the form of sim.run. Handles and outside forces are not measured (nan, or no column)."""
+        """Return a trace in the form of sim.run. Handles and external forces are not measured (nan, or no column)."""
         link = self.link()
         n, m = len(self), self.channels
         last = np.maximum.accumulate(
@@ -89,7 +89,7 @@ class Recorder:
         return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta, names=names)
 
     def save(self, path: Path, result: Trace) -> Path:
-        """Write an npz that sim.trace reads, with the arrays of _LINK beside its own."""
+        """Write an npz that sim.trace reads, with the arrays of _LINK added."""
         recorded = self.link()
         link = {f"link_{name}": recorded[name] for name in _LINK}
         arrays: dict[str, Any] = {**result.arrays, **link}
@@ -109,13 +109,13 @@ def _digest(arrays: Mapping[str, Array]) -> str:
 
 
 def load(path: Path) -> tuple[Trace, dict[str, Array]]:
-    """Read a trace with its link arrays. Raises InputError if the file is not as a session of the bridge wrote it."""
+    """Read a trace with its link arrays. Raises InputError if no session of the bridge wrote it, or it has changed."""
     arrays = read_arrays(path, "a trace of this program")
     result = Trace.of_arrays(path, arrays)
     if not all(f"link_{name}" in arrays for name in _LINK):
-        raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one")
+        raise InputError(f"{path}: holds a trace without data of a link: give a trace of hw.bridge")
     if str(arrays.pop("digest", "")) != _digest(arrays):
-        raise InputError(f"{path}: was changed after hw.bridge wrote it: its digest is another")
+        raise InputError(f"{path}: was changed after hw.bridge wrote it: its digest differs")
     return result, {name: arrays[f"link_{name}"] for name in _LINK}
 
 
@@ -130,7 +130,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cap: tuple[int, ...]
     energy_budget: BudgetPlan | None = None
     behind: tuple[int, ...] = ()  # (m,) [ticks] that several boards add to the link
-    lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, where there was one
+    lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, if there was one
 
     @classmethod
     def of(cls, arming: Arming, limits: SafetyLimits, units: Units) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Where the replay differs from the record."""
+    """Differences between the replay and the record."""
 
     asked: NDArray[np.bool_]  # (N,) whether any bit of the controller's forces differs
     sent: NDArray[np.bool_]  # (N,) whether the steps sent differ
@@ -161,7 +161,7 @@ class _Comparison:
 def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
     """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest.
 
-    Raises InputError where the trace cannot be replayed, as without a recipe.
+    Raises InputError where the trace cannot be replayed, for example without a recipe.
     """
     wanted, sent, arming = np.zeros_like(link["asked"]), np.zeros_like(link["sent"]), link["arming"]
     try:

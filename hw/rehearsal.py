@@ -40,8 +40,8 @@ _MEASURE = 200  # answers that are timed; few suffice, because virtual time does
 _QUANTILE, _GUARD_US = 0.99, 100.0
 _BEGIN_US = 500  # time from the device's first tick to the start of the session
 _GRACE_US = 20_000  # time after the end of a session in which its device comes to rest
-_LONGEST = 60.0  # [s] of virtual time in which a session connects, is armed and ends, beside its run
-_LATENCY_US = 60  # of one direction, so that the median age is about the 130 us measured
+_LONGEST = 60.0  # [s] longest virtual time in which a session connects, is armed and ends, in addition to its run
+_LATENCY_US = 60  # latency of one direction, which gives a median age of about 130 us, as measured
 
 Plan = Callable[[Ages], Sequence[Armable]]
 
@@ -56,7 +56,7 @@ class _Moment(NamedTuple):
 
 @dataclass
 class _Cable:
-    """The host's end of the line to one emulated device. Time goes on while it waits."""
+    """The host's end of the line to one emulated device. Virtual time advances while the host waits."""
 
     rehearsal: Rehearsal
     emulator: Emulator
@@ -78,7 +78,7 @@ class _Cable:
         return data
 
     def write(self, data: bytes) -> int:
-        """Send frames to the device one by one, since the line may lose each."""
+        """Send frames to the device one by one, because the line may lose any of them."""
         rehearsal, now = self.rehearsal, self.rehearsal.now
         since = self.emulator.since_armed(round(now))
         for frame in filter(None, data.split(b"\0")):
@@ -115,7 +115,7 @@ class _Further:
     """One more emulated board of a rehearsal, with a clock of its own (hw/boards.py)."""
 
     emulator: Emulator
-    clock: float = 1.0  # length of a tick in T
+    clock: float = 1.0  # length of a tick as a multiple of T
     faults: tuple[FaultInjection, ...] = ()  # faults of its line
     begin_us: float = 0.0  # time of its first tick
 
@@ -124,7 +124,7 @@ class _Further:
 class Rehearsal:
     """A session and its emulated devices in virtual time: the session's ports lead to the emulators.
 
-    `actions` are what a person does: (seconds after arming, call).
+    `actions` of a person are pairs: (seconds after arming, call).
     """
 
     session: Session
@@ -133,11 +133,11 @@ class Rehearsal:
     faults: tuple[FaultInjection, ...] = ()
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
-    host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
+    host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, duration [s]) of host freezes
     arm: bool = True  # whether to arm the first coupling; a softer one waits for a person
     operator: Operator | None = None  # decides in place of `arm`, as in a live session
     latency_us: float = _LATENCY_US
-    clock: float = 1.0  # length of a tick of the device in T
+    clock: float = 1.0  # length of the device's tick as a multiple of T
     keep: bool = True  # whether to record every tick of the device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
     further: Sequence[_Further] = ()
@@ -180,7 +180,7 @@ class Rehearsal:
         return self.session.stage in ENDED and self.now > self._ended + _GRACE_US
 
     def _turn(self) -> None:
-        """Make one call of the device, then the actions of the person."""
+        """Call the device once, then do the actions of the person."""
         if not self.session.log:
             self._pass(_BEGIN_US)
             self.session.start(round(self.now))
@@ -203,9 +203,9 @@ class Rehearsal:
             self._ended = self.now
 
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
-        """Advance time until bytes have come, by at most `seconds`, and then while the host is frozen."""
+        """Advance time until bytes have come, by at most `seconds`, and then until the host is no longer frozen."""
         until, cables = self.now + 1e6 * seconds, cables or self._cables
-        one = cables[0]  # mostly the only one, which a plain look is enough for
+        one = cables[0]  # usually the only cable; the loop checks it first to save time
         while not (ready := bool(one.data or one.gone or (cables[1:] and _come(cables)))):
             if self._queue[0][0] > until:
                 self.now = until
@@ -258,7 +258,7 @@ class Rehearsal:
 
 
 def _come(cables: Sequence[_Cable]) -> bool:
-    """Return whether bytes have come over any of the cables, or one was pulled."""
+    """Return whether bytes have come over any of the cables, or whether any was pulled."""
     return any(cable.data or cable.gone for cable in cables)
 
 
@@ -275,7 +275,7 @@ def _device_of(cables: Sequence[_Cable], session: Session) -> HapticDevice:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """The result of a session.
+    """The result of a rehearsed session.
 
     Attributes:
         stage: "finished" where all went well, otherwise "refused", "stopped", "lost" or "e-stop".
@@ -315,13 +315,13 @@ def rehearse(
 ) -> Rehearsed:
     """Rehearse a session with the scenario's devices behind the real protocol, without device, port or waiting.
 
-    The session connects, measures the delay, designs a coupling for it (or judges `coupling`), certifies it, arms, runs
-    for `seconds`, and ramps out. The scenario's theta is the least delay; a slower link makes it longer. With
-    `latch_on_arrival`, the device applies a force as soon as it comes. The loop then has the measured latency
-    (`latency`) in place of a whole tick, beside the scenario's theta, which may be 0. If no coupling is certified for
-    the delay, the session is refused, which is a result and no error: see `stage` and `cause`.
+    The session connects, measures the delay, designs a coupling for it (or takes `coupling`), certifies the coupling,
+    arms, runs for `seconds`, and ramps out. Delays are at least the scenario's theta, or longer for a slow link. With
+    `latch_on_arrival`, the device applies a force as soon as it comes. The loop then has the measured `latency` in
+    addition to the scenario's theta, which may be 0. If no coupling is certified for the delay, the session is refused.
+    A refusal is a result, not an error: see `stage` and `cause`.
 
-    Raises InputError for a scenario that cannot stand behind a serial link, TypeError for an argument of another type.
+    Raises InputError for a scenario that cannot run behind a serial link, TypeError for an argument of another type.
     """
     of_kind("scenario", scenario, Scenario, 'a Scenario, as load("omega-pair") gives it')
     if coupling is not None:
@@ -350,14 +350,14 @@ def rehearse(
             programs.append(certified_coupling(met, case, None, None, link, coupling))
         return programs
 
-    stop = seconds, lambda session, now: session.stop("asked to", now)
+    stop = seconds, lambda session, now: session.stop("requested", now)
     try:
         emulator = Emulator(scenario)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[stop])
     rehearsal.run_to_the_end(seconds + _LONGEST)
-    outcome(case, session, recorder, 0)  # says whether a session that ended as planned has finished
+    outcome(case, session, recorder, 0)  # changes a finished session with doubtful forces to a stopped one
     first, meta = programs[0] if programs else None, {"scenario": scenario.name, "scenario_digest": scenario.digest}
     meta["stage"], ages = str(session.stage), session.measurement.result
     return Rehearsed(

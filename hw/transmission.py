@@ -5,8 +5,8 @@ and the least and the largest of its damping b. With a clamped handle, motor and
 a damper. With a free handle, the motor's own damping slows all motion, and b damps only the mode between motor and
 handle. One model is fitted to the spectra of all records together, with clamped records at two levels of force.
 
-Each bound is the estimate, moved by two standard errors (95 %) and by 0.5 % for the scale of the encoder. The errors
-come from fits that each leave out a part of one record's frequencies, so they include the errors of the model.
+Each bound is the estimate, moved by two standard errors (95 %) and by 0.5 % for the scale of the encoder. The standard
+errors come from fits that each omit a part of one record's frequencies, so they include the errors of the model.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra, starts
 
-_BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, an encoder of 5 um sees nothing of 1 N
-_TOLD = 0.01  # model error that is allowed, as a part of the motion, beside the encoder's noise
-_UNEXPLAINED = 2.5  # largest rms error over both: play and presliding friction leave 3 to 6, dry friction up to 2.1
+_BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N moves less than a count of 5 um
+_TOLD = 0.01  # allowed model error as a share of the motion, in addition to the encoder's noise
+_UNEXPLAINED = 2.5  # largest rms error relative to both; play and presliding friction: 3 to 6, dry friction: up to 2.1
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
-_SIGMAS, _SCALE = 2.0, 0.005
+_SIGMAS, _SCALE = 2.0, 0.005  # by which bounds are moved: standard errors, and a relative error of the encoder
 _WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
-_STEPS = 60  # most evaluations of a fit
+_STEPS = 60  # most evaluations in a fit
 _LATE = 0.05  # [T] largest delay of a force: no proof covers a slower current loop
-_FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # least log m1, log m2, log k, log b, delta and lag
+_FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # lower bounds of log m1, log m2, log k, log b, delta and lag
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,18 @@ class TransmissionBounds:
 
 
 class _Joint:
-    """The records of one axis, explained by one p = [log m1, log m2, log k, log b, delta, lag, delay, 0]."""
+    """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay, 0].
+
+    m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
+    is the motor's damping, and the forces have a lag and a delay [s].
+    """
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:
         self.records = records
         self._scale = [np.hypot(step * np.sqrt(r.ticks / 12), _TOLD * np.abs(r.motion)) for r in records]
 
     def errors(self, p: Array) -> list[NDArray[np.complex128]]:
-        """Return motion less model of every record, in units of the allowed error."""
+        """Return the difference of motion and model for every record, in units of the allowed error."""
         p = np.append(p, 0.0)
         return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
 
@@ -81,13 +85,14 @@ def transmission_bounds(
     friction: Friction,
     lever: float = 1.0,
 ) -> TransmissionBounds:
-    """Bound one axis by its records, (displacements [m], forces [N]) (N,) each, of period T [s].
+    """Return the bounds of one axis from its records: (displacements [m], forces [N]) (N,) each, with period T [s].
 
-    `step` [m] is the encoder's, `friction` that of the free record. Radians and N m of an axis that a hand holds at the
-    radius `lever` [m] are fitted as metres and N at the hand.
+    `step` [m] is the encoder step, `friction` was estimated from the free record. On a rotary axis with the hand at the
+    radius `lever` [m], radians and N m are converted to metres and N at the hand.
 
     Raises:
-        ValueError: No spring and damper in parallel between two masses explain the records, or they determine no bound.
+        ValueError: Two masses with a spring and a damper in parallel do not explain the records, or a bound is too
+            uncertain.
     """
     records, friction = [], at_radius(friction, 1 / lever)
     for (x, force), held in ((free, False), *((record, True) for record in clamped)):
@@ -99,8 +104,8 @@ def transmission_bounds(
         if (rms := float(np.sqrt(np.mean(np.abs(error) ** 2)))) > _UNEXPLAINED:
             which = "clamped" if r.held else "free"
             raise ValueError(
-                f"a spring and a damper in parallel leave {rms:.1f} times the error of a record with a {which} handle, "
-                f"allowed is {_UNEXPLAINED:g}: play, presliding friction, or the handle was not {which}"
+                f"a spring and a damper in parallel leave {rms:.1f} times the expected error in a record with a "
+                f"{which} handle, allowed is {_UNEXPLAINED:g}: play, presliding friction, or the handle was not {which}"
             )
     mode = np.sqrt(np.exp(p[2] - p[0])) / (2 * np.pi)
     lowest, highest = _WITHIN[0] * records[-1].hz.min(), _WITHIN[1] * records[-1].hz.max()
@@ -120,7 +125,9 @@ def transmission_bounds(
         raise ValueError(f"forces are up to {1e6 * most[3]:.0f} us late, at most {1e6 * _LATE * T:.0f} us are allowed")
     if not (least[0] > 0 and least[2] > 0):
         shown, lowest = lever**2 * b, lever**2 * least[2]
-        raise ValueError(f"the transmission's damping, {shown:.3g} N s/m, is not told from 0: at least {lowest:.2g}")
+        raise ValueError(
+            f"motor mass or transmission damping, {shown:.3g} N s/m, cannot be told from 0: at least {lowest:.2g}"
+        )
     figures = least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0)
     return at_radius(TransmissionBounds(*figures), lever)
 
