@@ -83,7 +83,7 @@ class Ages:
     ticks: tuple[int, ...] = ()  # [us] lengths of the device's ticks by its own clock
 
     def longest_tick(self, T_us: float, q: float = 1.0) -> float:
-        """Return the quantile q of the ticks' lengths [us], or T if it exceeds T by at most the clock's error."""
+        """Return the quantile q of the tick lengths [us], or T unless that is longer by more than the clock's error."""
         ordered = sorted(self.ticks)
         longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(longest) if longest > T_us + _CLOCK_US else T_us
@@ -94,7 +94,7 @@ class Ages:
         place = min(everything - 1, int(q * everything))
         if place >= len(ordered):
             part = 100 * self.missing / everything
-            raise SafetyStop(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
+            raise SafetyStop(f"{part:.2g} % of the answers never arrived: no delay covers {100 * q:g} % (--quantile)")
         return ordered[place]
 
     def link_delay(self, T_us: float, q: float, guard_us: float) -> int:
@@ -135,7 +135,7 @@ class AnswerAges:
             self.inferred.discard(tick)
 
     def note(self, tick: int, margin: int) -> None:
-        """Record the age of the answer to `tick`, and of the answers that it skips."""
+        """Record the age of the answer to `tick`, and of the answers skipped before it."""
         age = self.age(margin)
         after = tick - 1 if self._youngest is None else self._youngest
         for skipped in range(max(after + 1, tick - 2 * self._due), tick):  # older answers were missed long ago
@@ -154,7 +154,7 @@ class Measurement:
     have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
     round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
     same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are farther
-    apart than the longest age, at random distances, so that a burst meets each of them with the same probability.
+    apart than the longest age, at random distances, so that bursts meet each with the same probability.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
@@ -500,7 +500,7 @@ class EncoderNoise:
 
     @property
     def still(self) -> tuple[int, ...]:
-        """Return the range (m,) [counts] of an encoder at rest: 1 without noise, as a broken channel toggles by 1.
+        """Return the range (m,) [counts] in which an encoder rests: 1 without noise, as broken channels toggle by 1.
 
         Over a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
         """

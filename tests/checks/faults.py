@@ -154,7 +154,7 @@ CASES = (
     ),
     # the measurement
     Fault("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
-    Fault("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
+    Fault("3 % lost from the start", G.REFUSED, "no delay covers 99 %", ("down:drop=0.03",), designed=True),
     # the device
     Fault("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
     Fault("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),

@@ -307,7 +307,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
     ages = Ages(tuple(range(100, 190)), missing=10)
     assert ages.quantile(0.5) == 150
     assert ages.quantile(0.89) == 189
-    with pytest.raises(SafetyStop, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
+    with pytest.raises(SafetyStop, match=r"10 % of the answers never arrived: no delay covers 95 %"):
         ages.quantile(0.95)
 
 

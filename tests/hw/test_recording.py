@@ -106,7 +106,7 @@ def test_the_replay_command(trace, capsys):
 def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
     simulation = assemble(scenario, rungs[0].chosen.coupling)
     path = run(simulation, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
-    with pytest.raises(InputError, match="not of a bridge's session"):
+    with pytest.raises(InputError, match="a trace without data of a link"):
         load(path)
 
 
