@@ -304,6 +304,8 @@ class Emulator:
                 raise ValueError(
                     f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
                 )
+            if fault.kind in ("swap", "cross") and scenario.channels < 2:
+                raise ValueError(f"--fault {fault.kind} is for two axes, the scenario has one channel")
         self._waiting = list(faults)
         self._ready = 0
 

@@ -362,7 +362,7 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
     if not low < high:
         raise InputError(f"{option} is {low:g},{high:g}, expected the lower end first")
     if scale == "log" and low == 0:
-        raise InputError(f"{option} begins at 0, which a logarithmic map cannot show; use --scale linear")
+        raise InputError(f"{option} begins at 0, which a logarithmic map cannot show: choose a lower end above 0")
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -109,7 +109,7 @@ def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
         (("radius = 0.15", "radius = 3"), "radius is 3, allowed are"),
         (('unit = "rad"', ""), 'radius is 0.15, which is for unit = "rad" only'),
         (('"rad"', '"deg"'), "unit"),
-        (("credible_speed = 10.0", ""), "device #1: missing credible_speed: a rotary device has no defaults"),
+        (("credible_speed = 10.0", ""), "device #1: missing credible_speed: rotary devices have neither defaults"),
         (
             ('kind = "rigid"', 'kind = "compliant"'),
             "device #1: missing motor_mass, handle_mass, transmission_stiffness",

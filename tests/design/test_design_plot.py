@@ -169,7 +169,7 @@ def test_a_missing_design_leaves_the_others(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--coupling", "none,none"], "twice"),
+        (["--coupling", "none,none"], "repeated"),
         (["--coupling", "none,,published"], "separated by commas"),
         (["--coupling", "a.json,b.json,c.json,d.json,e.json,f.json,g.json"], "allowed are 1 to 6"),
         (["--coupling", "stiff"], "allowed are none, published"),

@@ -48,7 +48,20 @@ def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
     assert [event.stage for event in session.log[-2:]] == [Stage.FINISHED, Stage.STOPPED]
     fault = _rehearse_case(Fault("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
     assert fault.stage == Stage.STOPPED
-    assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "told to"]
+    assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "the dev"]
+
+
+def test_rehearsals_wait_for_deaf_devices(tmp_path, capsys):
+    """A device must rest 30 ms after STOP; a rehearsal that ends before that would call it finished."""
+    words = ["--rehearse", "--case", "I", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)]
+    assert bridge.main([*words, "--fault", "stuck"]) == 1
+    assert re.search(r"stopped .* the device still drives 30 ms after STOP", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("kind", ["swap", "cross=1"])
+def test_faults_of_two_axes_have_two(kind):
+    with pytest.raises(ValueError, match=rf"--fault {kind[:4]}.* two axes"):
+        Emulator(load_scenario("one-wall"), (FaultInjection.parse(kind),))
 
 
 def one_of_each_kind():
