@@ -187,15 +187,20 @@ def inverse(M: Array) -> Array:
         return solve(M, fractions(np.eye(M.shape[-1])))
     try:
         result = np.linalg.inv(M)
-        # The product of the Frobenius norms is an upper bound of the condition number, which takes far longer.
-        with np.errstate(over="ignore", invalid="ignore"):  # a product that overflows is inf or nan, not below
-            below = _square_norm(M) * _square_norm(result) <= 1e24
     except np.linalg.LinAlgError:
-        result, below = None, np.False_
-    if M.size and (result is None or (not below.all() and np.max(np.linalg.cond(M)) > 1e12)):
-        solved = "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12)"
-        raise SingularLoop(f"{solved}: soften the environment or the coupling, or add a sample to psi")
+        raise SingularLoop(_TOO_STIFF) from None
+    with np.errstate(over="ignore", invalid="ignore"):  # A product that overflows is not below.
+        # The product of the Frobenius norms is at least the condition number, whose singular values take far longer.
+        below = _square_norm(M) * _square_norm(result) <= 1e24
+    if M.size and not below.all() and np.max(np.linalg.cond(M)) > 1e12:
+        raise SingularLoop(_TOO_STIFF)
     return result
+
+
+_TOO_STIFF = (
+    "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12): "
+    "soften the environment or the coupling, or add a sample to psi"
+)
 
 
 def _square_norm(M: Array) -> Array:

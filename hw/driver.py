@@ -124,6 +124,8 @@ class Driver:
             if answer is not None:
                 self.do(understand(answer, self.clock()))
         except wire.SafetyStop as fault:
+            if session.stage == Stage.FINISHED:
+                session.retract(str(fault))
             self.do(session.end(Stage.STOPPED, str(fault), self.clock()))
 
     def load(self) -> None:

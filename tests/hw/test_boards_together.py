@@ -63,6 +63,16 @@ def watched(emulator):
     return ticks
 
 
+@pytest.mark.parametrize("deaf", [0, 1])
+def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf):
+    """The other board stops and rests, which must not hide the force that is left."""
+    faults = [(), ()]
+    faults[deaf] = ("stuck@0.1",)
+    stop = (0.4, lambda session, now: session.stop("asked to", now))
+    rehearsal = rehearsal_of(scenario, alone, made, faults=faults, actions=[stop])
+    assert rehearsal.run_until_armed(1.2).stage == Stage.STOPPED
+
+
 @pytest.mark.slow
 def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
     """Through a slip, forces are 1 and 2 steps old, and the host's energies are those at the devices, in integers."""
