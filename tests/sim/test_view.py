@@ -664,7 +664,7 @@ def test_bad_input_is_named(words, said, tmp_path, monkeypatch):
 
 def test_mp4_without_ffmpeg_is_refused(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="MP4 needs ffmpeg"):
+    with pytest.raises(InputError, match="MP4 requires ffmpeg"):
         run("--video", str(tmp_path / "a.mp4"))
 
 
