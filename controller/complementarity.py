@@ -280,7 +280,7 @@ _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its 
 
 
 class _BallBlock:
-    """Vectors that M couples, so that they are solved for together."""
+    """Force vectors of several devices whose entries M couples, so that their equations are solved jointly."""
 
     def __init__(self, at: NDArray[np.intp], M: Array, limit: Array, balls: tuple[int, ...]) -> None:
         self.at, self.limit, self.balls = at, limit, balls

@@ -32,7 +32,8 @@ BASIS_STATES = 270
 BASIS_PROOFS = 30 * 112**2.7
 #: Largest number of unknowns of a basis for this-environment alone. The largest program takes ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Largest product of unknowns and channels with further requirements. The largest program takes ten seconds, too.
+#: Largest number of unknowns of a basis times channels where a loop has further requirements than this-environment. The
+#: largest program takes ten seconds.
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried.
 UNPROVED_BASES = 2

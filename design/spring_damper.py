@@ -257,8 +257,8 @@ def design(
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-#: significant digits of the gains in loops of more than FEW channels: exact proofs with all digits take minutes.
-#: Rounding changes the required damping by less than RESERVE.
+#: Number of significant digits of the gains in loops of more than FEW channels, because exact proofs with all digits
+#: take minutes. Rounding changes the required damping by less than RESERVE.
 _DIGITS = 5
 _SWEEPS = 150  # number of frequency sweeps that a search for this-environment costs
 _MOST_ANY, _MOST_LIMITED = 48, 32  # largest numbers of channels for which a search ends within half a minute
@@ -547,7 +547,9 @@ _STIFF_DIGITS = 6
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
-    """Return starts around 2 d/((theta + 1) T), the stiffest linear coupling for any passive environment.
+    """Return couplings from which a search starts, with stiffnesses around 2 d/((theta + 1) T) [N/m].
+
+    This is the stiffness of the stiffest spring for any passive environment, with the usable damping d [N s/m].
 
     With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency.
     Therefore the last start has the environment's stiffness at half the sampling rate.

@@ -170,7 +170,7 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device has an error, was reset or has switched its forces off."""
+        """Raise SafetyStop if a device is not ready: without power or link, in error, reset, or with its forces off."""
         for index, ID in self._ids.items():
             status = self._status[index]
             self._heeded(self._sdk.getStatus(status, ID=ID))

@@ -108,7 +108,7 @@ class Ages:
 
 
 class AnswerAges:
-    """Ages of answers, derived from STATEs, by the number of the tick that each answers.
+    """The age of each answer, derived from STATEs and stored under the number of the answered tick.
 
     A STATE reports the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
     advances by n, and the n-1 skipped answers are up to (n-1) T older. The skipped answers count with these ages,
@@ -372,7 +372,7 @@ class _ClockDrift:
     whose: str
     T_us: float
     tolerance: float  # largest drift, as a part of a block
-    forgiven_us: float  # largest part of a freeze that is excluded
+    forgiven_us: float  # [us] greatest length up to which a block excludes its longest delay
     _last: int | None = None
     _ticks: int = 0
     _behind: float = 0.0  # [us] time of the clock minus ticks * T

@@ -74,7 +74,7 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """The factor that scales every force; 0 unless forces act."""
+        """The factor, from 0 to 1, that multiplies every force; 0 while the session does not drive."""
         return self.drive.gain.value if self.drive else 0.0
 
     @property

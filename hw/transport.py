@@ -210,7 +210,7 @@ class Live(Driver):
             self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
-        """Design a coupling; SIGINT interrupts the design. Keys typed meanwhile are handled before arming."""
+        """Return the designed couplings, or raise SafetyStop if SIGINT came; keys are handled before arming."""
         self._watch(self.session)  # call it now, because the design takes a while
         try:
             with _interruptible():

@@ -375,7 +375,7 @@ class MujocoEngine:
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """The function that advances one tick; it is made at its first use after `start`."""
+        """The function that advances the loop by one tick. After `start` it is made when it is first read."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 

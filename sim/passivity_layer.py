@@ -113,7 +113,7 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
         process = replace(process, delays=constant)
     make = partial(wanted.net, simulation, process)
-    make(1)  # raises InputError for impossible numbers before anything runs
+    make(1)  # Impossible numbers raise InputError here, before the simulation begins.
     return replace(simulation, process=replace(process, net=make))
 
 

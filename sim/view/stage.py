@@ -319,7 +319,7 @@ class _ShownWorld(_ShownScene):
 
 
 def stage_for(session: LiveLoop) -> _ShownScene:
-    """Return the stage that shows a session's loop."""
+    """Return the drawn scene of a session: its MuJoCo world, or its devices with the simulated object."""
     simulation = session.prepared.simulation
     if session.world:
         return _ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
@@ -327,7 +327,7 @@ def stage_for(session: LiveLoop) -> _ShownScene:
 
 
 def _dressed(scene: Scene) -> mujoco.MjModel:
-    """Return the scene's model with shapes, positions, colours and the camera's range, but the same dynamics."""
+    """Return the scene's model with the shapes, positions and colours for drawing; its dynamics are unchanged."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
