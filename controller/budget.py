@@ -1,16 +1,16 @@
 """Energy budgets: forces are scaled so that a passive hand receives at most a chosen energy, for any controller.
 
-    EnergyBudget        before the delays, at the port of the devices
-    Shell               at the port of the environment, behind a coupling that is certified for any environment
+    EnergyBudget        scales forces before the delays, at the port of the devices
+    Shell               scales forces at the port of the environment, behind a coupling certified for any environment
 
 *The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the
 energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), of which the device feels -a[k], and
-dx[k] = x[k+1] - x[k]. With delta' = (1 - eps) delta the budget computes
+dx[k] = x[k+1] - x[k]. With the reduced damping Delta' = (1 - eps) Delta (on vectors, ' is the transpose) it computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
 For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. Let R
-be the sum of these losses for all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
+be the sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
 they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
 exists at every tick: with s = 0 the last tick lowers R by its largest loss, and W by at most this loss. So W >= 0
 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the energy that
@@ -61,7 +61,7 @@ class NetFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ShellFigures(NetFigures):
-    """Figures of a passivity layer with an energy account W."""
+    """Figures of a passivity layer that limits forces by an energy W (see the module's docstring)."""
 
     start_J: float
     cap_J: float | None
@@ -168,7 +168,7 @@ class EnergyBudget(_Net):
 
         Args:
             delta: Damping (m,), or the matrix Delta_D (m, m), that the devices guarantee [N s/m]. A matrix is
-                diagonalised device by device. Then r(f) = T f' Delta^-1 f/4, and encoder errors are bounded in the
+                diagonalised device by device. Then r(f) = T f' Delta'^-1 f/4, and encoder errors are bounded in the
                 principal axes.
             T: The largest period [s].
             packets: The ages of the forces that a tick uses.
@@ -209,7 +209,7 @@ class EnergyBudget(_Net):
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
         self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
-        self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> dx and its largest loss
+        self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> its dx and its largest loss
         self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick whose force is known, and that force
         self.surprises = 0  # as in BudgetFigures
 
@@ -227,7 +227,7 @@ class EnergyBudget(_Net):
 
         `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. Without
         `acted` it is the sent force if delays are constant, and unknown otherwise. The first call ignores both.
-        `wanted` must be clipped to forces that the device can apply. A force that is nan or larger than 1e12 N is sent
+        `wanted` must be clipped to forces that the device can apply. An entry that is nan, or 1e12 N or more, is sent
         as zero.
         """
         if self.ticks:
@@ -247,7 +247,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) that acted in a tick, counted from 0, whose force was unknown."""
+        """Report the forces (m, nsim) that acted in tick number `tick` (from 0), which had no report yet."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
@@ -287,12 +287,13 @@ class EnergyBudget(_Net):
     def _scale(self, wanted: Array) -> Array:
         """Return the largest s (nsim,) for which the energy is at least the reserve including the packet s f.
 
-        Each tick that the packet reaches then reserves max(M, s^2 r + s b), where M is its present reserve. The sum of
-        the reserves is within the energy if and only if sum (s^2 r + s b) <= room + sum M for every set of these ticks.
-        It is enough to check the first n ticks, for every n, in the order of the s at which s^2 r + s b exceeds M.
+        Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is its present reserve,
+        r the channel's loss, and b = 2 q |f|. The sum of the reserves is within the energy if and only if
+        sum (s^2 r + s b) <= room + sum M for every set of these pairs. It is enough to check the first n pairs, for
+        every n, in the order of the s at which s^2 r + s b exceeds M.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
-        scale, now = np.ones_like(room), self._reserve[self._reached]  # (ticks that the packet reaches, nsim)
+        scale, now = np.ones_like(room), self._reserve[self._reached]  # (pairs that the packet reaches, nsim)
         square, linear = (self._square * wanted**2)[self._channel], (2 * self._step * np.abs(wanted))[self._channel]
         short = np.maximum(square + linear - now, 0.0).sum(axis=0) > room
         if short.any():
@@ -308,10 +309,10 @@ class Shell(_Net):
     """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
     W[k+1] = W[k] + f'(u - u_-), where u_- is u of the previous tick, and f = s f_wanted with the largest s in [0, 1]
-    for which W[k+1] >= 0. V responds within the tick, u = u0 - D_V f, so that W[k+1] is a concave parabola in s,
-    nonnegative at 0, and s is its upper root. Then sum f'(u - u_-) >= -W0 at every tick, so the environment is passive.
-    With a coupling that is certified for any environment and psi = 0 the loop is safe. A tick is a call of `free`, then
-    of `limit`.
+    for which W[k+1] >= 0. V responds within the tick by its feedthrough D_V: u = u0 - D_V f, where u0 is u for f = 0.
+    So W[k+1] is a concave parabola in s, nonnegative at 0, and s is its upper root, or 1 if the root is larger. Then
+    sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is certified for any
+    environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:
@@ -377,7 +378,7 @@ class Shell(_Net):
         short = W + linear - square < 0
         W, b, c = W[short], linear[short], square[short]
         root = np.sqrt(b**2 + 4 * c * W)
-        gains = b > 0  # selects the form of the upper root that has no cancellation; b > 0 implies c > 0
+        gains = b > 0  # `gains` selects the form of the upper root without cancellation; b > 0 implies c > 0
         upper = np.divide(np.where(gains, b + root, 2 * W), np.where(gains, 2 * c, root - b), out=0 * W, where=root > 0)
         scale[short] = np.minimum(upper, 1.0) * _SHAVE
         return scale
@@ -390,7 +391,7 @@ def _root(square: Array, linear: Array, most: Array) -> Array:
 
 
 def _finite(wanted: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the force with zero for entries that are not finite, and the simulations (nsim,) with such entries."""
+    """Return the force with 0 for entries that are nan or too large, and the simulations (nsim,) with such entries."""
     wanted = np.asarray(wanted, dtype=float)
     good = np.abs(wanted) < _HUGE
     return np.where(good, wanted, 0.0), np.asarray(~good.all(axis=0))

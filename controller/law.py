@@ -28,8 +28,8 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 # spring-damper between the same nodes, except for the constant force of its gap.
 #
 # The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
-# coupling respond within the tick, y = y_free - D p, so that the tick has an algebraic loop. This loop is the linear
-# complementarity problem
+# coupling respond within the tick: y = y_free - D p, where y_free is y for p = 0, and -D is the feedthrough. This
+# algebraic loop is the linear complementarity problem
 #
 #         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
 #
@@ -38,7 +38,7 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 
 
 Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
-State = tuple[bool, ...]  # which walls touch
+State = tuple[bool, ...]  # for each wall, whether it touches
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,8 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The limiter sends forces f_e with |f_e,i| <= L_i by letting the contact slip by e (e_- at the previous tick):
+# Let G map displacements x to forces before Theta. The limiter subtracts a slip e from x (e_- at the previous tick), so
+# that the forces f_e that it sends satisfy |f_e,i| <= L_i:
 #
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
@@ -228,8 +229,8 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
-# together with the walls: their forces p are further unknowns in the normal cone of a box (-inf, 0]. Both together are
-# one box problem (controller.complementarity).
+# together with the walls, whose forces p are in the normal cone of the box (-inf, 0] at a (d - c) - p. Both are one box
+# problem (controller.complementarity).
 
 
 def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
@@ -246,7 +247,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
-    rho: Array  # (m,) [N/m] resists changes of the slip: any-environment 0, this-environment beta delta/T
+    rho: Array  # (m,) [N/m] resists changes of the slip; 0 for any-environment, otherwise a share of delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold
@@ -282,7 +283,7 @@ class Limiter(Law):
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
-        """The number of channels of each force that is limited as a vector or alone; () if `balls` is empty."""
+        """The number of channels of each limited force: those of a vector, or 1; () if `balls` is empty."""
         sizes, at = [], 0
         while self.balls and at < self.channels:
             end = next((ball.stop for ball in self.balls if ball.start == at), at + 1)
@@ -355,7 +356,7 @@ class Limiter(Law):
                 linear(before, after)
                 free = after.take(sent, axis=0)
                 touched = magnitudes(free, balls) > limit
-                if b"\1" not in touched.tobytes():  # takes a sixth of the time of any() for a few channels
+                if b"\1" not in touched.tobytes():  # six times as fast as touched.any() for few channels
                     return
                 at = slice(None) if touched.shape[1] == 1 else np.flatnonzero(touched.any(axis=0))
                 e, f = solve(free[:, at])
@@ -409,7 +410,7 @@ class Limiter(Law):
     def at_rest(self, x: Array) -> Array:
         """Return the steady state for held displacements x (m,) [m], with no wall touching.
 
-        The slip is that of the force F(1) x, so that the delay lines hold forces within the limits.
+        The slip e keeps the static force F(1) (x - e), which the delay lines hold, within the limits.
         """
         m, G = self.channels, self.sent
         free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
