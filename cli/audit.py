@@ -53,7 +53,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Audit a coupling. Return 0 if it is safe in this environment and at every vertex of its ranges, 1 if not."""
+    """Audit a coupling. Return 0 if the required condition is certified, including the loop's ranges, 1 if not."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.audit import audit
     from haptic_loop.design.certificate import named
@@ -64,7 +64,9 @@ def main(argv: list[str]) -> int:
     if args.devices:
         extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
         if extra:
-            raise InputError(f"--devices with --{extra[0]}: the list is always the whole catalogue, give one of them")
+            raise InputError(
+                f"--devices with --{extra[0]}: the list is always the whole catalogue, leave out one of the two"
+            )
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
@@ -116,14 +118,16 @@ def _parser() -> options.Parser:
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m], or one for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
-    coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
-    parser.add_condition("the condition that must hold; your own is judged after the standard two", to=coupling)
+    coupling.add_argument("--coupling", metavar="FILE.json|FILE.py:NAME", help=stored)
+    parser.add_condition(
+        "the condition that must hold; the report judges this-environment and any-environment, too", to=coupling
+    )
     device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"from the catalogue: {device}; other options override it")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     parser.add_loop()
     parser.add_rigid()
-    scene = "a MuJoCo scene as the environment, touched at its named bodies without a joint, along x"
+    scene = "a MuJoCo scene as the environment; devices touch its named bodies that have no joint, along x"
     parser.add_argument("--world", metavar="FILE.xml", help=scene)
     switching = "also judge any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
     parser.add_varying_delay(switching)
@@ -181,7 +185,7 @@ def _list_devices(args: argparse.Namespace) -> int:
 
 
 def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
-    """Audit a coupling, by default the stiffest certified one, in a MuJoCo world."""
+    """Audit a coupling in a MuJoCo world, by default a moving average designed for it."""
     from haptic_loop.cli import world
     from haptic_loop.design.environments import ANY_ENVIRONMENT
     from haptic_loop.design.result import Chosen
@@ -250,7 +254,7 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The report as a table, and its limits.
+# The report as tables and remarks.
 
 
 def _tables(result: Audit) -> list[render.Table]:
@@ -330,7 +334,7 @@ def _remarks(report: _Report) -> Iterator[str]:
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
-    """Yield the changes that certify the coupling, the one with the least required damping first."""
+    """Yield the changes that certify the coupling, the least required damping first, or that there are none."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
         yield "What helps: no single change of delay, damper or period was found to help; a design finds other gains."
@@ -350,5 +354,5 @@ def _switching_remarks(switching: SwitchingFigures) -> Iterator[str]:
     enough = "certified" if buffered.certified else "not certified"
     needed = f"needs {listed(buffered.required_damping)} N s/m"
     if math.inf in buffered.required_damping:
-        needed = "is not enough with any damping"
+        needed = "fails with any damping"
     yield f"A playout buffer to the constant {listed(switching.hi)} {needed}: {enough}."

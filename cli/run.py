@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
+    """Simulate and report. Return 0 for a completed run, stable or not, and 130 for an interrupted one."""
     args = _parser().parse_args(argv)
     from haptic_loop.sim.report import encoder_steps
 
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
 
         return world.run(args, scenario, out)
     environment, simulated = _environment(args, scenario)
-    chosen = chosen_by(args, scenario)  # the coupling V, Q or R
+    chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     encoder = encoder_steps(scenario, args.case, chosen.coupling)
@@ -90,7 +90,7 @@ def _parser() -> options.Parser:
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
     error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
-    check = "also run RK4, which shares no matrix with the exponential engine"
+    check = "repeat the run with RK4, which uses other formulas (with exponential, if RK4 ran), and compare"
     add("--cross-check", action="store_true", help=check)
     parser.add_human()
     parser.add_band()
@@ -147,7 +147,7 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | None:
-    """Return the damping needed in environments near the modelled one; None if no guarantee depends on it."""
+    """Return the damping needed in environments near the model; None if no guarantee depends on the model."""
     from haptic_loop.design.robustness import robustness_nearby
 
     guarantee = assessment.guarantee

@@ -1,9 +1,9 @@
 """Comparison of couplings: with the same devices and hands (`alternatives`), and over frequency (`Comparison`).
 
-The alternatives are none, the paper's gains for the paper's loop, and the spring-dampers for any passive environment
-and for this environment. The optimal coupling is included if it is quick to find. Each coupling is assessed with its
-proof and drives the same hands in the exact engine. Over frequency, couplings of the user's choice are compared by
-required damping, robustness and felt impedance.
+The alternatives are: no coupling, the paper's gains (in the paper's loop only), and the spring-dampers for any passive
+environment and for this environment. The optimal coupling is included if it is quick to find. Each coupling is assessed
+with its proof and, in loops without walls and friction, drives the same hands in the exact engine. Over frequency,
+couplings of the user's choice are compared by required damping, robustness and felt impedance.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class Alternative:
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
-    force_error_percent: float | None = None  # None if the loop grows, or has walls or friction
+    force_error_percent: float | None = None  # None if the loop is unstable, or has walls or friction
     required_damping: dict[str, tuple[float, ...]] = field(default_factory=dict)  # [N s/m], by condition
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)
     trace: Trace | None = off_table("left out", None)  # of the exact engine
-    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of the ideal environment for trace's motion
-    until_s: float | None = off_table("left out", None)  # time from which the trace is not credible
+    ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of Lambda E for the motion of `trace`
+    until_s: float | None = off_table("left out", None)  # time from which the devices' linear model is not credible
 
     @property
     def name(self) -> str:
@@ -81,10 +81,10 @@ def alternatives(
     progress: Callable[[int, int], None] = lambda done, of: None,
     also: Condition | None = None,
 ) -> list[Alternative]:
-    """Run the scenario with each coupling that is possible in its loop.
+    """Judge each coupling of `_ROWS` that is possible in the loop; run it if there are no walls and no friction.
 
     Scenarios with ranges get couplings for any environment only. Scenarios with walls get no optimal coupling, because
-    it contains a linear model. `also` is a user's own condition, which then judges every coupling, too.
+    it contains a linear model. `also` is a user's own condition, by which every coupling is judged in addition.
 
     Raises:
         InputError: the delays switch.
