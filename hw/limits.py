@@ -31,10 +31,10 @@ from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
-_COARSEST = 0.1  # largest encoder count, as a part of the largest displacement in a tick that a hand can make
-_LARGEST_MARGIN_US = 30_000  # ages are computed from margins, which are i16 in microseconds
+_COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
+_LARGEST_MARGIN_US = 30_000  # largest margin in a STATE, an i16 in microseconds from which ages are computed
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
-_HOLD, _RAMP_US = 4, 5000  # [ticks] for which a device without answers holds a force, then [us] of its ramp to zero
+_HOLD, _RAMP_US = 4, 5000  # A device without new forces holds the last one for these ticks, then ramps to zero [us].
 
 
 class Stage(StrEnum):
@@ -63,7 +63,7 @@ class _Shaped(NamedTuple):
     """A force that may be sent, and the limits that it has reached."""
 
     force: tuple[float, ...]  # (m,) [N]
-    clipped: bool  # whether an entry is at its cap, by the limiter or by clipping here
+    clipped: bool  # whether an entry or a vector is at its cap, by the limiter or by clipping here
     slowed: bool  # whether the slew rate limits an entry
 
 
@@ -116,7 +116,7 @@ class SafetyLimits:
         """Return the force to send for `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
         A vector that is capped keeps its direction. A vector with an axis above the slew rate moves straight towards
-        its goal, with that axis at the slew rate.
+        its goal, with its fastest axis at the slew rate.
 
         `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
         `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
@@ -351,7 +351,7 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """Return theta [ticks] for the measurement: the largest for which a margin can state every age.
+    """Return theta [ticks] for the measurement: the largest for which every margin fits into a STATE.
 
     Raises ValueError where T [s] is too long for theta = 1.
     """
@@ -362,7 +362,7 @@ def probe_delay(T: float) -> int:
 
 
 def watchdog_for(T: float) -> int:
-    """Return the longest silence [us] of a device that ticks every T [s]: five ticks, and at least 6 ms (busy host).
+    """Return the longest silence [us] of a device that ticks every T [s]: five ticks, but at least 6 ms for busy hosts.
 
     Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a device may push without a new force.
     """

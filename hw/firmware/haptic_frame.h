@@ -47,7 +47,7 @@ static inline uint32_t hl_crc(const uint8_t *p, size_t n)
     return ~crc;
 }
 
-/* Turns the n payload bytes that begin at frame[1] into a frame, in place, and returns the length of the frame. */
+/* Turns the n payload bytes that begin at frame[1] into a frame with its final zero, in place, and returns its length, n + 6. */
 static inline size_t hl_stuff(uint8_t *frame, size_t n)
 {
     size_t code = 0, i;
@@ -63,8 +63,8 @@ static inline size_t hl_stuff(uint8_t *frame, size_t n)
     return n + 2;
 }
 
-/* Takes one byte from the wire. Returns the length of the payload that the byte completes, 0 if it completes none, or -1 if
- * a frame must be dropped. */
+/* Takes one byte from the wire. Returns the length of the payload that the byte completes, 0 if it completes none, or -1, once
+ * for each frame that must be dropped. */
 static inline int hl_collect(hl_receiver *r, uint8_t byte)
 {
     size_t i = 0, n = r->length;
