@@ -76,7 +76,7 @@ class NominalWorst:
 
 @dataclass(frozen=True)
 class OverRanges:
-    """Requirement and mismatch of a coupling over ranges; a mismatch of zero is null in JSON."""
+    """Requirement and mismatch of a coupling over ranges; a mismatch of minus infinity dB is null in JSON."""
 
     coupling: str
     violated: int  # number of members that violate the condition
@@ -108,11 +108,11 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures over the ranges: of the design that `nominal` makes without ranges, then of `design`."""
+    """Return the figures over the ranges, first of a design that `nominal` makes without ranges, then of `design`."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}
-        with suppress(DesignFailed):  # The nominal design has another default basis and may fail.
+        with suppress(DesignFailed):  # The design without ranges may fail.
             couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]

@@ -1,15 +1,17 @@
 """Conditions for devices with a known motor mass and a known lossy transmission (Theorem B).
 
-this-environment assumes a hand of any stiffness at the motor's shaft. The devices here have a transmission, a spring of
-at most k and a damper of at least b in parallel. No hand behind it is stiffer than the transmission, and the mass of
-the motor keeps its speed continuous. Let P = k^2/b, let beta > 0 [s] be any number, and let the force f be held in each
-period. Then the motor, its transmission and every passive hand behind the transmission satisfy
+this-environment assumes a hand of any stiffness at the motor's shaft. The devices here have a transmission between
+motor and hand: a spring k and a damper b in parallel. No hand behind it is stiffer than the transmission, and the
+motor's mass keeps its speed continuous. The bounds are the motor's least mass m and least damping delta,
+P = k_max^2/b_min, and b_max. Let beta > 0 [s] be any number, and let the force f be held in each period. Then the
+motor, its transmission and every passive hand behind the transmission satisfy
 
-    sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
+    sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 a^2,
 
-with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx in a period, the speeds v and v+ at its
-ends, and dv = v+ - v. docs/theory.md has the proof. The blocks below state that the environment's side returns less
-energy than L. design.necessary has a lower bound for all conditions on these devices.
+with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b_max/4, the motor's displacement dx in a period, its speeds v and v+
+at the ends, dv = v+ - v, and its acceleration a. docs/theory.md has the proof. The blocks below state that the
+environment's side returns less energy than L. design.necessary computes a lower bound of the damping that conditions
+on these devices require.
 """
 
 from __future__ import annotations
@@ -91,7 +93,7 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """Return the bound of beta (m,) [s], where c0 or c2 becomes 0, for devices with the damping `share` Delta."""
+    """Return the beta (m,) [s] at which c0 or c2 becomes 0, for devices with the damping `share` times Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
@@ -200,7 +202,7 @@ def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], 
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double, from the ball's midpoint in the direction `towards`, whose decimal is `beyond` it."""
+    """Return the first double, from the ball's midpoint in the direction `towards`, with a decimal beyond the ball."""
     import flint
 
     value = float(ball.mid())
@@ -284,10 +286,10 @@ def _exact_cost(
 # inequality, whose least s bounds the required s from below.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least tried ratio; this-environment then requires the same damping to five digits
+_LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of this-environment to five digits
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # matrices in a stack, which take hardly longer than one: a step tries several shares at once
-_WORST, _IN_A_CUT = 6, 28  # frequencies at which a cut locates the least share, and number of bisections there
+_WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
 _VIOLATED = 3  # number of frequencies at which a round adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
 _GAP = 3e-6  # relative gap between the best share and the bound at which the search ends
@@ -326,7 +328,7 @@ class Sweep:
     ) -> None:
         self.loop, self.maps, self.form, self.unknowns = loop, maps, form, unknowns
         known, m = _known(loop, loop.T), loop.channels
-        self.P, self.highest = known.P, 4 * known.mass / known.damping  # beta [s] at which c2 = 0
+        self.P, self.highest = known.P, 4 * known.mass / known.damping  # `highest` is the beta [s] with c2 = 0
         self.usual = tuple(v for each in unknowns for v in (each.units if each.start is None else each.start))
         self.grids = [np.concatenate([[0.0], frequencies(self.idle(i, np.zeros(m)).free)]) for i in range(len(maps))]
         limited = any(each.name == "c" for each in unknowns)  # With a limiter dx is the sum of two inputs.
@@ -411,7 +413,7 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,) and blocks (.., k, n, n): that for zero beta and multipliers, then its slope in each."""
+        """Return z (k,) and blocks (.., k, n, n): one for zero beta and multipliers, then its slope in each unknown."""
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(self.device.size)
         each = [(no_beta, none), *((beta, none) for beta in np.eye(m)[:, self.device])]
@@ -428,12 +430,12 @@ class _Search:
         return self.sweep.loop.per_device(largest_beta(self.sweep.loop, share))
 
     def weights(self, x: Array) -> Array:
-        """Return the multipliers of x in their units."""
+        """Return the multipliers of x as multiples of their units."""
         inner = x[self.m : -1]
         return np.where(self.inverse, 1 / np.where(self.inverse, inner, 1.0), inner)
 
     def values(self, x: Array) -> tuple[float, ...]:
-        """Return the multipliers of x."""
+        """Return the multipliers of x in SI units."""
         values = np.zeros(self.units.size)
         values[self.searched] = self.weights(x) * self.units[self.searched]
         return tuple(values.tolist())
@@ -599,7 +601,7 @@ class _Search:
 
 _ETAS = (0.03, 0.3, 0.1, 0.9)  # shares of the largest beta for the first tangents; the search begins at the second
 _SLACK = 0.002  # A tangent with a larger least eigenvalue (its entries are about one) is dropped.
-_BETWEEN = 1e-4  # largest relative excess of the share between sampled frequencies; beyond it one more is sampled
+_BETWEEN = 1e-4  # If a sweep finds a share larger by more than this (relative), its frequency is sampled, too.
 
 
 def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
@@ -691,7 +693,7 @@ class KnownDevice(Condition):
         )
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
+        """Return the block at the loop's damping, with gain 0 for beta > 0, as L is not proportional to the damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m, straight = loop.channels, _straightened(loop)
@@ -778,8 +780,9 @@ class KnownDevice(Condition):
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid.
 
-        Shares from _LEAST_DRAWN to the share of the plain condition are tried, with beta = _DRAWN times the largest
-        beta of each channel. The grid is coarse because a map needs thousands of couplings.
+        Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
+        beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map needs thousands of
+        couplings. Returns None where the plain condition has no such figures, and inf where this condition has none.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):
@@ -881,7 +884,7 @@ class _KnownDeviceAny(KnownDevice):
         return "any passive environment"
 
 
-_LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of shares of the damping in a map
+_LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of the shares of the damping that `ratios` tries
 _DRAWN_STEPS = 10  # halvings of the logarithm of this range, to 0.6 %
 _DRAWN = np.concatenate([np.geomspace(0.003, 0.5, 18), [0.62, 0.74, 0.85, 0.93, 0.98, 0.9995]])
 _DRAWN_POINTS = 240  # number of frequencies, half of them evenly and half logarithmically spaced

@@ -59,7 +59,7 @@ class Transparency:
         if self.relative_mismatch == 0:
             return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
-            return "some motion of the object costs no static force, and tau (25) divides by the least force"
+            return "some motion of the object takes no static force, and tau (25) divides by the least force"
         return None
 
     def part(self) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
-    """Compute only the rms mismatch over log frequency; rounding is not set to 0. Raises ValueError if E is zero."""
+    """Compute only the rms mismatch over log frequency, rounding errors included. Raises ValueError if E is zero."""
     if silent(environment):
         raise ValueError(NO_FORCE)
     target = delay(lam, F.T) @ environment
