@@ -65,7 +65,7 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse the options `names`, which would have no effect, if `acts` is false for the parsed arguments."""
+        """Refuse the options `names` as "only `where`", unless `acts` is true for the parsed arguments."""
         self._only.append((where, acts, names))
 
     def format_help(self) -> str:
@@ -119,7 +119,7 @@ class Parser(argparse.ArgumentParser):
         return did_you_mean(word.partition("=")[0], known)
 
     def error(self, message: str) -> NoReturn:
-        """Raise InputError; its message has the units of the scenario that the options name."""
+        """Raise InputError with a message in metres or radians, whichever the scenario of --scenario uses."""
         scenarios = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         scenarios.add_argument("--scenario", default=DEFAULT)
         with suppress(argparse.ArgumentError, InputError):
@@ -159,9 +159,9 @@ class Parser(argparse.ArgumentParser):
             type=_known_device,
             action="append",
             metavar="MASS,K_MAX,B_MIN,B_MAX",
-            help=f"{known}; once for all channels, or once per channel",
+            help=f"{known}; once for all devices, or once per device",
         )
-        late = "time from a tick until its force latches [s], less than T: at most S or LO:HI, per device or for all"
+        late = "time from a tick until its force latches [s], below T: 0 to S, or LO:HI; per device or for all"
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
@@ -177,7 +177,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
         """Add --no-limiter; `limiter` is None (the default behaviour) or False."""
-        help_ = f"{what}, without the limiter that a guarantee covers"
+        help_ = f"{what}, without the limiter and its guarantee"
         (to or self).add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
 
     def add_rigid(self) -> None:
@@ -187,12 +187,12 @@ class Parser(argparse.ArgumentParser):
 
     def add_human(self, more: str = "") -> None:
         """Add --human."""
-        who = f"other humans: [[human]] per channel in a .toml, or a list of hands{more or ' in a .py'}"
+        who = f"other humans: one [[human]] per device in a .toml, or a list of hands{more or ' in a .py'}"
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
         """Add --energy-budget."""
-        what = "scale forces so that no passive hand receives more than W0 [J]; store at most CAP [J] of users' energy"
+        what = "scale forces so that no passive hand receives more than W0 [J]; the budget never exceeds CAP [J]"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:
@@ -327,7 +327,7 @@ def _energy_budget(text: str) -> tuple[float, float]:
 
 
 def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
-    """Parse '1,2' as one range for all channels, '1-2,0-3' as one range for each [samples]."""
+    """Parse '1,2' as one range [samples] for all channels, '1-2,0-3' as one for each channel or device."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
         parts = [(parts[0][0], parts[1][0])]
@@ -341,8 +341,8 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
-    """Parse '130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range; one for all channels or one for each [s]."""
-    parts = _parts(text, float, expected := "S or LO:HI in seconds, one or one per channel", ":")
+    """Parse '130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range [s]; one for all devices or one for each."""
+    parts = _parts(text, float, expected := "S or LO:HI in seconds, one for all or one per device", ":")
     if any(len(part) > 2 for part in parts):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
     return tuple((0.0, part[0]) if len(part) == 1 else (part[0], part[1]) for part in parts)
@@ -500,8 +500,8 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 def place(args: argparse.Namespace) -> str:
     """Return the part of a file name that states case or scenario, and coupling and condition if options name them.
 
-    Suffixes of files are left out: `run-I-stiff` for `--coupling stiff.json`. For a file of another folder a digest of
-    that folder is appended, so that results of files with equal names in two folders stay apart.
+    Suffixes of files are left out: `run-I-stiff` for `--coupling stiff.json`. For a file outside of the
+    working directory a digest of its folder is appended, so that files of equal names do not share results.
     """
     if args.scenario == DEFAULT:
         loop = args.case
@@ -597,7 +597,7 @@ def _rows(
 ) -> tuple[tuple[_Number, ...], ...]:
     """Read rows of numbers, separated by commas or blanks, from a file; # begins a comment. Raises InputError.
 
-    A single column is repeated for all columns.
+    A row with a single number stands for equal numbers in all columns.
     """
     rows = []
     for n, line in enumerate(read_text(path, f"{option} {path}", hint).splitlines(), start=1):
