@@ -2,7 +2,7 @@
 
     traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-A net is such a layer. With a net, a tick's block does not contain the delays Theta. The forces of
+A net is such a layer. With a net, the linear block of a tick does not contain the delays Theta. The forces of
 G = (I + Psi E V)^-1 Psi E go through the net, then through a delay line, for constant and for varying delays. The
 budget acts before the delay line, on forces within the actuators' limits.
 """
@@ -69,12 +69,12 @@ class EnergyNet:
 class Plugged:
     """A user's function in place of the environment, behind the coupling and a shell that makes it passive."""
 
-    force: Callable[[Array], Array]  # positions that the port would have without a force, (m,) [m] -> force (m,) [N]
+    force: Callable[[Array], Array]  # positions of its port at zero force, (m,) [m] -> force (m,) [N]
     start: float = 0.0  # W0 [J]
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh shell for `nsim` runs. Raises ValueError for a loop in which no shell is known."""
+        """Return a fresh shell for `nsim` runs. Raises ValueError if no shell is known for the loop."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("an environment of your own needs a coupling with a compliance V before it")
@@ -84,7 +84,7 @@ class Plugged:
 
 
 def claim(assessment: Assessment) -> str:
-    """Return one line with the guarantee of a run with an energy account, or the reason why there is none."""
+    """Return one line with the guarantee of a run with a net, or the reason why there is none."""
     if assessment.guarantee is None:
         return f"no guarantee: {assessment.reason}"
     behind = "behind a coupling certified for any environment, " if callable(assessment.environment) else ""
@@ -103,7 +103,7 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
     """Return the loop with a net between controller and devices, for runs of up to `ticks` (default: the scenario's).
 
     For linear analyses, such as certificates and modes, use the simulation without a net. The delays of the simulation
-    do not change. Raises InputError for latencies and for numbers that no budget can have.
+    do not change. Raises InputError for latencies, and the errors of `wanted.net` for impossible settings.
     """
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:

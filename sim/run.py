@@ -81,12 +81,12 @@ class Simulation:
     coupling: Coupling
     process: Process
     scene: Scene
-    plant: HeldPlant  # for periods T and forces that latch in the middle of their range
+    plant: HeldPlant  # for periods T, with forces that latch in the middle of the range of latencies
     timing: Timing | None = None  # begin and latch times of ticks; None if all ticks are alike and forces latch at them
 
     @cached_property
     def loop(self) -> Loop:
-        """The loop as designs see it, with the reference delays of case I, which a run does not use."""
+        """The loop of case I, as designs see it; a run does not use its reference delays."""
         return self.scenario.loop("I")
 
     @cached_property
@@ -142,15 +142,15 @@ class Simulation:
 def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
     """Build both sides of the loop: the computer's process and the plant.
 
-    `lag` is rho (m,) [N/m] of the limiter through which forces leave; with None, forces are clipped. `seed` is the seed
-    of varying periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no
+    `lag` is the `rho` (m,) [N/m] of controller.law.Limiter; with None, forces are clipped. `seed` is the seed of
+    varying periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no
     solution, and InputError for walls with a coupling that holds a linear model.
     """
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     axes = scenario.axis_devices
     limits, steps = (np.array([getattr(axis, of) for axis in axes]) for of in ("force_limit", "encoder_step"))
-    if scenario.environment.world:  # The forces of the scene come from a net (sim.world).
+    if scenario.environment.world:  # A net (controller.tick.Net) of sim.world gives the forces.
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
         most, balls = scenario.limiter_limits
@@ -251,7 +251,7 @@ def _room(width: int, ticks: int, T: float) -> Array:
     for needed, there, what in ((8 * _COLUMNS, free, "memory"), (2 * each, disk, tempfile.gettempdir())):
         if needed * ticks > there:
             needs = f"{ticks * T:g} s need {ticks * needed / 2**30:.3g} GiB of {what}, {there / 2**30:.3g} are free"
-            raise InputError(f"duration: {needs}: allowed are {there / needed * T:.3g} s; sim.validate stores none")
+            raise InputError(f"duration: {needs}: allowed are {there / needed * T:.3g} s; sim.validate stores no trace")
     with tempfile.TemporaryFile() as file:
         return np.memmap(file, np.float64, "w+", shape=shape).view(np.ndarray)
 
@@ -302,7 +302,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     first = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
-        engine.run_block(ticks)  # runs the law without limits; `linear_until` then checks its forces
+        engine.run_block(ticks)  # This runs the law without limits; `linear_until` then checks the forces.
         first = buffer.linear_until(ticks)
         if first == ticks:
             return
@@ -324,7 +324,7 @@ def outside_forces(
 ) -> Array:
     """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, outside).
 
-    The voluntary motion reaches the end of each human, the tap reaches one handle.
+    The voluntary force acts on the end of each human, the tap on one handle.
     """
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))

@@ -1,7 +1,7 @@
 """The trace of a run, its files, and oscillations in its displacements.
 
-Oscillations are judged by displacements alone, because a session on a device, a stored trace and a nonlinear loop have
-no known states. The slow motion is subtracted, and the rest is split into octaves.
+Oscillations are judged by displacements alone, because a session on a device and a stored trace contain no states, and
+a nonlinear loop has no eigenvalues. The slow motion is subtracted, and the rest is split into octaves.
 
 oscillation   Does an oscillation last in the second half of a trace? The half is cut into two windows. The oscillation
               lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
@@ -58,17 +58,17 @@ class Trace(ReadOnly):
     The states z and s have no columns in a trace that was read from a file or recorded on a real device.
 
     Attributes:
-        t: (N,) times [s]; sample k is taken at k T.
+        t: (N,) times [s] at which the ticks begin; k T if all periods are T.
         x: (N, m) displacements of the devices as the encoders gave them [m].
         f: (N, m) forces fed back, within the limits [N]; the devices feel -f.
         x_handle: (N, m) displacements of the handles [m].
         v_handle: (N, m) velocities of the handles [m/s].
-        w: (N, outside) forces from outside on the hands [N].
+        w: (N, outside) external forces [N], voluntary or of a tap.
         meta: Settings and verdicts of the run, as in its JSON; `meta["stability"]`, `meta["assessment"]`.
         z: (N, order) states of the controller.
         s: (N, states) states of the plant: positions [m], velocities [m/s], states of the hands' impedances, and with
             latencies the held forces [N].
-        diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
+        diverged: Whether the next tick has numbers that are not finite, or the engine gave up in the last 2048 ticks.
         interrupted: Whether the run was stopped from the keyboard.
         net: The passivity layer between controller and devices, in its final state; None without one.
         names: (m,) names of the channels if devices have several axes; empty if channels are numbered.
@@ -110,7 +110,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached `force_limit` (m,) [N]; `balls` are channels with a limited length."""
+        """Return (N,) whether a force reached `force_limit` (m,) [N]; `balls`: channels limited as a vector."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -244,7 +244,7 @@ def slowest_seen(duration: float) -> float:
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Judge positions x (ticks, m, nsim) [m], the second half of traces sampled every T seconds."""
+    """Judge positions x (ticks, m, nsim) [m], the second half of traces; `threshold` [m] is the least amplitude."""
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
@@ -310,7 +310,7 @@ class Growth:
     first: int  # the part has the ticks [first, stop)
     stop: int
     growth_rate_per_s: float | None = None
-    error_per_s: float | None = None  # standard error of the line
+    error_per_s: float | None = None  # standard error of the rate
     frequency_hz: float | None = None
     amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
     slowest_hz: float | None = None  # slower oscillations are not seen
@@ -364,7 +364,7 @@ class _Lines(NamedTuple):
     octaves: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m] of each
     brief: bool  # an oscillation is seen, but in too few windows
     gone: bool  # no oscillation is seen in the last window
-    floor: float  # [m]
+    floor: float  # [m] least amplitude that the encoders' rounding does not explain
     slowest: float  # [Hz]
 
 
@@ -414,7 +414,9 @@ def growths(trace: Trace) -> list[Growth]:
         ends = np.array([(int(first), int(stop)) for first, stop in stretches], dtype=int).reshape(-1, 2)
         steps = np.maximum(np.array(step, dtype=float).reshape(m), _FINEST)
     except (TypeError, ValueError, OverflowError):
-        raise InputError("the trace's run.steady_ticks or run.encoder_step_m are no numbers for its channels") from None
+        raise InputError(
+            "the trace's run.steady_ticks are no pairs of ticks, or run.encoder_step_m has no number per channel"
+        ) from None
     if np.any(ends[:, 0] < 0) or np.any(ends[:, 1] > n) or np.any(ends[:, 0] > ends[:, 1]):
         raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, but it has {n} ticks")
     if not all(np.isfinite(values).all() for values in (trace.t, trace.x, steps)):
@@ -427,5 +429,7 @@ def growths(trace: Trace) -> list[Growth]:
     if n > 1 and not 0 < T < np.inf:
         raise InputError(f"the trace's samples are {T:g} s apart")
     if not np.abs(np.diff(trace.t) - T).max(initial=0.0) <= _EVEN * T:
-        raise InputError(f"the trace's samples are not evenly spaced: t first steps by {T:g} s, later otherwise")
+        raise InputError(
+            f"the trace's samples are not evenly spaced: the first step of t is {T:g} s, a later one differs"
+        )
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
