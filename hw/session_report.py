@@ -1,4 +1,4 @@
-"""The report of a session (its end, its link, oscillations that grew), and a log that survives a crash."""
+"""The report of a session (its end, its link, the growth of oscillations), and a log that survives a crash."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class _WorldSession(WorldRecord):
 
     @classmethod
     def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[_WorldSession]:
-        """Return the figures of each arming. `trace` is that of the session; `arming` (N,) counts armings from 0."""
+        """Return the figures of each arming. `trace` is the session's; `arming` (N,) numbers its ticks by arming."""
         sessions, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
         for i, world in enumerate(session.worlds):
             x, f = trace.x[arming == i], trace.f[arming == i]
@@ -180,7 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """Return the report of a session that has ended. A finished session with doubtful forces becomes stopped."""
+    """Return the report of an ended session. It changes the end from finished to stopped if `_doubt` has a reason."""
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
     steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []
@@ -228,7 +228,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
 
 
 def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
-    """Return the ages [us] of all answers, also of those that `echo` skipped; `dues` [ticks] has a delay per arming."""
+    """Return the ages [us] of all answers, skipped ones (`AnswerAges`) too; `dues` has a delay [ticks] per arming."""
     ages: list[int] = []
     for i, due in enumerate(dues):
         rows = link["arming"] == i

@@ -2,7 +2,8 @@
 
 The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and mouse to the session. The
 window shows a copy of the scene with added shapes. The shapes have no mass and collide with nothing, so that both
-models have the same matrices. Pillow draws the pictures of a film; Pillow writes a GIF, and ffmpeg an MP4.
+models have the same matrices. Pillow draws the pictures of a film; the scene of a world in them is rendered by MuJoCo.
+Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """Return the steps from the handle to each joint's body: 0 for the handle, -1 for a motor, 1 or more for an arm."""
+    """Return the place of each joint's body [STEP]: motor -1, handle 0, then the arm, then a person's body."""
     place = dict.fromkeys(range(scene.channels), -1)
     for i, points in enumerate(scene.points[: _devices(scene)]):
         place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
@@ -103,7 +104,7 @@ def _places(scene: Scene) -> tuple[int, ...]:
 
 
 def _scale(history: Array, limit: Array) -> float:
-    """Return a power of two [N] above every force, at least 1 N or, if smaller, 1/16 of the largest force limit."""
+    """Return a power of two [N] above every force, at least min(1 N, 1/16 of the largest force limit)."""
     least = min(1.0, float(np.max(limit)) / 16)
     return float(2.0 ** np.ceil(np.log2(max(least, 1.05 * np.abs(history).max(initial=0.0)))))
 
@@ -156,7 +157,11 @@ def _limited(prepared: PreparedLoop) -> str:
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
     """Return the row of the energy shell of a world: its label, and its figures in words."""
     W0, given_mJ, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
-    most = f"gave {given_mJ:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
+    most = (
+        f"gave {given_mJ:.2f} mJ of W0 = {W0:g} plus released {released:.1f}"
+        if prepared.assessment.guarantee
+        else "no guarantee"
+    )
     return "energy shell", f"acted on {figures.limited_ticks} of {figures.ticks} ticks, {most}"
 
 
@@ -249,7 +254,7 @@ class _ShownScene:
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
         """Aim the camera from above at the devices, between the text and the plots."""
-        behind = (self.object.reach - STEP) / 2 if self.object else 0.0  # [m] by which the middle moves to the object
+        behind = (self.object.reach - STEP) / 2 if self.object else 0.0  # [m] shift of the aim towards the object
         camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array((0.0, 0.0, 0.2))
         camera.lookat[0] -= behind
         camera.distance = 3.0 * (self.model.stat.extent + behind / 2)
@@ -646,7 +651,7 @@ class _FlatPictures:
 
 
 class _WorldPictures(_FlatPictures):
-    """Pictures of a film of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
+    """Pictures of a film of a world: scene and devices, rendered without a display, and plots of the forces."""
 
     def __init__(self, stage: _ShownWorld, scene: Scene, force_limit: Array) -> None:
         """Open the renderer. Raises InputError if there is no OpenGL."""
@@ -692,7 +697,7 @@ def pictures_for(session: LiveLoop) -> _FlatPictures:
 
 
 def _offscreen(width: int, height: int) -> Any:
-    """Return an OpenGL context without a window, by EGL or OSMesa. Raises InputError."""
+    """Return an OpenGL context without a window, by EGL, OSMesa or CGL. Raises InputError."""
     for kind in ("egl", "osmesa", "cgl"):
         try:
             return import_module(f"mujoco.{kind}").GLContext(width, height)
