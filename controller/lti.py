@@ -4,7 +4,8 @@ A condition is written once as an expression over blocks and evaluated in severa
 systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit circle. Both have the operators
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
-    G.feedback(H)   (I + G H)^-1 G                                 G.over_z_minus_one()  G(1), G/(z - 1) less its pole
+    G.feedback(H)           (I + G H)^-1 G
+    G.over_z_minus_one()    G(1), and a block whose Hermitian part on the circle is that of G/(z - 1)
 
 The type of the period decides the arithmetic. A block with a float T has floating-point matrices. A block with a
 Fraction T is exact, and a float then stands for its shortest decimal: 0.0012 is 12/10000.
@@ -67,17 +68,17 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of blocks of a response, which fit into the cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # largest numbers of rows, points and entries in a block, for the cache
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
 _UNSEEN = 1e-18  # weights below this size, relative to the response, are omitted
-_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] a response's size is evaluated here and at its poles
+_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] a response's size is evaluated here and at the angles of its poles
 _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
-    """Return the work of a response for `spend`, within a factor of 2.5 (up to 200 states, 8 inputs, 2000 points)."""
+    """Return the work of a response in units of `spend`, within a factor of 2.5 up to 200 states and 2000 points."""
     return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
 
@@ -106,7 +107,7 @@ class Lti(ReadOnly):
             matrix = own[name]
             if matrix.shape[-2:] != shape:
                 raise ValueError(f"{name} has shape {matrix.shape}, expected {shape}")
-            # a finite sum of squares, which takes a tenth of the time, has finite terms
+            # If the sum of squares is finite, so are all entries. This test takes a tenth of the time.
             if not exact and not isfinite(np.vdot(matrix, matrix)) and not np.isfinite(matrix).all():
                 raise ValueError(f"{name} has entries that are not finite")
         if not 0 < self.T < np.inf:

@@ -4,8 +4,8 @@ The feasible set is not convex in (K, B), so the result may be a local optimum. 
 sequential quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a
 violation are added, until the gains pass the sweep.
 
-The block of a condition is evaluated at G = 0 and G = I, each with the multipliers 0 and 1. For each channel the block
-is affine in G and affine in the multiplier, so these responses determine all values and slopes of the block.
+For each channel the block of a condition is affine in G = (I + Psi E V)^-1 Psi E and affine in the multiplier. So its
+responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, rms_mismatch
 
-#: reserve of the sampled condition, 1.5 times that of the design, for frequencies between the samples
+#: share of the damping that the sampled condition leaves for frequencies between samples, 1.5 times that of designs
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
@@ -56,7 +56,7 @@ class _Around:
 
     x: Array
     G: Complex  # (k, m, m)
-    by: Array | Complex  # (2, k, m) dG/d(log K_i) is G[:, i] by[0, :, i] G[i, :]; by[1] is for B_i/delta_i
+    by: Array | Complex  # (2, k, m)  dG/d(log K_i) = by[0, k, i] G[k, :, i] G[k, i, :]; by[1] is for B_i/delta_i
 
 
 class SampledLoop:
@@ -65,8 +65,9 @@ class SampledLoop:
     The first 2m entries are the gains; the rest are the unknowns of the condition's multiplier.
     """
 
-    #: channels with a second row in the block and an unknown multiplier, and the bounds of this multiplier's entry in x
+    #: channels with a second row in the block and an unknown multiplier; in KnownDeviceLoop all devices
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
+    #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
@@ -112,7 +113,7 @@ class SampledLoop:
         return this_environment_demand(self.loop.late(G), self.loop)
 
     def block(self, G: Sampled, mu: Array) -> Sampled:
-        """Return the block at the damping less _SAMPLED_RESERVE."""
+        """Return the block with 1 - _SAMPLED_RESERVE times the damping."""
         demand = self.demand(G, mu)
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
@@ -186,10 +187,10 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the least eigenvalue of the Schur complement of `_least` at each frequency; (k,) or (k + 1,).
+        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`, in Delta_D/T.
 
-        The unit is Delta_D/T. With delay in the environment the loop can be unstable although the sampled condition
-        holds, so that a last entry is added: the distance of the loop's poles from the unit circle.
+        With delay in the environment `stability` follows as a last entry, because the loop can then be unstable
+        although the sampled condition holds.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
@@ -301,7 +302,7 @@ def _shared(loop: Loop) -> tuple[list[int], Array]:
 
 
 class SwitchingLoop(SampledLoop):
-    """The loop under any switching of delays: x = (log K, B/delta, log alpha T/delta of the channels that switch).
+    """The loop under any switching of delays: x = (log K, B/delta, log(alpha T/delta) of `active`).
 
     `judged` searches its own multiplier alpha in the sweep of `SWITCHING`.
     """
@@ -378,7 +379,7 @@ class KnownDeviceLoop(SampledLoop):
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # first value of the share; the default loops' optima are 0.29 to 0.47
+    _first = 0.35  # first value of beta over its largest value; the default loops' optima are 0.29 to 0.47
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE
