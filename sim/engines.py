@@ -5,7 +5,8 @@ that are fed back. A step lasts h seconds.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
     exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: MuJoCo computes the accelerations qacc
-                  (one mj_forward per step), and J is the plant's matrix; exact for linear scenes at any stiffness and h
+                  (one mj_forward per step), J is the plant's matrix, and models.hold defines phi1; exact for linear
+                  scenes at any stiffness and h
     RK4, ..       MuJoCo's own integrators; sim.accuracy compares numbers of steps per period
 
 The exponential and the exact engine use the same J. Comparing them checks MuJoCo's forces and the assembly of the
@@ -15,9 +16,9 @@ MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step inc
 MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the positions
 are fixed (Strang splitting). The splitting is of second order in the step and generates no energy.
 
-All engines read their inputs from a row of a step buffer and write the next row, without copies. With a timing
-(controller.delay) every tick has its own length, and late forces latch within the tick. The plant's state then ends
-with the forces that the actuators hold.
+All engines read their inputs from a row of a step buffer and write the next row. With a timing (controller.delay)
+every tick has its own length and latch times. If forces latch late, the plant's state ends with the forces that the
+actuators hold.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = 256  # size of an engine's cache of period maps, one for each kind of tick
+_MOST_MAPS = 256  # largest number of held plants, and of kinds of ticks, that an engine caches
 
 
 class Engine(Protocol):
@@ -206,16 +207,17 @@ def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDA
 
 @dataclass(frozen=True, eq=False)
 class _Access:
-    """Arrays and functions of MuJoCo that a tick reads, writes and calls: (n,) for one simulation, (n, nsim) for many.
+    """Arrays and functions of MuJoCo that a tick reads, writes and calls.
 
-    `ticks` returns closures, because attribute lookups would take longer than the step. A bound method would form a
-    reference cycle, which would keep a batch's memory allocated.
+    Arrays are (n,) for one simulation and (n, nsim) for many. `ticks` returns closures, because attribute lookups would
+    take longer than the step. An engine that stored its own bound method would form a reference cycle, which would keep
+    a batch's memory allocated.
     """
 
     T: float  # [s]
     substeps: int
     ctrl: Array
-    state: Array  # [q; v], (2, n) of one simulation
+    state: Array  # [q; v], (2, n) for one simulation and (2 n, nsim) for many
     size: int  # length of a plant state: q, v and the states of the hands' impedances
     qacc: Array
     forward: Callable[[], object]
@@ -375,7 +377,7 @@ class MujocoEngine:
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """The function that advances the loop by one tick. After `start` it is made when it is first read."""
+        """The function that advances the plant by one tick, made at its first use after `start`."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 
@@ -427,8 +429,8 @@ class MujocoEngine:
 class MujocoBatchEngine:
     """All simulations of a buffer in one mujoco.batch.Batch, one for every set of humans.
 
-    Each simulation has the same bits as in MujocoEngine, except with the exponential integrator, which sums products in
-    another order and differs by rounding.
+    Each simulation has the same bits as in MujocoEngine, except with the exponential integrator or with impedances:
+    their matrix products are summed in another order and differ by rounding.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Limit cycles of loops in human hands: eigenvalues for every human, and MuJoCo for the worst human.
 
-A cell is a force map F and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
-human and gives the growth of the dominant mode. `simulate_cells` runs cells in MuJoCo batches, with encoder steps,
-friction and walls.
+A cell of a Z-width map has a force map F and a process that computes it. `HeldDevices` closes F around the devices in
+the hands of every human and gives the growth of the dominant mode. `simulate_cells` runs cells in MuJoCo batches, with
+encoder steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Cells = NDArray[np.intp]
 # The exact loop's eigenvalues, with every human.
 
 
-_MIN_FREQUENCY_HZ = 2.0  # slower modes decay so little that they would hide an oscillation that is about to grow
-_LEADING = 0.1  # share of the humans that meet every cell; the others meet the cells that are stable with this share
+_MIN_FREQUENCY_HZ = 2.0  # lowest of a fast mode; slower modes decay slowly and would hide one that is about to grow
+_LEADING = 0.1  # share of the humans who are tried first; the others are tried in cells that all of these leave stable
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class HeldDevices:
 
     devices: tuple[Device, ...]  # (m,)
     T: float  # [s]
-    #: (index of each human, humans, plant, positions of motors and handles in the plant's state)
+    #: (indices of the humans, humans, their plants, indices of motors and handles in a plant state)
     groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
     late: tuple[float, ...] | None = None  # (m,) [s] from the tick to the latch of the forces; None: latch at ticks
 
@@ -112,7 +112,7 @@ class HeldDevices:
         return (vector / positions[np.argmax(np.abs(positions))]).real
 
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
-        """Return the tenth of the humans (at least 8) that are unstable, or nearly so, with most of these maps."""
+        """Return a mask (n,) of a tenth of the humans, at least 8: the most often unstable, then the least damped."""
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
         first = np.zeros(len(self), dtype=bool)
@@ -158,10 +158,10 @@ def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
 class Plan:
     """Settings for the simulation of cells."""
 
-    points: int  # rows and columns of the grid that are simulated; 0 for none
+    points: int  # largest number of rows, and of columns, that are simulated; 0 for none
     press: float  # [N] steady force of every hand
     duration: float  # [s]
-    threshold: float  # [m] amplitude above which a handle oscillates
+    threshold: float  # [m] amplitude above which a motor or handle oscillates
 
     @property
     def runaway_growth(self) -> float:

@@ -1,12 +1,14 @@
 """Varying delays: the loop as a switched system, its worst switching, and the certificates that cover it.
 
-The loop is linear, with one matrix for each set of ages of the forces in use. Its state is
-xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), and forces under way.
+The loop is linear, with one mode matrix for each set of ages of the forces in use. Its state is
+xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: the plant, the process block G (without Theta), and the forces g_i
+that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
 [lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
-because packets are held. The worst period is a window of this sequence that may be repeated. Its product of mode
-matrices has the largest spectral radius per tick. A radius above 1 proves instability.
+because a device holds its newest force. Candidates for the worst period are windows of this sequence that may be
+repeated, and constant delays; the product of mode matrices over the worst one grows fastest per tick. A spectral radius
+above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -37,10 +39,10 @@ from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, u
 
 _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
 _LONGEST_PERIOD = 250  # [ticks] of a searched window
-_STARTS = 6  # number of ticks of the greedy sequence at which windows begin
+_STARTS = 6  # number of windows of the greedy sequence
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
 _SHORTEST = 4  # least number of ticks, because a growth rate compares quarters of the trace
-_STREAM = 5  # random stream of these draws, independent of the humans' stream with the same seed and index
+_STREAM = 5  # random stream of the delays, independent of the humans' stream with the same seed and index
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
-    """Draw the delays (ticks, m) of run `index`; they depend on (seed, index) and the scenario only."""
+    """Draw the delays (ticks, m) of run `index` from (seed, index); `recorded` are adversarial delays."""
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else recorded
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
@@ -163,7 +165,7 @@ def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) 
 
 
 def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
-    """Return A_p .. A_2 A_1 for every p, each divided by exp(scale_p)."""
+    """Return, for every p, A_p .. A_2 A_1 divided by exp(scale_p), and scale_p."""
     power, scale = np.eye(matrices[0].shape[0]), 0.0
     products, scales = [], []
     for A in matrices:
@@ -177,7 +179,7 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 
 # ---- many humans in one batch, each under its own varying delays, drawn or adversarial
 
-_SHORTEST_CROWD = 2.0  # [s] least duration of a trace: a growth of 1 1/s then exceeds the spreading of the impulse
+_SHORTEST_CROWD = 2.0  # [s] least duration of a trace; in a shorter one the spreading impulse hides a growth of 1 1/s
 _LONGER = 5  # factor of the duration of a second trace, for hands whose rate is too slow for the first
 
 
@@ -200,7 +202,7 @@ def switched_crowd(
     """Run the impulse test for every set of humans, each under the delays of its index.
 
     Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other` makes the second engine for sets of these numbers. Sets whose rate is too slow for the
+    for all sets. `other(sets, integrator, timing)` makes the second engine. Sets whose rate is too slow for the
     duration run longer; if the sign changes, the longer traces of both engines count.
     """
     scenario, scene = simulation.scenario, held_by.scene
