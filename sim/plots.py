@@ -1,7 +1,6 @@
 """Pictures that commands write, in one style: readable in black and white and by the colour-blind.
 
-Each plot function takes the result of its command (a Trace, a Map or a report), writes one picture and returns its
-path.
+A plot function writes one picture and returns its path; `draw_run` returns its figure.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Run(Protocol):
 # ----------------------------------------------------------------------------------------------------
 # The style.
 
-#: titles of the conditions that apply to every device; other conditions have their names as titles
+#: titles of two conditions; every other condition has its name as its title
 TITLES = {"this-environment": "this environment", "any-environment": ANY}
 #: Okabe and Ito's palette, with a line style each
 STYLES: tuple[dict[str, Any], ...] = (
@@ -95,8 +94,8 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     """Write the figure atomically in the format of the suffix; its texts are not parsed as formulas.
 
-    A .png is for the screen. A .pdf or .svg is for a paper: as wide as a page of two columns, with letters that are
-    readable at that width.
+    A .png is for the screen. A .pdf or .svg is for a paper: at most as wide as a page of two columns, with letters that
+    are readable at that width.
 
     Raises:
         InputError: The suffix is none of .png, .pdf and .svg.
@@ -157,7 +156,7 @@ def _plain_numbers(axes: Any) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Runs, as in Figures 5 and 6.
+# Runs, as in the paper's Figures 5 and 6.
 
 _SAME = 1e-6  # [%] smaller force errors are rounding: the two forces are equal
 
@@ -198,8 +197,8 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The zoom shows six periods of this frequency. There is no zoom if forces turn as sharply in the
-            rest of the run.
+        frequency_hz: The zoom shows at least six periods of this frequency. There is no zoom if forces turn as sharply
+            in the rest of the run.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -360,7 +359,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     for i, column in enumerate(1e3 * sizes.T):
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
-    # The predicted line is fitted to the last third of the trace, where only the slowest mode is left.
+    # The predicted line is fitted to the last third of the amplitudes, where only the dominant mode is left.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
@@ -555,7 +554,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping
-    alike = len(set(available)) == 1  # Devices with different damping are drawn as ratios.
+    alike = len(set(available)) == 1  # With unequal dampings the curves are ratios.
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
     for axis, condition in zip(axes[0], names, strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)

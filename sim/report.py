@@ -106,7 +106,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The paper's figures compared with ours.
+# The paper's numbers compared with ours.
 
 
 #: The transparency indices (25) [dB] that the paper prints; none of our readings of Figure 4 reproduces them.
@@ -115,7 +115,7 @@ _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A figure of the paper and its value computed here."""
+    """A number of the paper and its value computed here."""
 
     what: str
     paper: str
@@ -124,7 +124,7 @@ class PaperRow:
 
 
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Return the paper's figures with ours; empty for any loop but the paper's."""
+    """Return the paper's numbers with ours; empty for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
@@ -188,7 +188,7 @@ class DelaySpan:
 
 @dataclass(frozen=True)
 class _Age:
-    """Ages of the forces in use, per channel, after the first arrival [samples]."""
+    """Ages of the forces in use, per channel, once a force has arrived on every channel [samples]."""
 
     least: list[int]
     largest: list[int]

@@ -74,7 +74,7 @@ class RunReport:
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
     robustness: Robustness | None = off_table(default=None)
-    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the paper's figures with ours
+    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the paper's numbers with ours
     remarks: tuple[str, ...]
 
     @property
@@ -123,7 +123,7 @@ def run_report(
     environment: str,
     check: bool,
 ) -> RunReport:
-    """Return the report of a run; `environment` is a name, and `check` repeats the run with another integrator."""
+    """Return the report of a run in the named environment; `check` repeats the run with another integrator."""
     simulation, trace, loop, requirements = run.simulation, run.trace, scenario.loop(case), assessment.requirements
     delays, grows = None, None
     if simulation.scenario.varying_delay:

@@ -1,6 +1,6 @@
 """Stability by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
 
-Functions take one loop or a stack of loops, one for each set of humans. Arrays of a stack have a leading axis.
+A closed loop or a mode may be a stack, one for each set of humans. Arrays of a stack have a leading axis.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def mujoco_loops(
     """Return the closed loops that MuJoCo simulates: its map over one period, joined with the process.
 
     The plant is linear, so one period from each basis state and with each force alone gives its map. One batch holds
-    2n + m simulations for every set of humans, and m more with `late` (m,) [s].
+    one simulation for each state and each force of every set of humans; with `late` (m,) [s] held forces are states.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     n = variants.states + (m if late else 0)
@@ -182,7 +182,7 @@ def worst_mode(simulation: Simulation) -> Mode:
 class Ringing:
     """Decay of a knock in the exact loop with the scenario's own hands, at constant delays and without friction.
 
-    A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 where it does not oscillate.
+    A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 for a decay without oscillation.
 
     Attributes:
         decay_per_s: Decay rate of the slowest mode [1/s]; negative if it grows.
@@ -393,7 +393,7 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 # so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
-_TO_THE_WALL = 20.0  # [N] impulse in loops with walls; a hand of 0.3 kg then swings over a few centimetres
+_TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls; a hand of 0.3 kg then swings over a few centimetres
 _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the engine
 
 
@@ -401,11 +401,11 @@ _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the eng
 class ImpulseTest:
     """The results of an impulse test, with one entry per simulation."""
 
-    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, up to the first clipped tick; nan below the noise
-    error: Array  # (nsim,) [1/s] bound on the error of `growth`; a smaller rate has no certain sign
+    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, until a force clips; nan: too short, or noise
+    error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
     clipped: NDArray[np.int64]  # (nsim,) ticks with a force at its limit
-    least_energy: Array  # (nsim,) [J] least energy W; without a limiter up to the first clipped tick
-    audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W: the scale of its rounding
+    least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick
+    audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W(N): the scale of its rounding
     settling: Array  # (nsim,) rms speed of the handles in the last quarter over that in the second quarter
     contacts: NDArray[np.int64]  # (nsim,) number of contacts with walls
     simulated: float  # [s] simulated time of all simulations together
@@ -445,7 +445,7 @@ class Balance:
 class _LateBalance(Balance):
     """The energy of each tick if forces latch within the tick, so that each period has two parts."""
 
-    before: Array  # (m, 1) [N/m] delta/t2, for the part before the latch; `damping` is delta/(T_max - t1)
+    before: Array  # (m, 1) [N/m] delta/(largest latency), until the latch; `damping` is delta/(T_max - least latency)
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
@@ -457,7 +457,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return the impulse [N], (ticks, outside): `size` on handle 1, -1/2 of it on handle 2, 1/3 on handle 3, ..."""
+    """Return the forces [N], (ticks, outside), of 10 ms: `size` on handle 1, -1/2 of it on 2, 1/3 on 3, ..."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):
@@ -524,7 +524,7 @@ def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[floa
     """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers.
 
     Modes that beat or decay one after the other hide a slow rate. Therefore the time is extended until it has SETTLED
-    time constants, or `most` ticks.
+    time constants, to at most 100 s or `most` ticks.
     """
     free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
