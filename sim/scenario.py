@@ -46,7 +46,7 @@ _MOST_CHANNELS = 32  # without a coupling a run of 16 channels takes 13 s of CPU
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]
-_UNSAID: Any = None  # placeholder of a default that depends on the number of channels
+_UNSAID: Any = None  # placeholder of a default that depends on the number of channels or devices
 
 
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,7 +69,7 @@ def _usual_hand(i: int) -> Human:
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Devices, humans, environment, delays and timing of one loop; every list has one entry per device.
+    """Devices, humans, environment, delays and timing of one loop, with one human per device.
 
     A channel is an axis of a device. Delays and latencies are given per device and stored per channel.
     """
@@ -346,7 +346,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def title(self, case: str) -> str:
-        """Return the title of reports and pictures; the paper's cases have names for the paper's loop only."""
+        """Return the title of reports and pictures, which names a case for the paper's loop only."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
