@@ -19,8 +19,8 @@ from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
 from haptic_loop.sim.stability import unstable
 
-_SETTLING = 4  # number of decay times of the slowest mode after which hands must be slower in the last quarter
-_ROUNDING = 1e-9  # allowed negative W(N), relative to the magnitudes of its terms
+_SETTLING = 4  # least duration of a trace whose hands must slow down, in decay times of the slowest mode
+_ROUNDING = 1e-9  # allowed negative energy W(N) (sim.crowds), relative to the magnitudes of its terms
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Test that the energy W(N) >= 0 on traces; traces with clipped forces are left out, unless a limiter clips."""
+    """Test that W(N) >= 0 (sim.crowds) on traces; traces with clipped forces are left out, unless a limiter clips."""
 
     audited: int
     clipped: int
@@ -252,7 +252,7 @@ class Growing(Generic[_Met]):
 
 @dataclass(frozen=True)
 class Attacked:
-    """The result of a search, and the loop's distance from its required damping."""
+    """The result of the search for the worst human, and the loop's required over available damping."""
 
     found: bool  # whether the worst human destabilises the loop
     spectral_radius: float

@@ -76,7 +76,7 @@ class DrawnObject:
 
     @classmethod
     def of(cls, network: Network) -> DrawnObject:
-        """Place contacts beside devices, and other points one column behind their neighbours nearest to a contact."""
+        """Place contacts beside devices, and every other point one column behind its neighbour nearest to a contact."""
         points = tuple(network.points) or tuple(network.nodes())
         nodes = set(network.contacts)
         contacts = tuple(name for name in points if nodes & set(network.coordinates(name)))
@@ -198,7 +198,7 @@ def scene_xml(simulation: Simulation) -> str:
 
 
 def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
-    """Add the geoms of a MuJoCo scene in its initial pose, left of the devices; meshes and soft bodies are left out."""
+    """Add the geoms of a MuJoCo scene in its initial pose left of the devices, but no meshes, fields or soft bodies."""
     import mujoco
 
     with quiet_warnings():

@@ -1,8 +1,8 @@
 """The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
 When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities. The new process
-starts at the equilibrium for these positions, z = A z + B x. Its delay lines hold the force F(1) x, so that no step in
-x occurs. The force changes to that of the new coupling, and the motion of the environment's masses is lost.
+starts at the equilibrium for these positions, z = A z + B x: its delay lines hold the force F(1) x, as if the positions
+had never changed. The force changes to that of the new coupling, and the motion of the environment's masses is lost.
 
 The mouse is a hand: a spring and a damper between the handle and the dragged point. It is part of the exact plant and
 passive, so a certificate for every passive human covers it. Only the end of the spring moves with the mouse, as in a
@@ -309,7 +309,7 @@ class Frame:
     high: Array  # (m,) largest force since the last frame [N]
     push: Array  # (m,) force of the mouse or the script on each handle [N]
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
-    clipped: int  # ticks with a force at its limit, in `history`
+    clipped: int  # ticks in `history` in which the force on some axis reaches `force_limit`
     prepared: PreparedLoop
     note: str  # the last event, or the reason why it was refused
     overruns: int
