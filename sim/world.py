@@ -3,7 +3,7 @@
     trace = simulate(scenario, design).meta["world"]
 
 The scene is solved together with the coupling (models.world). The energy shell (controller.budget) limits the energy
-that leaves the port to W0 plus the energy that gravity and springs released, whatever the scene does.
+that leaves the port to a budget W0 plus the energy that gravity and springs released, whatever the scene does.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # loads MuJoCo, which other scenarios and --help do not need
     from haptic_loop.models.world import Contact, World, WorldPort
 
 _ROUNDING = 1e-9  # entries of A below this relative size are rounding errors of finite differences over 1e-6 m
-_APART = 1e-12  # entries of D_V below this relative size are rounding errors
+_APART = 1e-12  # entries of D_V, the direct part of a coupling, below this relative size are rounding errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class WorldFigures(ShellFigures):
     given_J: float  # largest energy given to hands and devices, beyond the dissipation of the devices' damping
     port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
-    created_J: float  # energy that contacts created, as the lemma on scenes in docs/theory.md counts it
+    created_J: float  # upper bound on the energy that contacts created, by the lemma in docs/theory.md, MuJoCo worlds
     unsettled_ticks: int  # ticks in which the limited channels still changed after the last repetition of the step
     warnings: list[str]  # the texts of MuJoCo's warnings
 
@@ -78,7 +78,7 @@ class SceneRecord:
     file: str
     settings: str  # options that this program sets in the scene
     parts: list[dict[str, object]]  # kinds of parts, their number, and the bound on the energy that they generate
-    active: list[str]  # actuators, plugins and callbacks, which the lemma on scenes does not cover
+    active: list[str]  # actuators, plugins and callbacks, which that lemma does not cover
 
     @classmethod
     def of(cls, scene: World) -> SceneRecord:

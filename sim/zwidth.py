@@ -108,7 +108,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def stiffness_scale(self) -> float:
-        """The largest stiffness of a linear law against every passive environment, 2 delta/((theta + 1) T) [N/m]."""
+        """Bound on any linear coupling's stiffness for all passive environments, 2 delta/((theta + 1) T) [N/m]."""
         return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
@@ -124,8 +124,8 @@ class CouplingSweep(_Sweep):
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """Return F of every coupling, a stack for each frozen contact state, with all walls touching first.
 
-        A device without contact to a rigid wall is safe, so that only states with contact are tested. Random hands are
-        tested in each frozen state; certificates cover walls that make and break contact.
+        A rigid wall always touches, because a device without contact is safe. Random hands are tested in each frozen
+        state; certificates cover walls that make and break contact.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
@@ -136,7 +136,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,); inf if no damping is enough. Contact may change."""
+        """Return required over available damping (n,), with walls touched and left; inf if no damping is enough."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -177,8 +177,8 @@ class EnvironmentSweep(_Sweep):
         this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
-    Couplings are not designed anew for each cell: all of them would be certified, because Q near E^-1 turns the force
-    off. Raises ValueError if the network has walls, or no spring at a contact.
+    No coupling is designed for a cell: each would be certified, because a Q near E^-1 makes the force nearly 0. Raises
+    ValueError if the network has walls or a block, or no spring at a contact.
     """
 
     coupling: Coupling
@@ -326,7 +326,7 @@ class _Grid:
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> _Grid:
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
-    The scale of K is the loop's stiffness_scale; the scale of B is delta, the largest damping of a linear law. A linear
+    The scale of K is the loop's stiffness_scale; the scale of B is delta, a bound for any linear coupling. A linear
     map goes up to 2.5 times these scales, a logarithmic one from far below to far above. Raises InputError.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)

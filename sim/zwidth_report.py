@@ -203,7 +203,7 @@ class MapReport:
         humans: int,
         seed: int,
     ) -> MapReport:
-        """Return the report of a map; `humans` is the number of draws for each device."""
+        """Return the report of a map; `humans` is the number of random sets of humans."""
         loop, complete, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
