@@ -1,7 +1,7 @@
 """Conditions with multipliers: this-environment with its facts, and any-environment.
 
-The blocks for walls, switching delays and limited forces are affine in a multiplier, which weighs an error term;
-`Multiplied` searches for the best multiplier. The members of ranges are proved one by one.
+The blocks for a latency, walls, switching delays and limited forces are affine in their multipliers; `Multiplied`
+searches for the best ones. The members of ranges are proved one by one.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Multiplied(Condition):
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the map G of `block`. Raises SingularLoop, and NotProved if it is too large to be proved."""
+        """Return the map G of `block`. Raises SingularLoop, and TooLong if it is too large to be proved."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -105,7 +105,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block` for a multiplier whose values for `hands` are times s; it is affine in s and all values."""
+        """Return `block` if the values for `hands` have been multiplied by s; it is affine in s and all values."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -126,7 +126,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier; for None, at the best one, with the search's lower `bound`."""
+        """Return the requirement at this multiplier; for None, at the best one found, with the search's `bound`."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -140,7 +140,7 @@ class Multiplied(Condition):
             return refusal(self.name, loop.delta, str(error))
 
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
-        """Return the requirement for the map G at this multiplier; for None, at the best one."""
+        """Return the requirement for the map G at this multiplier; for None, at the best one found."""
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
@@ -353,7 +353,7 @@ class ThisEnvironment(Multiplied):
         return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """Return the block of a map from [x; p] to [f_e; y], with its multipliers in one sequence."""
+        """Return the block of a map G as in design.facts.compose, with its multipliers in one sequence."""
         return self._composed(G, loop, multiplier)
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
@@ -554,7 +554,7 @@ def beta_of(loop: Loop, certificate: Certificate) -> float:
 # The condition any-environment (Theorem 4), and its least multiplier Phi (17) for an environment with delay (psi >= 1).
 
 
-_ROOM = 1e-6  # relative increase of Phi that covers the solver's tolerance
+_ROOM = 1e-6  # increase of Phi, relative to the damping, that covers the solver's tolerance
 
 
 def least_phi(loop: Loop) -> Array | None:
@@ -571,14 +571,15 @@ _MOST_STATES = 30  # The least trace is computed up to so many states of E-hat: 
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return a diagonal Phi < Delta_D (m,) [N s/m] with E-hat + Phi passive; with few states, that of least trace.
+    """Return a diagonal Phi < Delta_D (m,) [N s/m] with E-hat + Phi passive.
 
+    With few states the sum of Phi_i/delta_i is least. With many states and matrix levels, Phi < Delta_D is not ensured.
     Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
     none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # level_ii = 1
-    least, _ = uncovered(unit, loop.psi, none)  # Phi = least delta suffices; no smaller multiple does.
+    least, _ = uncovered(unit, loop.psi, none)  # Phi = least * delta suffices; no smaller multiple does.
     each, root = least, np.linalg.inv(np.linalg.cholesky(level))
     if loop.levels:
         least, _ = uncovered(root @ unit @ root.T, loop.psi, none)
@@ -593,7 +594,7 @@ def least_multiplier(loop: Loop) -> Array:
 
 
 def _of_least_trace(regular: Lti, most: Array) -> Array:
-    """Return the entries of the diagonal Phi <= most (m, m) with least trace that makes `regular` passive."""
+    """Return the entries of the diagonal Phi <= most (m, m) with least trace for which `regular` + Phi is passive."""
     m, n = regular.inputs, regular.order
     ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
@@ -696,7 +697,7 @@ class _AnyEnvironment(Multiplied):
         return "Theorem 4 needs a coupling, and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with `multiplier`, or with the least multiplier if one is needed."""
+        """Return the requirement with `multiplier`; for None, with the least Phi or the best other multiplier found."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)
@@ -777,5 +778,5 @@ def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
 
 
 def _in_frame(loop: Loop) -> bool:
-    """Return whether the block is composed of facts (design.facts), because of a latency or switching delays."""
+    """Return whether `compose_any` composes the block, because of a latency or switching delays."""
     return bool(loop.latency or loop.varying_delay)

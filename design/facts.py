@@ -58,7 +58,7 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return delta T/T_max (m,) [N s/m]: damping that in even periods T counts like delta in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m]: at a constant period T it counts like delta in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T_k: the force map is the same at every tick.
@@ -261,7 +261,7 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return the block from inputs to [x; p; added force steps; delayed inputs], and the numbers of the last."""
+        """Return the block from inputs to [dx; dp; added force steps; delayed inputs], and the numbers of the last."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -419,7 +419,7 @@ class HandsSide(ABC):
         return []
 
     def allowed(self, loop: Loop, values: Values) -> Values:
-        """Return the multipliers, scaled down until they are allowed."""
+        """Return the multipliers, scaled so that they are allowed and as large as possible."""
         return values
 
     def excess(self, loop: Loop, values: Values) -> str | None:
@@ -428,7 +428,7 @@ class HandsSide(ABC):
 
 
 class _EvenPeriods(HandsSide):
-    """The form dx' Delta dx/T_max, for periods that are even or vary up to T_max."""
+    """The form dx' Delta dx/T_max, for periods that are constant or vary up to T_max."""
 
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
         return [Input("dx", i) for i in range(loop.channels)]
@@ -475,7 +475,10 @@ class Latency(HandsSide):
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return s I - D Q D with D = diag(tau, T_max - tau)^(1/2), at _LATENCIES latencies tau of each range."""
+        """Return s I - D Q D for the Q in `values`, at _LATENCIES latencies tau of each range.
+
+        D is diag(tau, T_max - tau)^(1/2).
+        """
         bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
@@ -740,7 +743,10 @@ class Limited(Fact):
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
-    """Return the damping's form for a matrix Delta: q_ab delta_i of inputs a, b of axis i becomes q_ab Delta_ij."""
+    """Extend the damping's form to matrices Delta.
+
+    The entry q delta_i of inputs a and b of axis i gives the entry q Delta_ij of a of axis i and b of axis j.
+    """
     if loop.levels is None:
         return form
     level, at = loop.Delta(isinstance(T, Fraction)), {(each.name, each.channel): g for g, each in enumerate(inputs)}
@@ -813,7 +819,7 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
 
 
 def _paths(loop: Loop, switch: bool) -> list[Weights]:
-    """Return the weights of Theta for each channel; for switching delays the mean of the delays lo and hi."""
+    """Return the weights of Theta for each channel; for switching delays the mean of z^-lo and z^-hi."""
     spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
     return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
 
