@@ -103,7 +103,7 @@ class _Definiteness:
 
     definite: bool
     semidefinite: bool
-    minor: int | None = None  # order of the first leading minor that is not positive, 1-based
+    minor: int | None = None  # order of the minor that decides, without the skipped rows before it; 1-based
     sign: int | None = None  # sign of that minor: -1, or 0
 
     def __str__(self) -> str:
@@ -227,7 +227,7 @@ def _dominates(W: Array) -> bool:
     """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
 
     The answer holds for the integers from which `_floats` made W. Their rounding is 2^-53 of each entry and 2^-900 of
-    the largest one, and that of a sum of n < 2^11 terms is n 2^-53. Both are far below the factor 1 + 2^-40.
+    the largest one, and that of a sum of n < 2^11 terms is n 2^-53. Both are below 2^-40, the factor's excess over one.
     """
     diagonal = np.diag(W)
     others = np.abs(W).sum(axis=1) - np.abs(diagonal)
@@ -267,7 +267,7 @@ def _whitening(W: Array) -> _Integers | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, exact arithmetic proves it.
+# Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, and exact arithmetic tests P.
 #
 # Kalman-Yakubovich-Popov: if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)

@@ -113,7 +113,7 @@ def process_block(
         stored: The coupling with its loop.
         with_theta: Whether the block contains the delays Theta; False if the link to the devices has them.
         force_limit: (m,) [N] limits of the certificate's limiter; None for a block without a limiter.
-        balls: Channels whose forces the limiter limits as one vector.
+        balls: Groups of channels; the limiter limits the forces of each group as one vector.
 
     Raises:
         ValueError: The loop is not linear, or the certificate covers no limiter.
@@ -159,7 +159,7 @@ def _with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: ExportedBlock) -> _Trial:
-    """Return normally distributed inputs and their outputs, scaled so that a limiter acts on a third of the ticks."""
+    """Return normal random inputs and their outputs; unlimited forces would exceed a limit on a third of the ticks."""
     rng = np.random.default_rng(0)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
@@ -425,7 +425,7 @@ def _delays(loop: Loop, with_theta: bool) -> str:
     def shown(steps: Sequence[int]) -> str:
         return ", ".join(map(str, steps))
 
-    theta = "included" if with_theta else "NOT included: the link to the devices must be that delay"
+    theta = "included" if with_theta else "NOT included: the link to the devices must have this delay"
     return f"delays in samples: environment psi = {shown(loop.psi)}, transmission theta = {shown(loop.theta)} ({theta})"
 
 
