@@ -62,7 +62,7 @@ def _cut(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a message in one line of at most _MOST_WORDS characters; quoted user input is cut to 80 characters."""
+    """Return a message in one line of at most _MOST_WORDS characters; quoted texts and long words are cut to 80."""
     words = _QUOTED.sub(lambda match: _cut(match[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
@@ -308,7 +308,7 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
 def remove(path: Path) -> None:
     """Remove a file that an earlier run wrote, if it is there.
 
-    Raises InputError if it cannot be removed, or if the command has read or written it.
+    Raises InputError if it cannot be removed, or if the command has read it, or has written it and an option names it.
     """
     try:
         if path.is_symlink() or path.is_file():

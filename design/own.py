@@ -27,7 +27,8 @@ def named(option: str, text: str) -> Any:
     to sys.path, so that the file and worker processes can import modules from it.
 
     Raises:
-        InputError: The file or the object in it does not exist, or the file is not valid Python.
+        InputError: The text is not FILE.py:NAME, the file or the object in it does not exist, the file is not valid
+            Python, or another module of its name is loaded.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)
