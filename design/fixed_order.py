@@ -235,7 +235,7 @@ def _singular(Q: Array, U: Array) -> bool:
 
 
 def _descended(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """Return the best coupling and the number of semidefinite programs solved."""
+    """Return the best coupling and the number of accepted steps, `budget` at most."""
     steps, sdps = _descend(family, p, norm), 0
     while sdps < budget:
         try:

@@ -69,7 +69,7 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
     """Return the suprema (n,) of n functions on the grid of `common` (k,) and each one's `own` (n, p) frequencies.
 
-    They are refined between the frequencies. A function with a value that is not finite has the supremum inf.
+    The highest peaks are refined between the frequencies. A function with a value that is not finite gives inf.
     """
     n = own.shape[0]
     parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
@@ -158,8 +158,8 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
     """Return sorted frequencies [rad/sample] in [low, high]: evenly spaced in w and in log w, dense around poles.
 
-    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. A repeated pole
-    counts once, because two points that differ by rounding only would make the bracket of a peak there too narrow.
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi. A repeated pole counts once, because
+    two points that differ by rounding only would make the bracket of a peak there too narrow.
     """
     poles = _distinct(np.concatenate([g.poles() for g in systems])) if systems else np.zeros(0)
     width = np.maximum(1 - np.abs(poles), 1e-9)
@@ -202,7 +202,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return one of each group of poles that are closer to each other than 1 % of their distance to the circle."""
+    """Return poles with imag >= 0, one for each group within 1 % of their distance to the circle."""
     distinct = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
         if not (np.abs(distinct - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
@@ -242,7 +242,7 @@ _GAIN = 1e-13  # relative gain of a peak that a search neglects
 
 
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
-    """Return the frequencies (peaks,) of the 32 highest local maxima of `response` on the grid that exceed `above`.
+    """Return frequencies (peaks,) of local maxima of `response` above `above`, 32 at most, refined between grid points.
 
     Maxima that are lower than the highest by more than the share `near` are left out.
     """
@@ -256,10 +256,11 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 
 
 def _brackets(values: Array, grid: Array, above: float) -> Array:
-    """Return brackets of local maxima of at least `above`: the 32 at most that may become the highest.
+    """Return brackets of local maxima of at least `above`, at most 32, chosen by `_reach`.
 
-    Where the response is flat, rounding makes many maxima, which may be higher than the grid points of a true peak. A
-    bracket has three points. Axis 0 is (frequency, value), axis 1 (left, peak, right), and axis 2 the bracket.
+    They are not chosen by value, because rounding of a flat response makes many maxima, which may be higher than the
+    grid points of a true peak. A bracket has three points. Axis 0 is (frequency, value), axis 1 (left, peak, right),
+    and axis 2 the bracket.
     """
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
@@ -297,10 +298,9 @@ def _narrowed(response: Response, bracket: Array) -> Array:
 
 
 def _reach(bracket: Array) -> Array:
-    """Return the largest possible peak of each bracket.
+    """Return the largest expected peak of each bracket: its value plus the drop to the lower neighbour.
 
-    Between its three points a parabola rises by at most a quarter of the drop to the lower neighbour. The largest
-    possible peak is taken as four times that rise above the value.
+    A parabola through three evenly spaced points rises above the highest one by at most an eighth of this drop.
     """
     low, best, last = bracket[1]
     lower = np.minimum(low, last)

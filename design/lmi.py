@@ -1,7 +1,7 @@
 """The paper's matrix inequalities, one function per equation, with remedies for two that cannot be satisfied.
 
-Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every function returns a symmetric matrix that must
-be positive (semi)definite; its arguments are numbers or cvxpy expressions.
+`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
+numbers or cvxpy expressions. The remedies below are in units in which T = 1 and Delta_D = I (`unit_environment`).
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
   E-hat = z/(z-1) Psi E has a pole at z = 1 if E has static stiffness, and A'PA - P < 0 excludes such a pole (15), (17).
@@ -29,7 +29,7 @@ RESERVE = 1e-4  # share of the damping that designs do not use, so that the roun
 
 
 def usable(loop: Loop) -> Array:
-    """Return the damping (m,) [N s/m] that a design may use, in even periods. Raises ValueError if it is 0."""
+    """Return the damping (m,) [N s/m] that a design may use at a constant period. Raises ValueError if it is 0."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     return (1 - RESERVE) * even_damping(loop)
@@ -52,7 +52,7 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     z = on_circle(np.array([0.1, 1.0, 3.0]))
     response = W2.at(z)
     if np.abs(response - response * np.eye(channels)).max() > 1e-9 * np.abs(response).max():
-        raise ValueError("W2 must be diagonal: the convex-concave step divides by it channel by channel")
+        raise ValueError("W2 must be diagonal: the convex-concave step exchanges it with the diagonal gains")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -126,7 +126,7 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
 
 
 def balanced(G: Lti) -> Lti:
-    """Return a stable G with equal diagonal Gramians, by the square-root method.
+    """Return the realisation of a stable G whose Gramians are equal and diagonal, by the square-root method.
 
     States with a Hankel value below 1e-11 times the largest are dropped. They are unreachable or unobservable to
     rounding, so the response does not change.
@@ -179,7 +179,7 @@ _Matrix = Any  # Array or cvxpy expression, (rows, columns)
 class Ports(NamedTuple):
     """x+ = A x + B u with a port output y2 = C2 x + D2 u and a dissipated output y1 = C1 x + D1 u.
 
-    The supply is y2'u - y1' Delta y1 - u' Phi u. Plain passivity has y1 = y2.
+    The supply is y2'u - y1' Delta y1 - u' Phi u. Output strict passivity has y1 = y2.
     """
 
     A: _Matrix
