@@ -68,8 +68,8 @@ _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the da
 def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand makes the loop unstable, by a refined sweep.
 
-    Motors are linear. For one channel or equal devices no condition on these devices requires less than this share.
-    Otherwise the share is sufficient, and close to the least one.
+    Motors are assumed to be linear. For one channel or equal devices no condition on these devices requires less than
+    this share. Otherwise the share is sufficient, and close to the least one.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels
@@ -109,7 +109,7 @@ class LeftOver:
     Attributes:
         required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less.
         frequency_hz: The binding frequency.
-        attained: Whether some lossless hand destabilises the loop at any smaller damping (one channel, equal devices).
+        attained: Whether a lossless hand destabilises the loop at every smaller damping (one channel, equal devices).
         proved_damping: (m,) [N s/m] by known-device; None if it is infinite.
     """
 
@@ -127,7 +127,7 @@ class LeftOver:
             return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
         excess = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
         necessary = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
-        return f"{necessary}; the proof gives away {excess} N s/m"
+        return f"{necessary}; the proof requires {excess} N s/m more"
 
 
 def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:

@@ -1,7 +1,7 @@
 """Design the optimal coupling: the force filter R of least mismatch whose loop satisfies a condition, with a proof.
 
 The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
-solution until a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
+solution so that a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
 proves. Since R(1) = g I, the static stiffness is F(1) = g E(1): every spring of the environment is scaled by g.
 """
 
@@ -110,15 +110,15 @@ def design(
     options: program.Options = program.DEFAULT,
     progress: Callable[[_BasisResult], None] = lambda result: None,
 ) -> Optimal:
-    """Return the coupling of least mismatch in the loop's environment, with its certificate and proof.
+    """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
     With ranges around the environment, this-environment holds at every vertex and at every point that the search
     between the vertices visits. With a range of delays, any switching within the range is safe.
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
-    Raises ValueError for a loop with walls, for a delta that is not positive, and for an environment that is unsafe
-    with any damping because it is not passive.
+    Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
+    that has no design in this loop, and for a loop that no damping makes safe without a coupling.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
@@ -193,8 +193,8 @@ def _for_known_devices(
 
     For fixed beta and fixed multipliers of the facts the block is affine in the forces. The filter over the smallest
     basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola through the three
-    merits, and the multipliers of the last accepted filter. Its best beta is not used, because with that beta the
-    program would return the same filter again.
+    merits, and the multipliers of the last accepted filter. They do not use the best beta of this filter, because with
+    it the program would return the same filter again.
 
     Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
@@ -304,7 +304,7 @@ class _Search:
 
     @property
     def proves_last(self) -> bool:
-        """Whether proofs follow the last basis. With a limiter each basis uses the multipliers of an earlier proof."""
+        """Whether proofs come after all bases. With a limiter each basis uses the multipliers of an earlier proof."""
         return not self.options.limiter
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
@@ -347,7 +347,7 @@ class _Search:
 
     @property
     def simple(self) -> float:
-        """Largest kappa for which R = kappa I, the environment scaled down, satisfies this-environment."""
+        """Largest kappa for which R = kappa I satisfies this-environment with MARGIN unused; 1 if `bare` is 0."""
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
@@ -385,7 +385,7 @@ class _Search:
     def over_basis(
         self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
     ) -> tuple[Optimal, _BasisResult]:
-        """Return the optimum over a basis, scaled until every sweep passes. With a limiter it is also proved.
+        """Return the optimum over a basis, scaled so that every sweep passes. With a limiter it is also proved.
 
         If the optimum renders less than the share `floor` of the static stiffness, the program is solved again with a
         larger weight of the stiffness.
@@ -444,7 +444,7 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
     ) -> tuple[ForceFilter, list[float]]:
-        """Find the optimum for the nominal environment, and add environments whose requirement is exceeded.
+        """Find the optimum in the nominal environment, and add those to the program that then need too much damping.
 
         `need` returns required over available damping in an environment.
         Returns (coupling, share of the damping that each environment needs).
@@ -517,7 +517,7 @@ class _Search:
         return candidate
 
     def spring_damper(self) -> Optimal | None:
-        """Return the best spring-damper under this-environment; None with further constraints or if there is none."""
+        """Return the best spring-damper; None if there is none, or with ranges, a latency or further constraints."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:

@@ -50,7 +50,7 @@ _EVEN = 0.002  # weight of the error relative to each motion's own force (`_even
 _LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10
-_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or its gain over zero force, if less
+_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or, if less, its gain over zero force
 _FORGIVEN = 5e-4  # allowed violation of an inequality between the frequencies of its grid; scaling removes it
 _STEEPER = 3.0  # factor between successive weights of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency
@@ -155,7 +155,7 @@ class Slip:
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
-    """Return LimitedForces as a constraint with the share MARGIN of the damping and of rho unused."""
+    """Return LimitedForces as a constraint with the share MARGIN of the damping and 2 % of rho unused."""
     condition, c = slip.condition, [v for row in slip.c for v in row]
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -589,7 +589,7 @@ class Problem:
         return self._kept(inner, start, x) if demanding else x
 
     def _kept(self, inner: Array, start: Array, x: Array) -> Array:
-        """Return a point on the line from x to an interior point that satisfies the constraints on the dense sweep.
+        """Return a point between x and an interior point; it satisfies the constraints on the dense sweep.
 
         The least eigenvalue is concave along this line, so its values at both ends give the length of the step.
         """
