@@ -125,7 +125,7 @@ class Requirement(Generic[C]):
 
     @property
     def margin(self) -> float | None:
-        """Available over required damping; None if no damping is required or none is enough."""
+        """Available over required damping; None if no damping is required, 0 if none is enough."""
         return finite(1 / self.ratio) if self.ratio > 0 else None
 
     @property
@@ -158,7 +158,7 @@ def switching_guarantee(span: DelayRange) -> str:
 class NotProved(ValueError):
     """No proof of the condition was found. `requirement` is the requirement by the sweep, or None.
 
-    `refuted` is True if exact arithmetic contradicts the sweep, so that no proof can exist.
+    `refuted` is True if the block of the exact coefficients is clearly negative, so that no proof can exist.
     """
 
     def __init__(self, reason: str, requirement: Requirement | None = None, refuted: bool = False) -> None:
@@ -244,10 +244,10 @@ class Design(Chosen):
     Attributes:
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
         condition: The name of the condition that it was designed for.
-        figure: The objective: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
+        figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
         objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep.
-        sdps: The number of convex problems that were solved, or of runs of a local search.
+        sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
         c: The multiplier of the limiter, one row per device, if it is kept because its search took long; or None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
@@ -277,4 +277,4 @@ class Design(Chosen):
 
 def held_torques(loop: Loop) -> str | None:
     """Return the remark that conditions ignore how the pose changes while torques are held; None without `axes`."""
-    return "not charged: forces count as held in space while the pose moves on" if loop.axes else None
+    return "not covered: forces are taken as held in space while the pose changes" if loop.axes else None

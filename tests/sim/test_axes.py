@@ -363,7 +363,7 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
 def test_reports_say_that_held_torques_are_free() -> None:
     rows = [dict(verdict.rows(assess(each.loop("I"), SpringDamper([3000.0] * m, [0.3] * m)))).get("held torques")
         for each, m in ((scenario(), 6), (line(), 2))]  # fmt: skip
-    assert "not charged" in str(rows[0])
+    assert "not covered" in str(rows[0])
     assert rows[1] is None
 
 
