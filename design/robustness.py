@@ -25,11 +25,11 @@ _PERCENT = 10.0  # change of a parameter in reports
 
 @dataclass(frozen=True)
 class Robustness:
-    """The worst requirement of a coupling in the environments of `vertices`, which differ by `percent`."""
+    """The worst requirement of a coupling in the nominal environment and in `vertices`, which differ by `percent`."""
 
     percent: float
     required_over_available: float  # required over available damping in the worst environment
-    where: str  # the parameter that differs in the worst environment, with its sign
+    where: str  # the parameter that differs in the worst environment, with its sign, or "nominal"
     certified: bool  # whether the condition holds in the worst environment
 
 
@@ -73,7 +73,7 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
 
 
 def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness:
-    """Return the worst requirement of a coupling over `vertices`, by the refined sweep of the condition.
+    """Return the worst requirement in the environment and in `vertices`, by the refined sweep of the condition.
 
     If there are many vertices, a coarse sweep first selects those near the worst one.
     """
@@ -94,7 +94,7 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """Return the worst requirement over `vertices` with changes of ten percent, or None.
+    """Return `robustness`, with changes of ten percent, or None.
 
     Returns None for a condition that holds in any environment or that sweeps skip, for walls, for environments given by
     a block, and if a stiffness or mass plus ten percent is too large.

@@ -155,7 +155,7 @@ class _GainSet:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A bound on a gain that is affine in real variables, at sampled frequencies, with cutting planes.
+# A bound on the gain of a response that is affine in real variables, at sampled frequencies, with cutting planes.
 #
 # A problem over all frequencies has infinitely many constraints, of which few bind. The problem is solved at some
 # frequencies, a refined sweep checks the result, and the worst frequency is added.
@@ -234,7 +234,7 @@ def design(
         loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
-        limiter: Whether the proof covers limited forces, too; proofs of any-environment always do.
+        limiter: Whether the proof covers limited forces, too; proofs of any-environment do if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
         W1: The output weight of (23).
         W2: The input weight of (23).
@@ -279,7 +279,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if so many
     channels would make the search take minutes.
     """
-    if not named(condition).extensible:  # Limited forces are covered with rho = 0.
+    if not named(condition).extensible:  # With psi = 0 any-environment covers limited forces.
         if limiter and named(condition) is KNOWN_DEVICE:
             raise ValueError("limiter: known-device designs do not cover limited forces; use this-environment")
         _require_few(
@@ -413,7 +413,7 @@ _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
     """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and device.
 
-    It is l Lam^-1 l*/4 with the form Lam of L, l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    It is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
     """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
@@ -547,12 +547,12 @@ _STIFF_DIGITS = 6
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
-    """Return couplings from which a search starts, with stiffnesses around 2 d/((theta + 1) T) [N/m].
+    """Return couplings from which a search starts, with 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
 
-    This is the stiffness of the stiffest spring for any passive environment, with the usable damping d [N s/m].
+    For psi = 0 this is half the largest stiffness for any environment, with the usable damping d [N s/m].
 
     With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency.
-    Therefore the last start has the environment's stiffness at half the sampling rate.
+    Therefore the last start is stiffer than the environment at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
@@ -691,7 +691,7 @@ def _verified(
     requirement = ANY_ENVIRONMENT.required(loop, coupling, phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
-        raise DesignFailed(None, (), f"the designed coupling is not certified by any_environment: {why}")
+        raise DesignFailed(None, (), f"the designed coupling is not certified by any-environment: {why}")
     wall_s = time.perf_counter() - started
     return Design(coupling, "any-environment", figure, objective, requirement, sdps, wall_s, phi=phi)
 

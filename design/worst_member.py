@@ -3,7 +3,7 @@
 The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
 stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or a
 face, which uniformly drawn points never hit. For every set of contacts that may be present, the search therefore tries
-points on all edges, on faces and inside. A compass search then continues from the worst points.
+points on edges, on faces and inside. A compass search then continues from the worst points.
 """
 
 from __future__ import annotations
