@@ -40,7 +40,7 @@ class EncoderSteps:
     """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
-    friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound
+    friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
     friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, where nothing is proved
     covered: bool
@@ -75,7 +75,7 @@ class EncoderSteps:
             has = f"at least {has} N (published: at most {bounds} N)"
         else:
             has += " N"
-        enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has}"
+        enough = f"friction of {amounts} N is enough for {widths} um, the axes have {has}"
         return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
 
 

@@ -88,7 +88,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
-    population: Population = Population()  # distribution of the humans that `validate` draws
+    population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
     T_min: float | None = None  # [s] the shortest period if periods vary; only the known-device condition uses it

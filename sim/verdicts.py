@@ -164,7 +164,7 @@ class Traces:
         stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
         decay = largest(-1 / findings.exact[findings.exact < 0])
         decides = decay is None or duration >= _SETTLING * decay
-        slow = f"the slowest mode decays in {decay or 0:.3g} s, so hands may still move as fast after {duration:g} s"
+        slow = f"the slowest mode decays in {decay or 0:.3g} s, so hands may not have slowed down after {duration:g} s"
         return cls(
             duration_s=duration,
             humans=findings.index.size,
