@@ -42,7 +42,7 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 # converges. A force that misses its tolerance after _MOST_STEPS steps is set to 0; `unsolved` counts these ticks.
 
 
-_TICKS = 64  # length of a test vector, longer than the delays and the fast modes of a loop
+_TICKS = 64  # length of a test vector, longer than the fast modes and the usual delays of a loop
 _MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, if rounding allows it

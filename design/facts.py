@@ -118,8 +118,8 @@ class Collected(Generic[Block]):
     ) -> None:
         """Add the hands' inputs and their rows.
 
-        With `any_object` the energy of a passive object behind the sent forces is subtracted: f_e[k] multiplies the
-        displacement less x[k] - x[k-1] (docs/theory.md, "any environment").
+        With `any_object` the energy that a passive object receives is subtracted, so that f_e[k] multiplies the
+        displacement minus (x[k] - x[k-1]) (docs/theory.md, "Any environment").
         """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay

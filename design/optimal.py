@@ -117,8 +117,9 @@ def design(
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
-    Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
-    that has no design in this loop, and for a loop that no damping makes safe without a coupling.
+    Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency or with
+    devices of several axes, for a limiter that has no design in this loop, and for a loop that no damping makes safe
+    without a coupling.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")

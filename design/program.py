@@ -122,7 +122,8 @@ def this_environment(loop: Loop) -> _Constraint:
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """Return SWITCHING as a constraint for delays that switch within the span.
 
-    Its own unknowns are alpha T/Delta, the scaled multipliers of the channels that switch.
+    Its own unknowns are alpha T/Delta, the scaled multipliers of the channels that switch. Every device must have one
+    axis.
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)

@@ -22,7 +22,7 @@ Environments = Literal["any passive environment", "these ranges", "this environm
 CONDITIONS: tuple[ConditionName, ...] = get_args(ConditionName)
 #: the conditions that need guaranteed bounds of the devices' motors and transmissions
 KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-device"))
-#: the conditions for every device
+#: the conditions that use only the devices' damping
 PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDITIONS)
 
 
