@@ -1,21 +1,22 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the test suite without its slow tests
-# make suite  the whole test suite, as .ci/run does
+# make suite  all tests but benchmarks, validate and firmware, as .ci/run does
 # make check  lint and the tests of what your change touches, under a minute
-# make lint   ruff and pyright, without a finding: to be run, with make suite, before anything is committed
-# make coverage  the whole test suite again, slower, and the lines that it does not reach
-# make validate  every check that a verdict rests on, and the slow pages: half an hour
-# make firmware  the sketches, compiled and run on a simulated ATmega328P and Cortex-M7; the packages that it needs: .ci/run
-# make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
-# make kernels  six designs under load, on one core and three at once, byte by byte; then the numerical tests under every
-#   kernel of OpenBLAS that this processor runs, and a table: an hour
-# make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
+# make lint   ruff and pyright; run it and make suite before you commit
+# make coverage  the tests (slower), and the lines that no test reaches
+# make validate  full-length checks of verdicts, and the slow commands of the pages: half an hour
+# make bench  the benchmarks in tests/benchmarks
+# make firmware  compile the sketches, and run them on a simulated ATmega328P and Cortex-M7; .ci/run lists the packages
+# make mutate  put small mistakes into the code behind verdicts, and report those that no test notices: ten minutes
+# make kernels  compare the files of six designs made idle, under load and three at once, byte by byte; then run the
+#   numerical tests under every kernel of OpenBLAS that this processor runs: an hour
+# make oldest  the tests of models, controllers and scenarios with the oldest allowed packages, in .venv-oldest
 # make installed  the wheel in an empty environment, run beside a user's own models/, sim.py and cli.py
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
-# a file of tests stays with one worker: its tests share fixtures, and those of the documentation files; one worker more
-# than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
+# loadfile keeps each file of tests on one worker, because its tests share fixtures. There is one worker more than cores,
+# because sessions in real time mostly wait. tests/conftest.py starts the longest files first.
 PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test suite check validate firmware lint coverage bench mutate kernels oldest installed figures clean
@@ -53,7 +54,7 @@ kernels: .venv/ready
 	$(PY) tests/tools/same_designs.py
 	$(PY) tests/tools/kernels.py
 
-# links from one folder, by which pyright finds haptic_loop.sim in the folder sim
+# links in one folder, so that pyright finds haptic_loop.sim in the folder sim
 build/typed: Makefile
 	@rm -rf $@ && mkdir -p $@/haptic_loop
 	@cd $@/haptic_loop && ln -s ../../../haptic_loop/__init__.py . && \
@@ -89,10 +90,10 @@ figures: .venv/ready
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s
 
-# DeprecationWarning: what an old matplotlib says of a new pyparsing
 installed: .venv/ready
 	$(PY) -m pytest tests/project/test_wheel.py
 
+# DeprecationWarning: an old matplotlib warns about a new pyparsing.
 oldest:
 	$(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python tests/oldest.py >.venv-oldest/floors.txt
