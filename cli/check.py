@@ -1,4 +1,7 @@
-"""python -m design.check coupling.json: prove a stored coupling again, from the file alone and without a solver."""
+"""python -m design.check coupling.json: prove a stored coupling again, from the file alone.
+
+The stored certificate needs no solver. For another --condition, multipliers may be searched.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ from haptic_loop.sim.couplings import read_coupling
 
 @dataclass(frozen=True)
 class _Switching:
-    """The claim for delays that vary; guarantee and proof are null if it fails."""
+    """The claim for delays that vary; guarantee and proof are null if the file is not proved."""
 
     lo: Sequence[int]
     hi: Sequence[int]
@@ -45,7 +48,7 @@ class _Switching:
 
 @dataclass(frozen=True)
 class _Checked:
-    """The report; figures are null if the file has no certificate."""
+    """The report; figures of the certificate are null if the file has none."""
 
     proved: bool
     reason: str | None = render.figure("reason")
@@ -60,9 +63,9 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
-    claim: str | None = render.figure("claim", default=None, json="if given")  # claim on a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # claim of the user's own condition
     assessment: Assessment | None = off_table(default=None)  # in the loop of the file, if the file is proved
-    anew: bool = off_table(default=False)  # whether --condition is not that of the file
+    anew: bool = off_table(default=False)  # whether --condition differs from the file's condition
 
 
 def main(argv: list[str]) -> int:
@@ -101,7 +104,7 @@ def _parser() -> options.Parser:
 
 
 def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
-    """Return the coupling with a certificate of this condition, proved and verified. Raises ValueError."""
+    """Prove another condition. Return the coupling, with a certificate if a proof was found, and the verdict."""
     coupling = stored.built()
     try:
         proved = Stored.of(stored.loop, coupling, prove(stored.loop, coupling, condition))

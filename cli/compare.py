@@ -1,8 +1,9 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
-Without --coupling, the loop is run with the scenario's own hands and every possible coupling. The table has one row for
-each coupling, and couplings.png shows the forces side by side. With --coupling, the named couplings are drawn over
-frequency: singular values, required damping, perceived stiffness and damping.
+Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. In a loop without
+walls and friction, the couplings drive the scenario's own hands, and couplings.png shows the forces side by side. With
+--coupling, the named couplings are drawn over frequency: singular values, required damping, perceived stiffness and
+damping.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return the verdict: the coupling with a guarantee and the least force error, else the best static stiffness."""
+    """Return the verdict: of the guaranteed couplings the one with the least force error, then the best stiffness."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -205,7 +206,7 @@ def _named(name: str) -> tuple[str, str | Condition | None]:
 
 
 def _guarantees(report: Comparison) -> render.Table:
-    """Return the table of required damping [N s/m], or of its share of the devices' damping if that differs."""
+    """Return the table of required damping [N s/m], or of its share if the devices' dampings differ."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
@@ -240,7 +241,7 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep cannot tell lower frequencies from 0.
+    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep cannot tell frequencies below 0.5 mHz from 0.
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    """Design, prove and store a coupling. Return 0 if it is certified, 1 if not."""
+    """Design, prove and store a coupling. Return 0 if it is certified, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.api import store
 
@@ -74,7 +74,7 @@ def _parser() -> options.Parser:
     default = "default spring-damper; moving-average in a world"
     kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own ({default})"
     parser.add_argument("--coupling", metavar="NAME", help=kinds)
-    around = "certify for every stiffness and mass within PERCENT of the nominal one, like [ranges] of a scenario"
+    around = "stiffnesses and masses vary by PERCENT: certify the vertices, search between them, like [ranges]"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")
     ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
@@ -113,7 +113,7 @@ def _percent(text: str) -> float:
 
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """Return the scenario's loop with the range of --varying-delay. Raises InputError."""
+    """Return the loop with --ranges and --varying-delay; set args.condition to its default. Raises InputError."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     loop = scenario.loop(args.case)
@@ -127,7 +127,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
-            raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
+            raise InputError("--varying-delay is for spring-damper or optimal, by this-environment or known-device")
         span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
         with options.refused("--varying-delay: "):
             loop = loop.switching(span)
@@ -219,7 +219,7 @@ def _that_decays(
         f"the best of {len(tried)} couplings has {best.least_damping_ratio:.4f} at {best.least_frequency_hz:.1f} Hz"
     )
     raise DesignFailed(
-        None, (), f"--decay {ratio:g}: no certified coupling gives every mode this damping ratio; {reached}"
+        None, (), f"--decay {ratio:g}: none of the couplings tried gives every mode this damping ratio; {reached}"
     )
 
 
@@ -322,7 +322,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
 _OBJECTIVE_WORDS = {
     "loop-norm": "the least norm of W1 L W2, (23) of the paper",
     "rms": "the least rms transparency error, a ratio",
-    "sup": "the least largest transparency error, a ratio",
+    "sup": "the least peak transparency error, a ratio",
     "stiffness": "the most stiffness, of all channels together [N/m]",
 }
 
@@ -366,7 +366,7 @@ def _stored_rows(stored: Filed) -> render.Rows:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Report:
-    """The report of a design; missing parts are null."""
+    """The report of a design; missing parts are null or left out."""
 
     case: str
     seed: int
@@ -403,7 +403,7 @@ def _tables(scenario: Scenario, report: _Report) -> list[render.Table]:
 
 
 def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
-    """Return the function that formats a figure: nominal environment / worst of the ranges."""
+    """Return the function that formats a figure: nominal environment / worst vertex."""
 
     def cell(row: coverage.OverRanges) -> str:
         figures: coverage.NominalWorst = getattr(row, name)
