@@ -1,4 +1,4 @@
-"""python -m hw.bridge: drive a device over a serial port with a coupling that is certified for the measured delay.
+"""python -m hw.bridge: drive a device with a coupling that is certified for the measured delay.
 
 port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out -> trace and report
 """
@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # In a world, each contact has an energy budget of its own (`world_start`).
+        args.energy_budget = None  # A world has one energy account instead, with W0 from `world_start`.
     behind = session_cli.boards_behind(args, scenario)
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
@@ -89,7 +89,7 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
         if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
             raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     if args.energy_budget and at_once:
-        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
+        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; drop one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError(
             "--energy-budget is 0 J: arming tests the encoders with a small force, give for example 0.01 J"
@@ -104,7 +104,7 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
 def _parser() -> argparse.ArgumentParser:
     parser = options.Parser(
         "hw.bridge",
-        "Drive a device over a serial port with a coupling that is certified for the measured delay.",
+        "Drive a device with a coupling that is certified for the measured delay.",
         "python -m hw.bridge --rehearse --duration 2",
         "python -m hw.bridge --port /dev/ttyACM0 --coupling coupling.json",
         first="port rehearse scenario coupling arm duration",
@@ -149,7 +149,7 @@ def _print_certificate(
         console.print(f"[dim]·[/] {remark}", highlight=False)
     if len(programs) == 1:
         console.print(
-            "no reserve: no coupling this soft is certified for a longer delay, so late answers end the session"
+            "no reserve: no softer coupling is certified for a longer delay, so that late answers end the session"
         )
 
 
@@ -215,8 +215,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
         if part.warnings:
             console.print(f"  MuJoCo warns: {' '.join(part.warnings)}")
         if part.step_us:
-            took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
-            console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")
+            took = f"{part.step_us['p50']:.0f} us of CPU time (median), {part.step_us['p99']:.0f} us (99 %)"
+            console.print(f"  a step of the scene took {took}; T is {1e6 * report.run.T_s:.0f} us")
     if report.scene and report.scene.active:
         console.print(f"active parts: {', '.join(report.scene.active)}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)

@@ -32,7 +32,7 @@ COMMANDS = {
     "design": ("design", "design a coupling, prove its certificate and store both"),
     "run": ("sim.run", "close the loop once: stability, transparency and error"),
     "validate": ("sim.validate", "test with random passive humans in both engines, and search for the worst"),
-    "bridge": ("hw.bridge", "drive a device over a serial port"),
+    "bridge": ("hw.bridge", "drive a device with a certified coupling"),
     "zwidth": ("sim.zwidth", "draw the Z-width map: which springs and dampers are safe"),
     "view": ("sim.view", "feel the loop in a window, or film it"),
     "trace": ("sim.trace", "measure how oscillations grow in a stored trace"),

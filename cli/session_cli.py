@@ -37,7 +37,7 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] time after its run until a rehearsal that has not ended is stopped
+_SPARE = 600.0  # [s] time by which a rehearsal may exceed its run before it is stopped
 _SHOWN_US = 100_000  # [us] virtual time between two updates of a rehearsal's progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 
@@ -80,7 +80,7 @@ def add_safety_options(parser: options.Parser) -> None:
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions); of a rotary device, at the radius of the hand"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
-    speed = "fastest motion of a hand while forces act (default 1, or the least credible_speed of the devices)"
+    speed = "fastest motion of a hand while forces act (default 1, at most the devices' least credible_speed)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
     heat = "force that each motor bears without end, or one number for all; larger forces are limited in time by I2t "
     heat += "(default: not watched)"
@@ -98,7 +98,7 @@ def add_safety_options(parser: options.Parser) -> None:
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
-    """Return the scenario, which needs ideal devices, even ticks and constant delays. Raises InputError."""
+    """Return the scenario. It may have no Coulomb friction, uneven ticks or varying delays. Raises InputError."""
     scenario = options.scenario_from(args)
     require_linear(scenario, command, walls=True)
     for require in (require_constant_delay, require_even_ticks):
@@ -107,7 +107,7 @@ def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """Return the limits of the safety options, with `cap`. Raises InputError."""
+    """Return the safety limits for `session_for`; set args.deadman to its default. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
@@ -195,7 +195,7 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
         raise InputError(f"--port has {count} ports, the scenario {devices} devices: give one for each, or one for all")
     if scenario.T_min:
         raise InputError(
-            "T_min: clocks of several boards slip, and a tick may have no length; leave it out with several ports"
+            "T_min: clocks of several boards drift, and no period is the shortest; leave it out with several ports"
         )
     return ticks_behind(scenario.theta, [len(device.free) for device in scenario.device])
 
@@ -213,7 +213,7 @@ def host_clocked(args: argparse.Namespace) -> bool:
 
 @dataclass(frozen=True)
 class _Held:
-    """Signals that came during the session, and the number of bytes that the port did not take at once."""
+    """Signals that came during the session, and the number of bytes that the ports did not accept."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -293,9 +293,9 @@ def _wait_for_any(ports: Sequence[SerialPort], seconds: float) -> None:
 
 def _ask_for_clamp(axes: str) -> None:
     """Ask whether a mechanical clamp holds these axes. Raises InputError for "no", and if nobody can answer."""
-    library = "the library's regulation (drd) locks x, y and z of a device together and cannot hold them"
+    library = "the library's regulation (drd) locks x, y and z of a device only together"
     if sys.stdin.isatty():
-        answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold them? [y/n] ")
+        answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold the undriven axes? [y/n] ")
         if answer.strip().lower() in ("y", "yes"):
             return
     raise InputError(f"--port: no channel drives {axes}; {library}: clamp them mechanically and give --clamped")
