@@ -61,7 +61,7 @@ class _Exported:
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
-    claim: str | None = render.figure("claim", json="if given")  # claim on a condition of the user's own
+    claim: str | None = render.figure("claim", json="if given")  # claim of the user's own condition
 
 
 def main(argv: list[str]) -> int:
@@ -120,7 +120,7 @@ def _parser() -> options.Parser:
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block")
-    link = "leave out Theta, if the link to the devices has this delay"
+    link = "leave out the transmission delay theta, if the link to the devices causes it"
     parser.add_argument("--without-theta", action="store_true", help=link)
     limit = "add the limiter that the certificate covers, with these largest forces [N]: one for all, one for each "
     limit += "device (length of its force vector) or one for each axis"
@@ -146,7 +146,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
 
 
 def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ...], tuple[slice, ...]]:
-    """Return limits (m,) [N] and the vectors to which they apply, for one number, one per device or one per channel."""
+    """Return limits (m,) [N] and the channels of each force vector that they limit; () limits each channel alone."""
     vectors = tuple(own for own in loop.devices if own.stop > own.start + 1)
     if not vectors or len(given) == loop.channels:
         return options.per_channel("--force-limit", given, loop.channels), ()

@@ -1,9 +1,10 @@
-"""python -m hw.identify: measure the damping that a device guarantees, by a chirp of a small force and a free release.
+"""python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
 Two sittings are recorded with the handles at different places, and nobody may hold them. If a hand damps a handle in
-one sitting, the other sitting reveals it. The chirp is played in a bridge session with all of its limits; the force cap
-is the excitation's largest force. With --transmission two sittings with clamped handles follow. They bound the mass of
-the motor and the transmission (hw/transmission.py), because the known-device conditions use these bounds.
+one sitting, the other sitting reveals it. The excitation is played in a bridge session with limits of force and speed;
+the force cap is the excitation's largest force. With --transmission two sittings with clamped handles follow. They
+bound the mass of the motor and the transmission (hw/transmission.py), because the known-device conditions use these
+bounds.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 class _Sitting:
     """One session, and the estimates from its record."""
 
-    axes: list[Estimate]  # empty if there is a reason
+    axes: list[Estimate]  # empty if nothing was estimated
     reason: str | None
     report: SessionReport = off_table("left out")
     session: Session = off_table("left out")
@@ -66,7 +67,7 @@ class _Sitting:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """The last session, one estimate per axis from all sittings, and whether each has a bound above zero."""
+    """The last session, one estimate per axis from all sittings, and whether their bounds hold."""
 
     session: SessionReport = off_table("inlined")
     axes: list[Estimate] = off_table()
@@ -176,10 +177,10 @@ def _sitting(
 
     With `clamped` the excitation is a chirp at this share of the force, and the function estimates nothing.
     """
-    undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # No damping is required, as it is unknown.
+    undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r = scenario.lever  # the options state figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # stops a device that is lighter than declared
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # A device that is lighter than declared is stopped.
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
@@ -198,7 +199,7 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
-    seconds = played(1).seconds - 0.2  # The gain rises during the lead.
+    seconds = played(1).seconds - 0.2  # The gain rises in the 0.3 s of zero force at the beginning.
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
@@ -252,7 +253,7 @@ def _with_transmissions(
 
 
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Write a device's [[device]] table for a scenario file, with the declared transmission if none was identified.
+    """Return a device's [[device]] table for a scenario, with the declared transmission if none was identified.
 
     `axes` and `bounds` have one entry per free axis. Masses and transmission of several axes are their means.
     """

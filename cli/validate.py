@@ -101,7 +101,7 @@ def _parser() -> options.Parser:
     )
     add("--adversary", action="store_true", help="also search for the worst passive human")
     add("--generations", type=whole_number(1, 10_000), metavar="N", help="generations of --adversary (default 150)")
-    met = "nominal (default), or ranges: the vertices of the scenario's ranges in turn, and as many points inside"
+    met = "nominal (default), or ranges: in turn the nominal environment, the ranges' vertices, and points inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")
@@ -119,7 +119,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
-    """Return the vertices of the ranges, the worst point found, and further random points. Raises InputError.
+    """Return the nominal environment, vertices, the worst point and random points of ranges. Raises InputError.
 
     Without `--environments ranges` the result is empty, and every loop has the nominal environment.
     """
@@ -159,7 +159,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search for the worst humans in the environment that requires the most damping. Ctrl-C ends the search."""
+    """Search for the worst humans; with ranges, where the most damping is required. Ctrl-C ends the search."""
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
@@ -298,7 +298,7 @@ def _varying(
 
 
 class _Tests(NamedTuple):
-    """Tests of the claims; each field has the name that it has in the report."""
+    """Tests of the claims, with the field names of the report."""
 
     own_humans: _Own
     energy_audit: verdicts.EnergyAudit | None
@@ -321,7 +321,7 @@ def _tested(
     mode = worst_mode(assemble(question.scenario, chosen.coupling))
     own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
-    # W counts delta dx^2/T, and a proof for known devices does not bound this sum.
+    # The audit's energy W counts delta dx^2/T, which a proof for known devices does not bound.
     energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
     switching, timing = _varying(question, chosen, assessment, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
