@@ -138,7 +138,7 @@ def publish(
 
 
 def announce(args: argparse.Namespace, verdict: str) -> None:
-    """Print a verdict before pictures and the rest of a report are made."""
+    """Print a verdict without breaking its line."""
     console(args).print(verdict, soft_wrap=True)
 
 
@@ -273,7 +273,7 @@ def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, p
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """Return the row of the contacts' names, in the order of all lists; the text is None for a single contact."""
+    """Return the row of the contacts' names in the order of the channels; the text is None for a single contact."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 
@@ -301,7 +301,7 @@ def robustness_rows(there: Robustness | None) -> Rows:
 
 
 def verdict(word: str | None) -> str:
-    """Return "stable" or "unstable" with its colour."""
+    """Return "stable" or "unstable" with its colour, or "not decided"."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
 
 

@@ -15,7 +15,7 @@ from haptic_loop.design.files import nobody_reads, printable
 
 _CUT = "…"  # rich's mark for a cut word
 _WIDEST = 400  # characters of the widest table
-_STEP = 2
+_STEP = 2  # characters by which the width grows
 _OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # an opening bracket that begins no tag of reports
 
 
@@ -33,7 +33,7 @@ class Screen(Console):
     """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print as rich does, but widen the console until no table loses a character."""
+        """Print as rich does, but widen the console until no table loses a character, at most to _WIDEST."""
         own, objects = self._width, tuple(map(_in_unit, objects))
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """Return the coupling of --coupling, --condition and --no-limiter; a kind of coupling is designed."""
+    """Return the coupling of --coupling; if that is a kind, design one for --condition and --no-limiter."""
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
         return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
 
@@ -151,7 +151,7 @@ def _sentence(words: str) -> str:
 
 
 def rows(assessment: Assessment) -> render.Rows:
-    """Yield the first rows of every table with an assessment."""
+    """Yield the rows of an assessment: conditions, ranges, guarantee, force limits, held torques."""
     yield from render.certificate_rows(assessment.requirements, 5)
     yield from range_rows(assessment.ranges) if assessment.ranges else ()
     guarantee = assessment.guarantee

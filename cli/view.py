@@ -118,7 +118,7 @@ class _Film:
 
 @dataclass(frozen=True)
 class _Clock:
-    """The lead of the window's clock over the loop."""
+    """How often the loop fell behind the window's clock, and by how much in total."""
 
     overruns: int
     lost_s: float
@@ -145,7 +145,7 @@ class _Report:
     ended: _Ended = off_table("inlined")
 
     def lines(self) -> Iterator[str]:
-        """Yield one line per event, and the file of the film."""
+        """Yield one line per event, then the end, the held torques, and the clock or the film."""
         yield from (event.line() for event in self.events)
         yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
         if torques := self.events[0].assessment.held_torques:
@@ -183,7 +183,7 @@ def _parser() -> options.Parser:
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
-    """Return the user's name of the first coupling, and the script after it. Raises InputError."""
+    """Return the name of the first coupling, and the script without it. Raises InputError."""
     label = _label(args)
     usual = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else _SCRIPT if usual else None
