@@ -16,7 +16,7 @@ from haptic_loop.sim.scenario import InputError, require_even_ticks, require_lin
 
 _MOST_STEPS = 3_000_000  # largest number of steps for a row; that many take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: error [1/s], the larger one of the loops with and without the coupling",
+    "position: relative rms error; growth: the larger error [1/s] of those with and without the coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
     "real: simulated seconds per second; *: no other setting of this engine is both faster and more accurate",
 )

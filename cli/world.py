@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Report:
-    """The report of every command on a coupling in a world; SI units."""
+    """The report of each of these commands; SI units."""
 
     scenario: str
     scenario_digest: str
@@ -212,7 +212,7 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         wall_s=time.perf_counter() - began,
     )
     whom = f"of {len(hands)} sets of hands none" if holds else f"hands {worst.number} ({worst.kind})"
-    title = f"{report.guarantee} Measured: {whom} was given more than that."
+    title = f"{report.guarantee} Measured: {whom} was given more than W0 and the released energy."
     _publish(args, report, title, _hands_rows(report, hands), out)
     return options.exit_code(holds)
 

@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     require_no_world(scenario, "sim.zwidth")
     require_constant_delay(scenario, "sim.zwidth")
     if scenario.period is not None:
-        raise InputError("period: a map simulates constant periods; give T_max alone, its certificates cover all below")
+        raise InputError("period: a map simulates constant periods; give T_max alone, up to which certificates hold")
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
@@ -88,7 +88,7 @@ def _parser() -> options.Parser:
     parser.add_condition("the condition of the fixed coupling's design; your own is drawn in every map", to=of_map)
     rows = "rows and columns (default 60; 24 with --coupling, and before walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
-    K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
+    K, B = "[N/m]; default from delta, theta and T, or from the contact springs", "[N s/m]; default from delta"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
     of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
     mark = "also judge and mark this point (repeatable)"
@@ -221,7 +221,7 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """Return the text of the damping that the worst channel requires."""
+    """Return the largest required and the least available damping as a text."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
@@ -258,12 +258,12 @@ def _remarks(report: MapReport) -> Iterator[str]:
 
 def _about(conditions: Sequence[str]) -> str:
     """Return the words for the axes and for the guarantee of a certified cell."""
-    line = "K and B are those of every contact spring; a sweep certifies each cell for its environment alone"
+    line = "K and B belong to every contact spring; a sweep certifies each cell for its environment alone"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
-        f"{line}: this-environment, the population and MuJoCo with the coupling's model set to the cell's environment, "
-        f"{zwidth.MODEL_KEPT} with the model of the coupling's design."
+        f"{line}. For this-environment, the population and MuJoCo the coupling's model is the cell's environment, "
+        f"for {zwidth.MODEL_KEPT} that of the coupling's design."
     )
 
 
