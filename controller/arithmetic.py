@@ -21,16 +21,17 @@ Number = float | Fraction
 
 
 class SingularLoop(ValueError):
-    """A feedback interconnection whose algebraic loop has no solution, or an exact system with a pole at z = 1."""
+    """A feedback interconnection whose algebraic loop has no solution, or a system with a pole at z = 1."""
 
 
 class TooLong(ValueError):
-    """A computation ended without a result because its budget of work is spent."""
+    """A computation ended without a result because its budget of work or the user's time is spent."""
 
 
 # ----------------------------------------------------------------------------------------------------
 # Counted work. Searches and exact arithmetic count their operations from the sizes of their matrices and numbers, and
-# end when a budget is spent. They read no clock, so that a busy or slow machine gets the same result as a fast one.
+# end when a budget is spent. Without a user's time limit they read no clock, so that a busy or slow machine gets the
+# same result as a fast one.
 #
 # One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured there.
 
@@ -189,7 +190,7 @@ def inverse(M: Array) -> Array:
         result = np.linalg.inv(M)
     except np.linalg.LinAlgError:
         raise SingularLoop(_TOO_STIFF) from None
-    with np.errstate(over="ignore", invalid="ignore"):  # A product that overflows is not below.
+    with np.errstate(over="ignore", invalid="ignore"):  # An overflow gives inf or nan, which is not <= 1e24.
         # The product of the Frobenius norms is at least the condition number, whose singular values take far longer.
         below = _square_norm(M) * _square_norm(result) <= 1e24
     if M.size and not below.all() and np.max(np.linalg.cond(M)) > 1e12:
@@ -198,7 +199,7 @@ def inverse(M: Array) -> Array:
 
 
 _TOO_STIFF = (
-    "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12): "
+    "the algebraic loop within a tick is singular, or too stiff for floating point (condition above 1e12): "
     "soften the environment or the coupling, or add a sample to psi"
 )
 

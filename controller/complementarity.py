@@ -23,7 +23,7 @@ PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of
 
 @dataclass(frozen=True, eq=False)
 class _Problem(ReadOnly):
-    """A complementarity problem in the forces of a tick. M maps these forces to displacements along them."""
+    """A complementarity problem of a tick. M maps wall forces p to displacements, or slips v to limited forces."""
 
     M: Array  # (n, n)
 
@@ -39,7 +39,7 @@ class _Problem(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class Complementarity(_Problem):
-    """p >= 0, M p - q >= 0, p'(M p - q) = 0. It has one solution for every q if M is a P-matrix.
+    """Wall forces p: p >= 0, M p - q >= 0, p'(M p - q) = 0. There is one solution for every q if M is a P-matrix.
 
     Raises:
         SingularLoop: A principal minor of M is not positive.
@@ -227,9 +227,9 @@ class BallProblem(_Problem):
 
     The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
     diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in
-    u = f + v tau, which starts from the radial scaling of q. If this iteration fails, a block of one vector is solved
-    by bisection, and a block of several vectors by the Douglas-Rachford iteration. If the residual is still too large,
-    f is set to 0, and the failure is counted.
+    u = f + tau v, where tau is the mean of a vector's diagonal entries in M. It starts from the radial scaling of q. If
+    this iteration fails, a block of one vector is solved by bisection, and a block of several vectors by the
+    Douglas-Rachford iteration. If the residual is still too large, f is set to 0, and the failure is counted.
 
     Raises:
         SingularLoop: A block's symmetric part has a negative eigenvalue.
@@ -280,7 +280,7 @@ _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its 
 
 
 class _BallBlock:
-    """Force vectors of several devices whose entries M couples, so that their equations are solved jointly."""
+    """One force vector, or several that M couples, so that their equations are solved jointly."""
 
     def __init__(self, at: NDArray[np.intp], M: Array, limit: Array, balls: tuple[int, ...]) -> None:
         self.at, self.limit, self.balls = at, limit, balls
@@ -324,7 +324,7 @@ class _BallBlock:
         return v, f, lost.size
 
     def _newton(self, u: Array, q: Array) -> Array:
-        """Improve the solution u of P(u) + M (u - P(u))/tau = q by Newton steps, column by column."""
+        """Improve u in P(u) + M (u - P(u))/tau = q by Newton steps for each column; P projects onto the balls."""
         one, starts = np.eye(len(q)), np.cumsum((0, *self.balls))
         for turn in range(_NEWTON):
             v, f = self._of(u)
