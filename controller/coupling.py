@@ -69,7 +69,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return the equivalent V for the internal model `model`; None for a coupling without a model."""
+        """Return the equivalent V for the internal model `model`; None if there is no such V."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -147,10 +147,10 @@ class SpringDamper(ReadOnly, Coupling):
             object.__setattr__(self, name, frozen(getattr(self, name), max(1, np.ndim(getattr(self, name))), name))
         if self.K.shape != self.B.shape:
             raise ValueError(
-                f"K has {self.K.shape[-1]} channels and B has {self.B.shape[-1]}; give one of each per device"
+                f"K has {self.K.shape[-1]} channels and B has {self.B.shape[-1]}; give one of each per channel"
             )
         if not self.K.shape[-1]:
-            raise ValueError("K has no channels, expected one stiffness per device")
+            raise ValueError("K has no channels, expected one stiffness per channel")
         if not ((self.K > 0) & (self.K <= _LARGEST_COEFFICIENT)).all():
             raise ValueError(
                 f"K is {self.K.tolist()}, expected positive stiffnesses up to {_LARGEST_COEFFICIENT:g} N/m"
@@ -305,7 +305,7 @@ class MovingAverage(ReadOnly, Coupling):
         object.__setattr__(self, "terms", tuple(int(n) for n in self.terms))
         if not len(self.weight) == len(self.constant) == len(self.terms):
             sizes = f"{len(self.weight)}, {len(self.terms)} and {len(self.constant)}"
-            raise ValueError(f"weight, terms and constant have {sizes} entries; give one of each per device")
+            raise ValueError(f"weight, terms and constant have {sizes} entries; give one of each per channel")
         if not all(1 <= n <= _MOST_TERMS for n in self.terms):
             raise ValueError(f"terms are {list(self.terms)}, allowed are 1 to {_MOST_TERMS}")
 
@@ -705,7 +705,7 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
 
 
 class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
-    """The form of a force filter: the poles of its basis, and a coefficient for each basis function."""
+    """The form of a force filter: poles and pole pairs of its basis, and a coefficient for each basis function."""
 
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)

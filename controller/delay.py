@@ -127,7 +127,7 @@ _LONGEST = 1000  # [samples]
 
 
 class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Delays of the forces, lo to hi [samples] per channel, one for every packet."""
+    """Delays of the forces, between lo and hi [samples], for every packet and channel."""
 
     lo: tuple[int, ...]  # (m,) [samples]
     hi: tuple[int, ...]  # (m,) [samples]
@@ -172,7 +172,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def steady(self) -> bool:
-        """Whether every force has the same delay theta, so that Theta is linear and its certificates hold."""
+        """Whether every force has the same delay theta, so that certificates for constant delays hold."""
         return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
 
     @property

@@ -40,7 +40,7 @@ def spoken() -> PositionUnit:
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
-    """Return a text with metres in `unit`, by default that of this command's output. Converting twice does no harm."""
+    """Replace metres by radians in a text's units if `unit` (default: this command's) is rad. Twice does no harm."""
     return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
 
 
