@@ -1,8 +1,8 @@
 """Compare another tool with the published figures: python benchmarks/check.py [YOURS.py]
 
-YOURS.py has functions named like columns of figures.csv, such as `reference_this_environment(loop)`: from a loop, the
-TOML file as a dictionary, to a number, or None where the tool has no answer. Without a file the two functions below
-answer, which need only NumPy: they sweep frequencies and know nothing of the program that made the table.
+YOURS.py defines functions named like columns of figures.csv, such as `reference_this_environment(loop)`. `loop` is a
+TOML file as a dictionary; the result is a number, or None if the tool has no answer. Without YOURS.py the two functions
+below are compared. They need only NumPy, sweep frequencies, and share no code with the program that made the table.
 """
 
 import csv
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-HERE, BEYOND = Path(__file__).parent, {"latency", "varying_delay", "T_max"}  # what the two functions do not cover
+HERE, BEYOND = Path(__file__).parent, {"latency", "varying_delay", "T_max"}  # keys that no function below covers
 Z = np.exp(1j * np.geomspace(1e-4, np.pi, 40_000))
 
 
@@ -31,7 +31,7 @@ def object_(loop):
 
 
 def reference_this_environment(loop):
-    """s = max of the eigenvalues of -T He[F/(z - 1)] over Delta, F = Theta (I + Psi E V)^-1 Psi E."""
+    """Return the largest eigenvalue of -T He[F/(z - 1)] relative to Delta, with F = Theta (I + Psi E V)^-1 Psi E."""
     if BEYOND & set(loop) or loop["environment"].get("walls"):
         return None
     delta, T = np.array([device["damping"] for device in loop["device"]]), loop["T"]
@@ -44,7 +44,7 @@ def reference_this_environment(loop):
 
 
 def reference_any_environment(loop):
-    """Channel by channel, without delay in the object: T (1 - cos n w)/(2 delta He[(1 - 1/z) V]), n = theta + 1."""
+    """Return the largest T (1 - cos n w)/(2 delta He[(1 - 1/z) V]) of all channels, n = theta + 1; needs psi = 0."""
     if BEYOND & set(loop) or any(loop.get("psi", [])):
         return None
     w = np.angle(Z)
