@@ -31,7 +31,8 @@ _NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or th
 
 #: largest amounts: far above those of any rendered object, and far below the largest float
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-_LEAST_AMOUNT = 1e-12  # smallest amount but 0: a person cannot feel it, and its square is far above the smallest float
+#: smallest amount other than 0: a person cannot feel it, and its square is far above the smallest float
+_LEAST_AMOUNT = 1e-12
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can handle a few hundred states.
@@ -39,14 +40,16 @@ _MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can h
 
 def _check_amount(what: str, value: float, unit: str) -> None:
     if value != 0 and not _LEAST_AMOUNT <= value <= MOST_AMOUNT[unit]:
-        raise ValueError(f"{what} is {value}, allowed are 0 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)")
+        raise ValueError(
+            f"{what} is {value}, allowed are 0 and 1e-12 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)"
+        )
 
 
 _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice changes nothing
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the direction scaled to length 1. Raises ValueError if all entries are about 0 or one is 1e9 or more."""
+    """Return the direction scaled to length 1. Raises ValueError unless one is above 1e-9 and all are below 1e9."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
         raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9 that are not all 0")
     length = float(np.linalg.norm(direction))
@@ -127,8 +130,8 @@ def _parts_of(element: Any) -> list[Spring | Wall]:
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
-    A block is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and
-    nonnegative. If passivity holds within rounding only, a spring of at most 1e-6 of the block's mean gain is added to
+    A block is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and positive
+    semidefinite. If passivity holds within rounding only, a spring of at most 1e-6 of the block's mean gain is added to
     D. Raises ValueError for a block that produces energy, or whose passivity cannot be decided.
     """
 
@@ -173,16 +176,18 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # accepted and largest correcting spring, relative to the mean gain
+_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # correcting spring that needs no finer search, and the largest, over the mean gain
 
 
 @functools.lru_cache(maxsize=64)
 def _correction(block: Block) -> Any:
-    """Return the correction of D (m, m), Fractions, that makes the block provably passive. Raises ValueError.
+    """Return the correction of D (m, m), Fractions, that makes the block provably passive.
+
+    Raises ValueError for a block that is not passive, or whose passivity cannot be decided.
 
     The block absorbs the power f'(x - x_-)/T, where x_- is the displacement x of the previous tick. So E is passive if
-    E(1) is symmetric and nonnegative and He [(1 - z) E] >= 0. On the circle this is |1 - z|^2 He [E z/(z-1)]. Without
-    the pole at z = 1 the condition is He H >= 0 on the whole circle for
+    E(1) is symmetric and positive semidefinite and He [(1 - z) E] = |1 - z|^2 He [E z/(z-1)] >= 0. Without the pole at
+    z = 1 the condition is He H >= 0 on the whole circle for
     H = E(1)/2 - C (I-A)^-1 B - C (I-A)^-1 A (zI-A)^-1 B. A spring of l N/m beside the block adds l/2 to H.
     Objects at the edge of passivity, such as a free mass, get a spring that covers the error bound.
     """
@@ -315,7 +320,7 @@ class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
 
     file: str  # MJCF
     digest: str  # SHA-256 over the contents of the scene's files
-    along: tuple[tuple[tuple[float, float, float], ...], ...]  # directions in which each contact slides
+    along: tuple[tuple[tuple[float, float, float], ...], ...]  # directions per touched body, one per contact
     every: int = 1  # number of ticks for one step of the scene
 
     def __post_init__(self) -> None:
@@ -330,8 +335,8 @@ class Network(
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()
-    masses: dict[str, float] = {}  # [kg], by node; other nodes have no mass
-    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
+    masses: dict[str, float] = {}  # [kg], by node or point; other nodes have no mass
+    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # n walls have 2^n contact states
     block: Block | None = None  # an E(z) that is added to the network
     elements: tuple[Any, ...] = ()  # objects of a user's own classes; their parts become springs and walls
     world: SceneFile | None = None  # a MuJoCo scene in place of springs, masses, walls and block
@@ -361,7 +366,7 @@ class Network(
         for name, mass in self.masses.items():
             _check_amount(f"mass of {name!r}", mass, "kg")
             if name == GROUND or not set(self.coordinates(name)) <= {*nodes, GROUND}:
-                raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
+                raise ValueError(f"masses names {name!r}, which no spring or wall reaches; nodes: {', '.join(nodes)}")
         ends = [node for part in (*self.springs, *self.walls) for node in part.between]
         held = {node for end in (*ends, *self.masses) for node in self.coordinates(end)}
         loose = [n for n in self.contacts if n not in held and not self.block]
@@ -374,7 +379,9 @@ class Network(
             raise ValueError(f"world and {beside[0]}: a world is the whole environment, give one of them")
         if sum(map(len, world.along)) != len(self.contacts) or len(world.along) != len(self.bodies):
             count = sum(map(len, world.along))
-            raise ValueError(f"along has {count} directions for {len(self.contacts)} contacts")
+            raise ValueError(
+                f"along has {count} directions for {len(self.contacts)} contacts, expected one group per body"
+            )
         if len(set(self.contacts)) < len(self.contacts):
             raise ValueError(f"contacts must be different bodies, got {list(self.contacts)}")
 
@@ -420,7 +427,7 @@ class Network(
         return self.points.get(end, (end,))
 
     def _check_axes(self, part: Spring | Wall) -> None:
-        """Raise ValueError unless both ends and the direction of a part have equally many coordinates."""
+        """Raise ValueError if ends and direction of a part differ in their numbers of axes, or a normal is missing."""
         ends = [(end, len(self.coordinates(end))) for end in part.between if end != GROUND]
         counts = {n for _, n in ends}
         what = f"between {' and '.join(part.between)}"
@@ -469,7 +476,7 @@ class Network(
         return [[(node, c) for node, c in signed if c and node != GROUND]]
 
     def joined(self, part: Spring | Wall) -> list[list[str]]:
-        """Return the nodes that each elongation of a part joins, including ground."""
+        """Return the nodes that each elongation of a part joins, with ground if there is only one."""
         free = [[node for node, _ in ends] for ends in self._lengths(part)]
         return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
 
@@ -525,7 +532,7 @@ def environment(network: Network, T: Number) -> Lti:
     """Return E(z) from contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz), without walls.
 
     The positions q and velocities v of the internal nodes obey
-    M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, where q- and v- are those of the
+    M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
     dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor
     connections.
@@ -539,7 +546,7 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
     """Return the environment with ports for walls, from [x; p] to [f; y].
 
     p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node also has a port
-    from a force on it to its displacement. These ports come before those of the walls.
+    from a force against its displacement to this displacement. These ports come before those of the walls.
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
@@ -556,8 +563,8 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
 def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
     """Return the bodies that no spring joins to a contact or to ground, as lists of indices of internal nodes.
 
-    Only dampers act on such a body, so that its position affects no force and would be an unobservable integrator.
-    `_realise` stores the positions of its nodes relative to the first node.
+    Only dampers and inerters act on such a body, so that its position affects no force and would be an unobservable
+    integrator. `_realise` stores the positions of its nodes relative to the first node.
     """
     names = network.nodes()
     body = {name: name for name in (*names, GROUND)}  # union-find: each node points towards its body's root
@@ -597,7 +604,11 @@ _SLACK = 1e-9  # smaller stiffnesses, relative to the largest one, come from the
 
 
 def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
-    """Raise ValueError if springs leave a body free in a direction that is not a coordinate direction."""
+    """Raise ValueError if springs hold a body in some directions only.
+
+    A group of `_adrift` may move in one direction, which `_realise` takes for a common translation of its nodes. A
+    single diagonal spring to ground leaves another direction free and is not refused.
+    """
     adrift = _adrift(network, network.springs)
     loose = {i for group in adrift for i in group}
     held = [i for i in range(len(names)) if i not in loose]

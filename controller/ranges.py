@@ -57,7 +57,7 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the ranges in which only numbers vary, because every contact is either present or absent."""
+    """A part of the ranges with a fixed set of present contacts, in which only numbers vary."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
@@ -65,7 +65,7 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """Return the environment, then all vertices of the ranges that differ from it, or 128 of them if there are more.
+    """Return the environment, then the vertices of the ranges that differ from it: all, or at most 128 of them.
 
     Raises ValueError with the field's name if the ranges do not fit the network or have too many parameters.
     """
@@ -82,11 +82,12 @@ def number_of_vertices(network: Network, ranges: Ranges) -> int:
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that form an orthogonal array.
+    """Return each vertex as the numbers of the parts' corners: all vertices, or the 128 words of a linear code.
 
-    In the 128 vertices, the words of a linear code, any three pairs of ends meet in every combination. Each bit of a
-    corner's number is the parity of the bitwise AND of the word's number and a mask. All masks have the highest bit, so
-    that the sum of two masks is never a mask. Any three masks are therefore independent.
+    Each bit of a corner's number is the parity of the bitwise AND of the word's number and a mask. All masks have the
+    highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
+    pairs of ends meet in every combination, unless one belongs to a part with ranges that may also be absent.
+    Such a part has 3 or 5 corners, and some combinations may be missing.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -217,7 +218,7 @@ def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
 def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
     if node not in (*network.points, *network.nodes()):
         names = network.points or network.nodes()
-        raise ValueError(f"ranges.masses names {node!r}, which no spring reaches; nodes: {', '.join(names)}")
+        raise ValueError(f"ranges.masses names {node!r}, which no spring or wall reaches; nodes: {', '.join(names)}")
     own = network.masses.get(node, 0.0)
     _require_inside(f"ranges.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
