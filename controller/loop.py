@@ -6,7 +6,7 @@
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
 A `Loop` contains the damping of every device and, if guaranteed, bounds of its motor and transmission. It contains
-nothing about the humans. controller.tick simulates the loop.
+nothing about the humans. controller.tick computes its ticks.
 """
 
 from __future__ import annotations
@@ -276,9 +276,9 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     ) -> Law:
         """Return the law of a tick.
 
-        With `rho` (m,) [N/m] a limiter bounds the sent forces by `limit` (m,) [N]. `balls` are groups of neighbouring
-        channels whose force is limited as a vector. Raises SingularLoop, and ValueError for a coupling that excludes
-        walls.
+        With both `rho` (m,) [N/m] and `limit` (m,) [N] a limiter bounds the sent forces. `balls` are groups of
+        neighbouring channels whose force is limited as a vector. Raises SingularLoop, and ValueError for a coupling
+        that excludes walls.
         """
         walls = self.environment.walls
         sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
@@ -298,7 +298,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.environment.as_network()
 
     def frozen(self) -> tuple[Loop, ...]:
-        """Return the loop for each frozen contact state of its environment."""
+        """Return the loop for every set of walls that are frozen in contact."""
         return tuple(self.at(state) for state in self.environment.frozen())
 
     def at(self, network: Environment) -> Loop:

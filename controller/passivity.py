@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # number of intervals of [0, pi] at the start
-_EVALUATIONS = 1 << 15  # largest number of intervals for up to 8 states, about half a second; fewer for more states
+#: twice the largest number of intervals for up to 8 states, which take about half a second; fewer for more states
+_EVALUATIONS = 1 << 15
 _REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|R|
 _UNIT = 2.0**-53  # largest relative error of one rounding
 _NOISE = 1e-4  # covariance of the noise in every state, relative to that of the noise at the inputs
@@ -145,8 +146,8 @@ def _bounded(
 def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
     """Bound |G(e^jv)| for all complex v with |v - w| <= radius, and the rounding error of G(e^jv) for real v.
 
-    With R0 = R(z0) at z0 = e^jw and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0 satisfies
-    |R| <= |R0|/(1 - d |R0|).
+    With R = (zI - A)^-1, R0 = R(z0) at z0 = e^jw and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0
+    satisfies |R| <= |R0|/(1 - d |R0|).
 
     Args:
         G: A stable block of floats.

@@ -5,7 +5,7 @@
           2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
           3  f = Theta f_e
           4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant by T
-          5  commit the discrete states                    (the plant's state just after kT)
+          5  commit the discrete states z+                 (the plant's state just before (k+1)T)
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 together are one linear state-space block, so that a tick is one matrix product
