@@ -170,8 +170,12 @@ def _parser() -> options.Parser:
     add("--coupling", metavar="NAME|FILE", help=what)
     parser.add_condition("the condition of designs")
     parser.add_limiter()
-    add("--script", metavar="EVENTS", help=f"events with their times [s] (default of a video: '{_SCRIPT}')")
-    until = "length (default: a window until it is closed, a video until after its script)"
+    add(
+        "--script",
+        metavar="EVENTS",
+        help=f"events with their times [s] (default of a video without world and --coupling: '{_SCRIPT}')",
+    )
+    until = "length (default: in a world the scenario's; else a window until closed, a video until after its script)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
     parser.add_json()
     add = parser.add_argument_group("without a display").add_argument
