@@ -12,14 +12,15 @@ a + tau^2/2, so the fit does not mistake this lag for negative damping. The fit 
 integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
 takes milliseconds. A fit needs no initial state.
 
-Dry friction g(x') is c tanh(v/v0), with a part that vanishes at high speed (Stribeck), or a bristle that bends over
-some distance (Dahl). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits almost as well
-as the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term
-holds forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods
-are searched in the residual.
+Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
+vanishes at high speed (Stribeck). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits
+almost as well as the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The
+periodic term holds forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity).
+Their periods are searched in the residual.
 
 For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
-the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit.
+the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit,
+less the share SCALE.
 
 The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
 b is a lower bound at every speed.
@@ -40,21 +41,21 @@ _WINDOW = 0.012  # [s] least standard deviation of h; this h halves amplitudes a
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] rounding noise allowed in accelerations; a coarse encoder gets a longer window
 _SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that friction depends on; sets the shortest window
 _SPACING = 0.4  # distance of two rows, in standard deviations of h: filtered signals have no finer detail
-_NEARBY = 3.5  # standard deviations between a row and the nearest tick at which the balance does not hold
+_NEARBY = 3.5  # least distance from a row to a tick at which the balance does not hold, in standard deviations of h
 _REACH = 6  # standard deviations at which a window is cut off
 _STILL = 0.02  # [s] an axis is at rest if its encoder stays within one count for this long
 #: [m/s] speed at which dry friction reaches 3/4 of its maximum
 _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
-_BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction reverses by position (Dahl 1968)
+_BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction grows from 0 to its limit (Dahl 1968)
 _STRIBECK = 0.02  # [m/s] speed at which the Stribeck part has fallen to 37 %
-_SLOW, _WEAK = 0.2, 0.05  # least share of a force that h must pass; share of the strongest force that needs no check
+_SLOW, _WEAK = 0.2, 0.05  # h must pass this share of a force; a force below this share of the strongest is not checked
 _SLIP = 0.002  # [m/s] slip assumed in `dry_friction` if the best law is a bristle
 _BLOCKS = 10  # parts of the record that are left out in turn
-_HIDDEN = 0.03  # share of the damping hidden by the residual that is subtracted from the bound
-#: error of the encoder's scale, which no recording shows; 20 um of eccentricity over part of a turn of 40 mm give 3e-3
+_HIDDEN = 0.03  # the bound is reduced by this share of the damping that the residual could hide
+#: relative error of the encoder's scale, which no record shows; eccentricity of 20 um in a turn of 40 mm gives 3e-3
 SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
-_FEW = 200  # rows below which a record is too short
+_FEW = 200  # least number of ticks with motion in a record
 _ALMOST = 4.0  # twice the largest log likelihood ratio of the best law to a law that counts in the bound
 _ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
@@ -77,8 +78,8 @@ class Friction:
     drift: float  # [N/s] of the constant force
     static: float  # [N] Stribeck part of dry friction, which vanishes at high speed
     drag: float  # [N s2/m2]
-    slip: float  # [m/s] in the best law of dry friction; 0 where friction reverses by position
-    reach: float  # [m] over which dry friction reverses by position; 0 where it reverses by speed
+    slip: float  # [m/s] v0 of the best law of dry friction; 0 where the best law is a bristle
+    reach: float  # [m] over which dry friction grows from 0 to its maximum; 0 where it depends on speed
     periods: tuple[float, ...]  # [m] periods of the disturbances found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b
@@ -123,7 +124,7 @@ def _moving(x: Array, step: float, T: float) -> NDArray[np.bool_]:
 
 
 def _bristle(x: Array, reach: float) -> Array:
-    """Return friction (N,) within +-1 that displacements x (N,) [m] build up over `reach` [m] before they slip."""
+    """Return the friction (N,) of a bristle, within +-1, for displacements x (N,) [m]; it slips if bent by `reach`."""
     z, out = 0.0, []
     for moved in np.diff(x, prepend=x[0]).tolist():
         z += moved
@@ -134,7 +135,7 @@ def _bristle(x: Array, reach: float) -> Array:
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
-    """Return the ticks at which the window passes enough of the force. Elsewhere, hidden motion changes friction."""
+    """Return the ticks at which h passes enough of the force. Elsewhere, motion that h removes changes friction."""
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
@@ -257,7 +258,7 @@ def _fitted(balance: _Balance, matrix: Callable[[float], Array], periodic: list[
 
 
 def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[float, _Pair]:
-    """Return the gain and the pair that explains most of `residual` (rows,) beside `columns` (rows, p)."""
+    """Return the share of `residual` (rows,) that the best pair explains beside `columns` (rows, p), and this pair."""
     q = np.linalg.qr(columns)[0]
     left, most, strongest = residual - q @ (q.T @ residual), 0.0, pairs[0]
     for pair in pairs:
@@ -272,7 +273,7 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
     """Return the periodic disturbances that explain the residual of the fit, strongest first.
 
     In pure noise, the best of n pairs explains a share of 2 log(n) / `independent`. A pair counts if its gain of log
-    likelihood is larger by _CHANCE.
+    likelihood exceeds that of this best pair by _CHANCE.
     """
     pairs: list[_Pair] = []
     grid = balance.waves(_PERIODS[np.ptp(balance.x) > _PERIODS])
@@ -304,7 +305,7 @@ def _apart(columns: Array, i: int) -> Array:
 
 
 def dry_friction(x: Array, T: float, found: Friction) -> Array:
-    """Return dry friction [N] of displacements x (N,) [m] by the law that fits best, without its Stribeck part."""
+    """Return dry friction [N] for displacements x (N,) [m], without its Stribeck part; a bristle counts as _SLIP."""
     return found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
 
 

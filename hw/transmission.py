@@ -24,9 +24,10 @@ from haptic_loop.hw.viscosity import Spectra, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N moves less than a count of 5 um
 _TOLD = 0.01  # allowed model error as a share of the motion, in addition to the encoder's noise
-_UNEXPLAINED = 2.5  # largest rms error relative to both; play and presliding friction: 3 to 6, dry friction: up to 2.1
+#: largest rms error over the allowed one; with play or presliding friction it is 3 to 6, with dry friction up to 2.1
+_UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
-_SIGMAS, _SCALE = 2.0, 0.005  # by which bounds are moved: standard errors, and a relative error of the encoder
+_SIGMAS, _SCALE = 2.0, 0.005  # bounds are moved by so many standard errors, and by this relative error of the encoder
 _WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
 _STEPS = 60  # most evaluations in a fit
 _LATE = 0.05  # [T] largest delay of a force: no proof covers a slower current loop
@@ -91,8 +92,8 @@ def transmission_bounds(
     radius `lever` [m], radians and N m are converted to metres and N at the hand.
 
     Raises:
-        ValueError: Two masses with a spring and a damper in parallel do not explain the records, or a bound is too
-            uncertain.
+        ValueError: Two masses with a spring and a damper in parallel do not explain the records, the clamped mode is
+            too near an end of the band, forces are too late, or a bound is not above 0.
     """
     records, friction = [], at_radius(friction, 1 / lever)
     for (x, force), held in ((free, False), *((record, True) for record in clamped)):

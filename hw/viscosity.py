@@ -9,11 +9,12 @@ motor is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n =
 constant force, k a spring's stiffness and l the lag of an amplifier. For viscous and dry friction q = 0 at every
 amplitude. Where friction thins, q < 0, and the damping at the speed v is b + q v.
 
-Frequency: a model is fitted to the motion under the force less dry friction. It has a transmission, an amplifier's lag
-and, for each of several tau, a Maxwell element (c, tau) beside b. The element's damping c/(1 + (w tau)^2) acts in the
-record's slow strokes and vanishes at high frequency, where only b is left. A certificate uses the damping at every
-frequency, so only b counts. The bound is the least lower confidence limit of b over all tau. A memory that the record
-cannot exclude, for example because of a coarse encoder, therefore lowers the bound.
+Frequency: a model is fitted to the motion under the motor's force, less dry friction, drag, spring and drift. It has a
+transmission, an amplifier's lag and, for each of several tau, a Maxwell element (c, tau) beside b. The element's
+damping c/(1 + (w tau)^2) acts in the record's slow strokes and vanishes at high frequency, where only b is left. A
+certificate uses the damping at every frequency, so only b counts. The bound is the least lower confidence limit of b
+over all tau. A memory that the record cannot exclude, for example because of a coarse encoder, therefore lowers the
+bound.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 _FAST = 0.25  # a stroke counts if it reaches this share of the highest speed: dry friction is saturated
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
-#: [s] time constants of a memory; a shorter one counts as damping: an encoder of 5 um at 0.25 kg cannot exclude 1 ms
+#: [s] time constants of a memory; a shorter one counts as damping: an encoder of 5 um at 0.25 kg does not show 1 ms
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
-_BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um does not resolve the motion by 1 N
+_BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, 1 N causes less motion than an encoder of 5 um resolves
 _LOUD = 0.05  # least force at a frequency, as a share of the strongest in the band
 _POINTS = 200  # frequencies of a first, rough fit
 _ALIASES = (-1, 0, 1)  # sampling adds frequencies at multiples of 1/T; further ones add less than 1e-3
@@ -190,10 +191,10 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
     """Return the smallest lower bound of b [N s/m] over all tau, the tau [s] that gives it, and whether memory shows.
 
-    `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. A small
+    `force` is that of the motor less `nonviscous`. The model without memory is fitted to all frequencies. A small
     Maxwell element changes the motion little beside the mass, so its effect is linear in c, and each tau takes one
     linear fit. But the lag and the transmission of the model without memory may imitate a large element. So all
-    parameters are also fitted from a start with most of the damping in the element. Such a fit counts if it explains
+    parameters are also fitted from starts with most of the damping in the element. Such a fit counts if it explains
     the record about as well as the model without memory.
     """
     import scipy
