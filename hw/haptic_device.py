@@ -1,8 +1,8 @@
 """The four calls to a device that a session needs. `Driver` in hw/driver.py makes them.
 
-There are two implementations: a device at a serial port (docs/protocol.md), and a device that the host clocks
-(hw/force_dimension.py). Calls wait for at most 0.5 ms or a tick, because keys, signals and time-outs are handled
-between two calls.
+There are three implementations: a device at a serial port (docs/protocol.md), several of them (hw/boards.py), and
+devices that the host clocks (hw/force_dimension.py). Calls wait for at most 0.5 ms or a tick, because keys, signals and
+time-outs are handled between two calls.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Protocol
 from haptic_loop.hw import protocol as wire
 
 _RESEND = 0.1  # [s] time after which an unanswered question is sent again
-_STOPPING = 0.05  # [s] longest time from STOP until the device is at rest
+_STOPPING = 0.05  # [s] longest time after the first CONFIG for which the device may drive
 _LONGEST_WAIT = 5e-4  # [s] longest wait of one call
 
 
@@ -48,7 +48,7 @@ class HapticDevice(Protocol):
 
 
 class _BytePort(Protocol):
-    """A port for bytes. Every method raises PortLost where the port is gone."""
+    """A port for bytes. Where the port is gone, `read` raises PortLost; `write` and `discard` may."""
 
     def wait(self, seconds: float) -> bool:
         """Wait for bytes for at most `seconds`, and return whether there are any."""
@@ -86,7 +86,7 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send CONFIG, again while the device ramps to zero. Raises SafetyStop if it drives without a command."""
+        """Send CONFIG, and repeat it while the device ramps. Raises SafetyStop if it drives for more than 50 ms."""
         answer = self._answer(config)
         if (
             not isinstance(answer, wire.Ack)

@@ -2,8 +2,9 @@
 
 The excitation is a chirp of a small force, slow motions, a swing that reaches the speed of a session, a chirp of the
 swing's force, and silence (see `chirp`). It does not depend on the motion, so it closes no loop and needs no
-certificate. Mass and friction come from the balance of forces (hw/friction.py); friction must be viscous
-(hw/viscosity.py). The transmission is fitted to the spectra of the motion and of the force less dry friction.
+certificate. Mass and friction come from the balance of forces (hw/friction.py). Damping that falls with speed or
+frequency is refused (hw/viscosity.py). The transmission is fitted to the spectra of the motion and of the force less
+dry friction.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
 
     Radians and N m of an axis that a hand holds at the radius `lever` [m] are fitted as metres and N at the hand.
 
-    Raises ValueError where the device did not move, a hand holds it, nothing is left of its damping, or its damping
+    Raises ValueError where the device did not move, a hand holds it, the bound of its damping is 0, or its damping
     falls with speed or frequency.
     """
     if np.ptp(x) < 20 * step:
@@ -230,10 +231,10 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
 
 
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
-    """Return warnings for axes with far more damping than INFO and the scenario declare.
+    """Return warnings for axes with over 10 % more damping than INFO and the scenario declare.
 
-    Estimates of a correct device scatter about the declared value, and one bound in twenty lies above it. This scatter
-    gives no warning.
+    A smaller excess gives no warning: estimates of a correct device scatter about the declared value, and one bound in
+    twenty lies above it.
     """
     causes = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
@@ -249,8 +250,8 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
     """Return one estimate per axis from two or more recordings, and warnings if a hand damped only some of them.
 
     Each axis gets the estimate of its least damped recording, and the least bound of all recordings. A passive hand
-    adds damping to a device and takes none away (docs/hardware.md), so one recording without a hand is enough. Raises
-    ValueError where no other recording agrees with the least damped one, because a hand may have damped that one, too.
+    only adds damping (docs/hardware.md), so no hand damped the least damped recording, unless a hand damped them all.
+    Raises ValueError for one recording, or where no other recording agrees with the least damped one.
     """
     if len(sittings) < 2:
         raise ValueError("one sitting cannot tell a hand's damping from the device's: take two (--sittings)")

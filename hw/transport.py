@@ -1,4 +1,4 @@
-"""Run a session in real time over a serial port (pyserial), in one thread that waits only for the port.
+"""Run a session in real time, in one thread that waits only for the device, and open serial ports (pyserial).
 
 A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So gc.freeze() excludes the loaded objects, and the
 collector is off during the session.
@@ -45,7 +45,7 @@ class SerialPort:
             self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise InputError(f"--port {path}: {error}") from None
-        with suppress(Exception):  # if the driver has it; on FTDI chips it lowers the latency timer from 16 ms to 1 ms
+        with suppress(Exception):  # some drivers lack it; on FTDI chips it sets the latency timer from 16 to 1 ms
             self._serial.set_low_latency_mode(True)
 
         self._fd = self._serial.fileno()
@@ -210,7 +210,7 @@ class Live(Driver):
             self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
-        """Return the designed couplings, or raise SafetyStop if SIGINT came; keys are handled before arming."""
+        """Return the designed couplings, and act on keys typed meanwhile. Raises SafetyStop if SIGINT came."""
         self._watch(self.session)  # call it now, because the design takes a while
         try:
             with _interruptible():
