@@ -35,7 +35,7 @@ _CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of th
 _REMEMBERED = 64  # most forces or latches that are stored; at most the last theta still matter
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
 _PATIENCE = 5  # wrong ticks in a row at which a session stops
-_CHANGE = 1.0  # [N] change of force that moves any handle that is not at a stop
+_CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle that is not at a stop
 _IMPULSE = 0.1  # [N s] largest time integral of such changes without a motion: 1 N for 100 ms, 5 N for 20 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
@@ -44,12 +44,12 @@ _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
 _FIT = 0.8  # least share of power with the expected shape: loosely moved handles have 0.93, held handles at most 0.5
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short one, but no certificate covers a whole tick
-_CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a table may transmit less
+_CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
 _STRONG = 2  # first block of the test at the end of a session
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
-_PRESSING, _PRESSED = 0.3, 0.5  # force [N], and the longest time [s] for which an encoder may stand still under it
+_PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
 _FORGETTING = 8  # right ticks that cancel one wrong tick; wrong ticks that come more often stop a session, too
 
 
@@ -259,8 +259,8 @@ class Counters:
     gaps: int = 0  # ticks without a STATE
     duplicates: int = 0  # STATEs of the same tick as the last one
     stale: int = 0  # STATEs of an older tick than the last one: late or reordered
-    unexpected: int = 0  # messages of a type that no session expects
-    late: int = 0  # answers that reached the device after their latch
+    unexpected: int = 0  # STATEs with a wrong number of axes
+    late: int = 0  # answers after their latch, or with theta = 0 after the certified latency
     misses: int = 0  # ticks without an answer in time, by the device's count
     device_errors: int = 0  # frames that the device rejected
     host_errors: int = 0  # frames of the device that could not be read
@@ -344,7 +344,7 @@ class LinkMonitor:
             raise SafetyStop(f"no STATE in {part}: the device's forces are unknown")
         if self._untold / window > _UNTOLD:
             raise SafetyStop(
-                f"{100 * _UNTOLD:g} % of the last {window} STATEs had no margin: the lateness of answers is unknown"
+                f"{100 * _UNTOLD:g} % or more of the last {window} STATEs had no margin: their lateness is unknown"
             )
         if late > self.settings.late:
             return f"{100 * late:.0f} % of the last {window} answers were late"
@@ -372,11 +372,11 @@ class _ClockDrift:
     whose: str
     T_us: float
     tolerance: float  # largest drift, as a part of a block
-    forgiven_us: float  # [us] greatest length up to which a block excludes its longest delay
+    forgiven_us: float  # [us] most that a block excludes of its longest delay
     _last: int | None = None
     _ticks: int = 0
     _behind: float = 0.0  # [us] time of the clock minus ticks * T
-    _freeze: float = 0.0  # [us] longest delay of a single call in the block
+    _freeze: float = 0.0  # [us] longest delay of one reading in the block, at most forgiven_us
 
     def note(self, at_us: int, ticks: int) -> None:
         """Process a reading of the clock (modulo 2^32), `ticks` after the last. Raises SafetyStop if it drifts."""
@@ -423,7 +423,7 @@ class CommandMonitor:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._forces: dict[int, tuple[int, ...]] = {}  # [steps] forces by the tick of their latch
+        self._forces: dict[int, tuple[int, ...]] = {}  # [steps] forces by the tick of the STATE that shows them
         self._last: State | None = None
         self._ready = False  # whether the last STATE was not DISARMED
         self._run = (0, 0)  # least and largest possible number of forces latched since arming

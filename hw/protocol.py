@@ -263,7 +263,7 @@ _READ = {(_LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.item
 
 _OVERHEAD = 6  # CRC-32, the COBS byte, the delimiter
 _MAX_WIRE = max(f.struct.size for f in _FORMS.values()) + _OVERHEAD
-_RESIDUE = crc32(bytes(4) + crc32(bytes(4)).to_bytes(4, "little"))  # CRC-32 over anything followed by its own CRC-32
+_RESIDUE = crc32(bytes(4) + crc32(bytes(4)).to_bytes(4, "little"))  # CRC-32 of any bytes followed by their CRC-32
 _STATUSES = frozenset(phase | cause << 4 | held for phase in Phase for cause in Cause for held in (0, DEADMAN))
 _CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent, so every field is checked; struct checks State and Force
 
@@ -364,7 +364,7 @@ class Decoder:
 
     def __init__(self) -> None:
         self.crc_errors = 0
-        self.malformed = 0  # frames with inconsistent COBS codes, or of a type and length that no message has
+        self.malformed = 0  # frames with inconsistent COBS codes, or a type, length, status or text of no message
         self.oversize = 0  # frames that are longer than any message's
         self.tail = b""  # bytes of a frame without its end yet, at most _MAX_WIRE
         self.skipping = False  # inside an oversize frame that is already counted

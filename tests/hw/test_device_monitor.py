@@ -187,7 +187,7 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
         silent += 1
     assert silent == 181
     assert session.stage == Stage.STOPPED
-    assert session.cause == "90 % of the last 200 STATEs had no margin: the lateness of answers is unknown"
+    assert session.cause == "90 % or more of the last 200 STATEs had no margin: their lateness is unknown"
 
 
 def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
