@@ -61,7 +61,7 @@ class Recorder:
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
-        """Return the ticks [first, stop) of each arming with a linear loop: full gain, before a cap or slew rate acts.
+        """Return the ticks [first, stop) of each arming with a linear loop: full gain, before cap, slew or budget act.
 
         Missed ticks are included. `force_step` is (m,) [N].
         """

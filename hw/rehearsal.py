@@ -47,7 +47,7 @@ Plan = Callable[[Ages], Sequence[Armable]]
 
 
 class _Moment(NamedTuple):
-    """One tick of the device."""
+    """One tick of a device."""
 
     t_us: int
     phase: Phase
@@ -138,7 +138,7 @@ class Rehearsal:
     operator: Operator | None = None  # decides in place of `arm`, as in a live session
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # length of the device's tick as a multiple of T
-    keep: bool = True  # whether to record every tick of the device in `moments`
+    keep: bool = True  # whether to record every tick of every device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
     further: Sequence[_Further] = ()
     moments: list[_Moment] = field(default_factory=list)
@@ -170,7 +170,7 @@ class Rehearsal:
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
 
     def run_to_the_end(self, most: float) -> Session:
-        """Run until the session has ended and its device rests, or for `most` seconds of virtual time."""
+        """Run until shortly after the end of the session, or for `most` seconds of virtual time."""
         while not self._over and self.now <= 1e6 * most:
             self._turn()
         return self.session
@@ -280,12 +280,13 @@ class Rehearsed:
     Attributes:
         stage: "finished" where all went well, otherwise "refused", "stopped", "lost" or "e-stop".
         cause: Why the session ended.
-        delay: The median time from a sample to its force [s]; None where it was not measured.
+        delay: The median time from a sample to the arrival of its force [s]; None where it was not measured.
         theta: (m,) delays for which the coupling is certified [samples]; None where there is none.
         latency: Least and most time by which forces latch after their tick [s]; None where they latch at ticks.
         coupling: The first coupling certified for the measured delay; None where there is none.
         assessment: The assessment of that coupling in the loop with the measured delay.
-        result: A Trace with t, x and f of every tick, without handles, which are not measured; None without ticks.
+        result: A Trace with t, x and f of every tick from arming on; handles are not measured. None if the session was
+            never armed.
         zero_after: The time from the request to stop until all motors stay at zero [s], including the last test of
             the motors; None where forces never acted, or do not stop.
     """
@@ -316,7 +317,7 @@ def rehearse(
     """Rehearse a session with the scenario's devices behind the real protocol, without device, port or waiting.
 
     The session connects, measures the delay, designs a coupling for it (or takes `coupling`), certifies the coupling,
-    arms, runs for `seconds`, and ramps out. Delays are at least the scenario's theta, or longer for a slow link. With
+    arms, runs for `seconds`, and ramps out. Delays are the scenario's theta, or longer for a slow link. With
     `latch_on_arrival`, the device applies a force as soon as it comes. The loop then has the measured `latency` in
     addition to the scenario's theta, which may be 0. If no coupling is certified for the delay, the session is refused.
     A refusal is a result, not an error: see `stage` and `cause`.

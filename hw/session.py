@@ -74,7 +74,7 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """The factor, from 0 to 1, that multiplies every force; 0 while the session does not drive."""
+        """The factor, from 0 to 1, of the controller's forces; 0 while the session does not drive."""
         return self.drive.gain.value if self.drive else 0.0
 
     @property
