@@ -140,8 +140,8 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     friction_max: float | None = None  # [N] a published upper bound, neither simulated nor used by a proof
     delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
-    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted. Assumed: three times 0.7 m/s.
-    # In a study (abstract) teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
+    credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
+    # According to a study's abstract, teleoperation masters exceeded 0.7 m/s in a fifth of a tapping task's fast part.
     guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
@@ -289,7 +289,7 @@ def _check_axes(self: Any) -> None:
 
 
 def _check_damping(self: Any) -> None:
-    """Raise ValueError unless 0 <= damping and 0 < delta <= damping, as matrices if there are several axes."""
+    """Raise ValueError unless 0 < delta <= damping, as matrices for several axes; one axis may have no damping."""
     if self.axes == 1:
         for name in ("damping", "delta"):
             if isinstance(getattr(self, name), tuple):

@@ -26,9 +26,9 @@ class HeldPlant:
     A and B with a leading axis hold many plants.
     """
 
-    A: _Array  # (..., 2n, 2n)
-    B: _Array  # (..., 2n, outside + m)
-    C: _Array  # (m, 2n)
+    A: _Array  # (..., states, states)
+    B: _Array  # (..., states, outside + m)
+    C: _Array  # (m, states)
     T: float  # [s]
 
 
@@ -63,7 +63,7 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return rows (..., m, entries) from a tick's [s; held forces; w; f] to each position when its force latches."""
+    """Return rows (..., m, entries) that map [s; held forces; w; f] to each position at the latch of its force."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -80,9 +80,8 @@ def exponential_step(J: _Array, h: float, n: int, felt: _Array | None = None) ->
     """Return the matrix (nsim, states, states + n) that maps [s; a] to s + h phi1(h J) s', for a step of h seconds.
 
     J (nsim, states, states) is the Jacobian of s' = [v; a; 0] + felt s with the state s = [q; v; states of impedances]
-    of n joints. The accelerations a (n,) [m/s^2] are those of the bodies, and `felt` (nsim, states, states) is the
-    contribution of the impedances.
-    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
+    of n joints. The accelerations a (n,) [m/s^2] are those without impedances, and `felt` (nsim, states, states) is
+    the contribution of the impedances. phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
     """
     nsim, states, _ = J.shape
     unit = np.tile(_units(J, h), 2)

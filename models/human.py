@@ -270,7 +270,7 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
             raise ValueError("impedance: A has a double eigenvalue at zero, expected one spring at most")
         left = left / (left @ null)
         stiffness = float((C @ null).item() * (left @ B).item())
-        # A maps the states orthogonal to `left` to each other, there without the eigenvalue at zero.
+        # A maps the space orthogonal to `left` into itself, and has no eigenvalue at zero there.
         rest = np.linalg.svd(left[None])[2][1:].T
         B = B - np.outer(null, left @ B)
         A, B, C = rest.T @ A @ rest, rest.T @ B, C @ rest
@@ -495,14 +495,14 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
 
 
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
-    """Raise ValueError where a person holds a channel that does not exist or that another person holds."""
+    """Raise ValueError where a person holds a device that does not exist or that another person holds."""
     held: set[int] = set()
     for i, holds in enumerate(held_by, start=1):
         for channel in holds:
             if channel > channels:
-                raise ValueError(f"person #{i}.holds has channel {channel}, allowed are 1 to {channels}")
+                raise ValueError(f"person #{i}.holds has device {channel}, allowed are 1 to {channels}")
             if channel in held:
-                raise ValueError(f"person #{i}.holds has channel {channel}, which another person holds already")
+                raise ValueError(f"person #{i}.holds has device {channel}, which another person holds already")
         held.update(holds)
 
 

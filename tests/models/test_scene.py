@@ -217,10 +217,10 @@ def test_voluntary_velocity_is_the_motions_derivative():
         (lambda: Person((1, 2), 0.0, 0.0, 0.0), "mass is 0, allowed are 1e-06 to 1000 kg"),
         (lambda: Person((1, 2), 1.0, -1.0, 0.0), "damping is -1"),
         (lambda: Cross(stiffness=-1.0), "stiffness is -1"),
-        (lambda: build([RigidDevice()], [HAND], [TWO_HANDS]), r"person #1.holds has channel 2, allowed are 1 to 1"),
+        (lambda: build([RigidDevice()], [HAND], [TWO_HANDS]), r"person #1.holds has device 2, allowed are 1 to 1"),
         (
             lambda: build([RigidDevice()] * 2, [HAND] * 2, [TWO_HANDS] * 2),
-            "channel 1, which another person holds already",
+            "device 1, which another person holds already",
         ),
         (lambda: build([RigidDevice()], []), "1 devices and 0 humans"),
     ],
