@@ -46,8 +46,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices.
 # Gravity, contacts and constraints are off, except for the Coulomb friction of devices. The inputs are MuJoCo
-# actuators: first the external forces (voluntary motion and taps), then one motor per device with gear -1, because the
-# device feels -f.
+# actuators: first the external forces (voluntary motion and taps), then one motor per channel with gear -1, because
+# the device feels -f.
 #
 # A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper between one point and ground
 # becomes a property of the joint; every other spring-damper becomes a fixed tendon. An impedance (A, B, C, D) has no
@@ -155,7 +155,7 @@ def plant(model: mujoco.MjModel) -> Plant:
 
 
 class _Felt(NamedTuple):
-    """An impedance between joints: its input is `row` times the joint velocities, and its force acts along `row`."""
+    """An impedance between joints: its input is `row` times the joint velocities, and its force acts along -`row`."""
 
     row: _Array  # (n,)
     Z: Impedance
@@ -205,7 +205,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     """Return the port of a hand written in MJCF: bodies that slide along x, with springs and dampers between them.
 
     The body `handle` is the part of the hand that moves with the handle, and the world is the base. The voluntary force
-    contracts the joint or tendon named `pull`, by default the last spring-damper. Gravity and shapes are ignored.
+    contracts the joint or tendon named `pull`, by default the last spring-damper. Gravity and collisions are ignored.
 
     Raises:
         ValueError: The model is not a network of masses, springs and dampers along x.
@@ -693,13 +693,13 @@ def _link(row: _Array, axes: int) -> Link:
     return Link(float(row[0]), tuple(map(tuple, damping)), tuple(map(tuple, stiffness)))
 
 
-MIXED = 0  # value of `links`: each human has one link or two, with equal probability
+MIXED = 0  # value of `links`: the humans of a set all have one link or all two, with equal probability
 
 
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
     """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
-    The links depend on (seed, index) and the population only. With `links` = MIXED the humans have 1 or 2 links each.
+    The links depend on (seed, index) and the population only. With `links` = MIXED the humans all have one, or all two.
     With `axes` a link has random amounts of damping and stiffness along `directions`. Their weights w make the sum of
     w d d' over all directions d the identity. So the damping and the stiffness in any direction lie within the
     population's ranges.
@@ -770,7 +770,7 @@ def _draw_bodies(population: Population, persons: int, seed: int, index: int) ->
 class HumanSets:
     """Sets of any humans, one per device, that differ in their parameters only. All sets have the same persons."""
 
-    sets: tuple[tuple[Hand, ...], ...]  # (nsim, m)
+    sets: tuple[tuple[Hand, ...], ...]  # (nsim, devices)
     people: tuple[Person, ...] = ()
     mechanics: _Drawn = ()  # (nsim, devices) as in Crowd
 
@@ -822,7 +822,7 @@ class Variants:
         return Variants(self.scene, {name: rows[sets] for name, rows in self.fields.items()}, felt)
 
     def plants(self) -> Plant:
-        """Return the plants of all models, with A (nsim, 2n, 2n) and B (nsim, 2n, inputs)."""
+        """Return the plants of all models, with A (nsim, states, states) and B (nsim, states, inputs)."""
         model = self.scene.model
         across, mass = _tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
 

@@ -1,8 +1,8 @@
 """MuJoCo scenes as environments: devices touch bodies of a scene, and scene and coupling are solved in one step.
 
 A device touches a contact: a body of the scene that is a child of the world body and has no joint. A coupling with
-the direct part D_V responds within the tick, u = u0 - D_V f, where u0 is the contact's position without force. For the
-scene, device, delays and coupling are therefore one spring G = D_V^-1 from the contact to the point u0. The program
+the direct part D_V responds within the tick, u = u0 - D_V f, where u0 is the contact's position without force. Device,
+delays and coupling therefore act on the scene like one spring G = D_V^-1 from the contact to the point u0. The program
 adds this spring and slides along the contact's directions. MuJoCo's `discrete` integrator then solves in each step
 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
@@ -437,7 +437,7 @@ def _force_settings(spec: Any, h: float, gravity: bool) -> None:
 
 
 def _off_rest(model: mujoco.MjModel) -> None:
-    """Lengthen tendon springs by 1e-12, because MuJoCo ignores the stiffness of a spring that is exactly at rest."""
+    """Lengthen tendon springs by 1e-12 of their length: MuJoCo ignores the stiffness of a spring exactly at rest."""
     if not model.ntendon:
         return
     exact = (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(axis=1)
@@ -486,13 +486,13 @@ class WorldPort:
         any_limit = bool((force_limit < np.inf).any())
         self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if any_limit else None
         self.ticks = 0
-        self.created = 0.0  # [J] upper bound on the energy that contacts have created so far
-        self.unsettled = 0  # ticks in which the limited channels still changed after _MOST_REPETITIONS
+        self.created = 0.0  # [J] upper bound on the energy that contacts and other constraints have created so far
+        self.unsettled = 0  # steps of the scene in which limited forces still changed after _MOST_REPETITIONS
         self._at_first = self._potential()
         self.released = 0.0  # [J] largest energy that gravity and the scene's springs have released so far
 
     def step(self, u0: Array) -> Array:
-        """Step the scene; return the forces (m,) [N] of contacts whose positions without force are u0 (m,) [m].
+        """Advance by one tick; return the forces (m,) [N] of contacts whose positions without force are u0 (m,) [m].
 
         Forces are within the limits, but not finite if MuJoCo's state is not finite. Raises ValueError if MuJoCo
         cannot step.
@@ -598,7 +598,7 @@ class WorldPort:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return an upper bound [J] on the energy that contacts created in the last step: their positive excesses."""
+        """Return an upper bound [J] on the energy that constraints created in the last step: positive excesses."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 
