@@ -111,7 +111,7 @@ class _Reference:
 
 
 def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
-    """Run the exact engine on both loops."""
+    """Run the exact engine on the coupled loop, and on the uncoupled one if that is unstable."""
     cycle = None
     if unstable(exact_growth(uncoupled)):
         free = run(uncoupled, "exact")
@@ -284,11 +284,11 @@ def _not_credible(credible: Credible, until: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ForceError:
-    """Forces of the coupled loop and of the ideal environment for the same displacements, before any force limit."""
+    """Forces of the coupled loop and of the ideal environment for the same displacements (`force_error`)."""
 
-    asked: Array = off_table("left out")  # (N, m) forces of the coupled loop, F x [N]
+    asked: Array = off_table("left out")  # (N, m) forces of the coupled loop [N]
     ideal: Array = off_table("left out")  # (N, m) forces of the delay-matched environment, Lambda E x [N]
-    error_percent: float | None = off_table()  # rms(asked - ideal)/rms(ideal), over all ticks and channels
+    error_percent: float | None = off_table()  # 100 rms(asked - ideal)/rms(ideal), over all ticks and channels
     asked_rms_n: float | None = off_table()
     ideal_rms_n: float | None = off_table()
     reason: str | None = off_table("if given")  # reason why there is no comparison
@@ -354,7 +354,7 @@ _FEW = 4.0  # error bound if the differences do not converge, in units of the la
 
 @dataclass(frozen=True)
 class EngineChoice:
-    """One setting of MuJoCo's engines on a scene."""
+    """Cost and error of one setting of MuJoCo's integrators on a scene."""
 
     integrator: str
     substeps: int

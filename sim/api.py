@@ -49,8 +49,8 @@ _SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 class ScenarioRun:
     """The run of a scenario, with its settings."""
 
-    simulation: Simulation  # the loop without a net
-    ran: Simulation  # the loop with its net, as it ran
+    simulation: Simulation  # the loop without a net (passivity layer)
+    ran: Simulation  # the loop with its net, if it has one, as it ran
     period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # with defaults filled in
@@ -142,9 +142,9 @@ def simulate(
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
         f (N, m) [N] (the devices feel -f), and `meta`. `meta["stability"]` has the growth rates [1/s] of the trace and
-        of the exact loop, the verdict, and the ticks at the force limit (None under varying delays).
-        `meta["assessment"]` states the guarantee of this run, or why there is none, and `meta["energy_budget"]` how
-        often forces were limited.
+        of the exact loop, the verdict, and the ticks at the force limit (None under varying delays, with `environment`
+        and in a MuJoCo scene). `meta["assessment"]` states the guarantee of this run, or why there is none, and
+        `meta["energy_budget"]` how often forces were limited.
 
     Raises:
         ValueError: An engine, integrator or number of substeps is impossible (InputError if the scenario is at fault).
