@@ -44,7 +44,7 @@ def choose(
 
     Args:
         scenario: The scenario whose loop the coupling is for.
-        case: The reference delays, "none", "I" or "II".
+        case: The reference delays, "I" or "II"; "none" for the loop without a coupling.
         name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
         condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
         limiter: True to require that limited forces are covered, False to ignore them; None to cover them if possible.

@@ -150,8 +150,8 @@ class Findings:
         audited: (n,) sum of the magnitudes of the terms of W [J].
         settling: (n,) ratio of the handles' rms speeds in the last and the second quarter of the exact trace.
         contacts: (n,) number of times that a wall was touched on the exact trace.
-        mass: (n,) geometric mean over channels of a hand's total mass [kg].
-        damping: (n,) geometric mean over channels of a hand's least damping [N s/m].
+        mass: (n,) geometric mean over devices of a hand's total mass [kg].
+        damping: (n,) geometric mean over devices of a hand's least damping [N s/m].
         switching: (n,) growth rate [1/s] of the linear loop under varying delays or ticks; nan for constant ones.
         switching_mujoco: (n,) growth rate [1/s] of MuJoCo's trace for `switching`; nan also if the trace was clipped.
         simulated: The duration of all traces together [s].
@@ -221,7 +221,7 @@ def _examine(
 ) -> Findings:
     """Judge and simulate the humans of `indices`, who all meet the same environment.
 
-    `ticked` is called with the number of ticks that were simulated for all these humans.
+    `ticked` is called after each block of ticks that the other engine simulates, with their number.
     """
     simulation = validation.simulation
     if member := validation.environment(indices[0]):
@@ -319,7 +319,7 @@ def _batch(
 
 
 def _geometric_mean(values: Array) -> Array:
-    """Return the geometric mean over the channels, (n, channels) -> (n,); 0 where a channel is 0."""
+    """Return the geometric mean over the devices, (n, devices) -> (n,); 0 where a device has 0."""
     with np.errstate(divide="ignore"):
         return np.exp(np.log(values).mean(axis=1))
 
@@ -350,7 +350,7 @@ def _traced(
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
 ) -> ImpulseTest:
-    """Return the exact engine's impulse test; growth and clipped ticks of `witnesses` are those of the other engine.
+    """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are the other's.
 
     Periods are even, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
     """
