@@ -42,9 +42,9 @@ class DesignOptions(TypedDict, total=False):
     order: int  # ccl: states per channel
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
-    limiter: bool  # spring-damper and optimal for this-environment: cover limited forces, too (the default)
+    limiter: bool  # cover limited forces in this-environment; by default a spring-damper tries, optimal does not
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
-    band_hz: tuple[float, float]  # optimal, spring-damper for this environment: band of the mismatch
+    band_hz: tuple[float, float]  # optimal, spring-damper for this-environment: band of the mismatch
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: a soft penalty instead
     seconds: float  # optimal: time after which no larger basis is tried
 
@@ -133,10 +133,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     that of the design, is also judged. With loop.varying_delay there is a further entry "switching", for delays that
     switch in any way within that range.
 
-    With ranges around the loop's environment, "this-environment" covers the environment and every vertex of the ranges.
-    Between the vertices there is no proof, only a search (design.worst_member). If every vertex is proved and the
-    search finds no violation, the requirement is the largest of the vertices. Otherwise it is the largest of vertices
-    and search, and it is not proved.
+    With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
+    vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
+    every vertex is proved and the search finds no violation, the requirement is the largest of the vertices. Otherwise
+    it is the largest of vertices and search, and it is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -146,7 +146,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     Raises:
         TypeError: An argument has the wrong type.
         ValueError: Coupling and loop have different numbers of channels.
-        SingularLoop: The algebraic loop of environment and coupling has no solution.
+        SingularLoop: A coupling of your own class makes an algebraic loop without solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
     own = coupling.own if isinstance(coupling, Design) else None

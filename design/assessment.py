@@ -65,14 +65,14 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-PluggedEnvironment = Callable[[Array], Array]  # positions of the port without a force, (m,) [m] -> force (m,) [N]
+PluggedEnvironment = Callable[[Array], Array]  # port positions (m,) [m] for zero force -> force (m,) [N]
 
 
 # ----------------------------------------------------------------------------------------------------
 # The environments of ranges.
 
 
-_SAMPLES = 64  # default number of environments that are drawn evenly from inside the ranges
+_SAMPLES = 64  # default number of environments that are drawn at random from inside the ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class RangesResult:
 
     @property
     def proved(self) -> bool:
-        """Whether every member is proved in exact arithmetic, and the search has found no violation between them."""
+        """Whether every member is proved in exact arithmetic, and neither search nor samples violate the condition."""
         return self.certificate is not None and self.worst_found[1].certified
 
     @property
@@ -255,7 +255,7 @@ class ForceLimits:
         rho: (m,) stiffnesses of the limiter [N/m]; None if no condition covers a limiter, so that forces are clipped.
         reason: Why a condition covers limited forces, or why none does.
         requirement: The requirement of the condition `limiter`, if it was evaluated.
-        c: The multiplier of the condition `limiter`, one row per channel, no unit.
+        c: The multiplier of the condition `limiter`, one row per device, no unit.
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
         less: Whether the limiter is proved in one environment only, while the guarantee covers more.
@@ -297,7 +297,7 @@ class ForceLimits:
 
     @property
     def proved(self) -> bool:
-        """Whether limited forces are covered by exact arithmetic."""
+        """Whether the limiter needs no proof of its own, or has one in exact arithmetic."""
         return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
 
     def part(self) -> dict[str, Any]:
@@ -439,7 +439,7 @@ class Assessment:
         environment: The environment that runs: a network, or a plugged-in function.
         ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
-        transparency: The mismatch; None if the environment has no E(z) or the loop has no solution.
+        transparency: The mismatch; None if it cannot be computed, for example without an E(z).
         certificate: The exact proof, if one was given or made for the ranges.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
@@ -544,7 +544,7 @@ def assess(
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or
             known-device if the loop has bounds of its devices.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
-        ranges_samples: Number of these environments.
+        ranges_samples: Number of environments that are drawn.
         searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
@@ -629,7 +629,7 @@ def _force_limits(
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:
-    """Return the mismatch, with all walls touching, or None if the environment has no E(z)."""
+    """Return the mismatch, with all walls touching, or None if it cannot be computed."""
     try:
         F, E = loop.F(coupling), loop.E()
     except ValueError:  # A rigid wall has no E(z), and a singular loop has no F.
@@ -726,7 +726,10 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """Return the shell's guarantee, which needs a coupling certified for any environment with psi = 0."""
+    """Return (the shell's guarantee or None, the reason why there is none).
+
+    The shell needs a coupling that is certified for any environment, and psi = 0.
+    """
     loop, needs = assessment.loop, assessment.requirements[ANY_ENVIRONMENT.name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"

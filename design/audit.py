@@ -86,8 +86,8 @@ def check_loop(loop: Loop) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Margins: the stiffest K, and the errors of the loop's data that the certificate tolerates.
 #
-# The loop is varied and the conditions are evaluated again, without a solver. A search varies one value in steps and
-# bisects the first step that meets the edge, so it can miss a gap narrower than a step. The result is certified.
+# The loop is varied and the conditions are evaluated again. A search varies one value in steps and narrows the first
+# step that meets the edge, so it can miss a gap narrower than a step. The result is certified.
 
 
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
@@ -96,7 +96,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
-_NOT_CERTIFIED = "not certified, so no change can end a certificate"
+_NOT_CERTIFIED = "not certified, so there are no margins"
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class _Sensitivity:
     delta_error: float | None = None
     largest_T_s: float | None = None  # with the same gains and delays in samples
     T_error: float | None = None
-    extra_samples: int | None = None  # of delay, on all channels at once
+    extra_samples: int | None = None  # largest increase of theta, on all channels at once
     reason: str | None = off_table("if given", None)
 
 
@@ -147,7 +147,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
         if suffices(ratio(softer)):
             return _Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
         scale = softer
-    return _Stiffest(unknown, "with this B, no multiple of K is certified")
+    return _Stiffest(unknown, "with this B, no multiple of K down to 1 N/m is certified")
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
@@ -242,7 +242,7 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
 
 
 def _crossing(f: Callable[[float], float], inside: float, outside: float) -> float:
-    """Return the root of `f`, to an error of _EDGE relative to the root and to `inside`.
+    """Return the root of `f`, to an error of _EDGE (|root| + |inside|).
 
     The steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software
     28, 1997). About ten values of `f` take less time than importing scipy.optimize.brentq.
@@ -284,7 +284,10 @@ class _Remedy:
 
 
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower the requirement by 10 %; [] if it is certified."""
+    """Return single changes that certify the coupling or lower the requirement by more than 10 %.
+
+    Return [] if the coupling is certified, or if the condition is not varied.
+    """
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []
