@@ -26,7 +26,7 @@ from haptic_loop.design.frequency import hermitian
 _CENTRED = 0.5  # largest squared Newton decrement of a point that counts as central
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
-_LONGEST = 1e3  # largest step, in Newton steps
+_LONGEST = 1e3  # largest step, in Newton steps, if no eigenvalue of S falls
 _RIDGE = 1e-9  # relative ridge, for directions on which neither objective nor inequalities depend
 _upper = cache(np.triu_indices)
 
@@ -118,7 +118,7 @@ class EntryInequality:
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """The pairs (first, second) of functions t, u: [Re tu, Im tu, Re tu*], (n (n + 1)/2, 3 k), and Im tu*."""
+        """Pairs of functions t, u: both indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
         first, second = _upper(self.functions.shape[1])
         t, u = self.functions.T[first], self.functions.T[second]
         along, against = t * u, t * np.conj(u)
@@ -141,7 +141,7 @@ class EntryInequality:
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
         hessian, size = np.zeros((x.size, x.size)), r * r * n
         hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] = between
-        # Inner products with S^-1 and S^-1 slope_a S^-1.
+        # `turned` has the columns S^-1 and S^-1 slope_a S^-1, whose inner products with the derivatives of S follow.
         turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
         through = V[:, None] @ _unpacked(np.swapaxes(turned, 1, 2)) @ L[:, None]
         entry = through[:, :, column, row].reshape(k, -1)

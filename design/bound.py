@@ -7,7 +7,7 @@ analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z
 circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
 no force has arrived yet).
 Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mean square relative mismatch
-J = <M, w M>, M = F - Lambda E. If the support of H lies in the band, |M|^2 w >= 2 Re tr H*M - |H|^2/w, and therefore
+J = <M, w M>, M = F - Lambda E. Any H(z) with its support in the band has |M|^2 w >= 2 Re tr H*M - |H|^2/w, so that
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
 F's coefficients are differences of the s_k. Choose C_k that weigh only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
@@ -52,7 +52,7 @@ _NO_BOUND = f"no bound for more than {MOST} channels: it would take half a minut
 _NEAR_END = (0.22, 0.5)  # distances of further knots from the band's ends, in steps; h falls to zero there
 _NEAR_MODE = 1.0  # distance of further knots from a mode, in widths of the mode
 _CLOSEST = 0.1  # least distance of two knots, in steps
-_MOST_ADDED = 96  # largest number of frequencies that a sweep adds
+_MOST_ADDED = 96  # largest number of frequencies that one check of D adds
 _AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # ratios of frequencies around the band's ends, where D bends
 _AROUND = np.array(
     [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
@@ -66,7 +66,7 @@ _QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimat
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # Gauss's rule in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
 _UNIT = 2.0**-53
-_LARGEST_CHARGE = 0.005  # The search ends if the proved bound is below the estimate by less than this share.
+_LARGEST_CHARGE = 0.005  # The search ends if the bound is below the barrier's value by less than this share.
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class _Bound:
     """A lower bound of the rms mismatch of every linear coupling for this environment; an estimate unless `proved`."""
 
     rms: float  # relative to the environment
-    proved: bool  # whether the dual matrix is nonnegative on the whole circle, not only at samples
+    proved: bool  # whether D >= 0 is proved on the whole circle; True for a bound of 0, which needs no proof
     sampled_rms: float  # the estimate from samples alone
     seconds: float
 
@@ -144,7 +144,7 @@ class _Dual:
 
     @property
     def start(self) -> Array:
-        """The point h = 0 and C_0 = I/delta, where D = I. It also serves as the vector c with c'x = tr C_0."""
+        """The point h = 0 and C_0 = I, where D = I, in units of 1/delta. It is also the vector c with c'x = tr C_0."""
         m = self.loop.channels
         unit = [float(i == j) for i, j in _triangle(m)]
         return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
@@ -237,7 +237,7 @@ class _Dual:
         return middle, half, response, bounds
 
     def objective_again(self, x: Array) -> tuple[float, float]:
-        """Return (the bound on J from the point x, by Gauss's rule and from H itself; its largest error).
+        """Return (the bound on J from the point x, its largest error). The integrals of H are computed by Gauss's rule.
 
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
         linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
@@ -326,9 +326,10 @@ def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
-    """Return the point nearest to x, on the line to `inner`, at which no least eigenvalue is negative, or None.
+    """Return a point near x, on the line to `inner`, at which no least eigenvalue is negative, or None.
 
-    `room` and `lacking` are the least eigenvalues at `inner` and at x; least eigenvalues are concave in between.
+    `room` and `lacking` are the least eigenvalues at `inner` and at x. They are concave on the line, so that linear
+    interpolation bounds them from below.
     """
     if room.min() <= 0:
         return None if lacking.min() < 0 else x
@@ -476,7 +477,11 @@ class BoundBeside:
         """One line for a report."""
         if self.reason or self.rms_mismatch_db is None:
             return self.reason or ""
-        sup = f", nor than {self.relative_mismatch_db:z.2f} dB at most" if self.relative_mismatch_db is not None else ""
+        sup = (
+            f", nor than {self.relative_mismatch_db:z.2f} dB in the supremum"
+            if self.relative_mismatch_db is not None
+            else ""
+        )
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
         left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
         rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"

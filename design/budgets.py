@@ -89,6 +89,6 @@ GAIN_CHUNKS = 20_000
 
 
 def require_size(states: int) -> None:
-    """Raise TooLong if exact arithmetic over this number of states would take minutes."""
+    """Raise TooLong for a proof over more than PROOF_STATES states."""
     if states > PROOF_STATES:
         raise TooLong(f"a proof over {states} states takes long: up to {PROOF_STATES} are tried")

@@ -1,7 +1,8 @@
 """Minimise c'x under linear matrix inequalities: each block constant + sum_a x_a slope_a is positive semidefinite.
 
-The status of a solver is not trusted. A result is used only if it is finite, if its blocks are semidefinite when they
-are evaluated again, and if the caller's `accept` agrees. Otherwise the next of several solver settings is tried.
+The status "solved" of a solver is not enough: a result is used only if it is also finite, if its blocks are
+semidefinite when they are evaluated again, and if the caller's `accept` agrees. Otherwise the next of the solver
+settings is tried.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ class ConeProgram:
 
 
 def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
-    """Minimise cost'x with constant - s = -slopes x and s in its cone; return x and Clarabel's status."""
+    """Minimise cost'x with s = constant + slopes x in its cone; return x and Clarabel's status."""
     import clarabel
     import scipy
 

@@ -15,9 +15,9 @@ In an interval of length l without a bend inside, the error of linear interpolat
 - |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the
   interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times its slope,
   with |a^(1)| = |a^(2)| = 1.
-On the line between two Hermitian matrices, no matrix has an eigenvalue below the least eigenvalues of both. The least
-eigenvalue of D in the interval is therefore at least the smaller of those at its ends, less the Frobenius norm of the
-errors above and of rounding.
+On the line between two Hermitian matrices, no matrix has an eigenvalue below the smaller of their least eigenvalues.
+The least eigenvalue of D in the interval is therefore at least the smaller of those at its ends, less the Frobenius
+norm of the errors above and of rounding.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class DualMatrix:
     def of(cls, points: Array, heights: Complex, scale: Array, sums: Array) -> DualMatrix:
         """Return D for a piecewise linear H with these heights (n, m, m) at the points, zero at both ends.
 
-        `scale` (m, m) is 4/T times the roots of the damping.
+        `scale` (m, m) is 4/T root(delta_i delta_j).
         """
         width, ends = np.diff(points)[:, None, None], ((1, 1), (0, 0), (0, 0))
         slope = np.pad(scale / (2 * np.pi) * np.diff(heights, axis=0) / width, ends)
@@ -70,7 +70,7 @@ class DualMatrix:
         """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
         The intervals between the frequencies `swept` and the bends are halved until each has a bound above -wanted, or
-        a bound near the eigenvalues at its ends. The search also ends when the counted work is spent.
+        a bound near the eigenvalues at its ends. The search also ends after _MOST evaluations of bends.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
         budget = _MOST // self.points.size - w.size
