@@ -68,10 +68,10 @@ def _in_time() -> Iterator[None]:
 # any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the parameters of a Network are
 # non-negative. Other multipliers are stored.
 #
-# With ranges, this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..). There is no
-# proof for an environment between the vertices, or for one that changes with time.
+# With ranges, a condition on the environment is proved for the nominal one (P) and for at most 128 vertices (P1, P2,
+# ..). There is no proof for an environment between the vertices, or for one that changes with time.
 #
-# A certificate names its base condition and the facts that are part of its block: latency, walls, limiter, switching.
+# A certificate names its base condition and the facts that it covers: latency, walls, limiter, switching, ranges.
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def prove(
         loop: The loop. Its facts, such as walls or delays that switch, are part of the condition.
         coupling: The coupling.
         condition: A name or a condition. design.environments.LimitedForces covers limited forces, too; under
-            any-environment without delay in the environment the limiter has no lag and needs no further proof.
+            any-environment without delay in the environment the limiter has rho = 0 and needs no further proof.
         multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None for the best ones.
         swept: The result of `required_damping` for these arguments, if the caller has it.
 
@@ -201,7 +201,7 @@ _MOST_COST = 2  # total cost of the members of ranges, in units of one proof wit
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
-    """Raise NotProved if the condition does not cover the loop, or if a proof would take minutes."""
+    """Raise NotProved if the condition does not cover the loop, NotProved or TooLong if a proof would take minutes."""
     if reason := condition.beyond(loop):
         raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
@@ -221,7 +221,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
 
 
 def _coefficients(value: Any) -> Iterator[float]:
-    """Yield every number in plain data."""
+    """Yield every float in plain data."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, dict | list | tuple):
@@ -236,7 +236,7 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
     On the circle the difference of the responses, plus the rounding errors, may be at most _MOST_LOST of the largest
-    response or of Delta_D/T. Terms that are far larger than the forces and cancel make it larger.
+    response or of Delta_D/T. Terms that cancel and are far larger than the forces increase the rounding errors.
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
@@ -397,7 +397,10 @@ def _margin(requirement: Requirement) -> float:
 
 
 def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
-    """Return the condition's multipliers in one sequence, or None if it has none. Raises NotProved."""
+    """Return the condition's multipliers in one sequence, or None if it has none.
+
+    Raises NotProved if names or lengths differ from those of the condition.
+    """
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
     if {name: len(values) for name, values in stored.items()} != expected:
@@ -480,8 +483,9 @@ def requirements_of(
 ) -> dict[str, Requirement]:
     """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
-    The environment is the nominal one and the delays theta are constant; design.assessment adds ranges and switching.
-    `known` is a certificate that holds; its proof is not repeated.
+    Conditions for known devices are left out without bounds of the devices. The environment is the nominal one and the
+    delays theta are constant; design.assessment adds ranges and switching. `known` is a certificate that holds; its
+    proof is not repeated.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)

@@ -6,9 +6,10 @@ as free + s gain, where s multiplies the damping Delta_D that the devices guaran
 (an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives the conditions.
 
 A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
-states whether periods vary and forces have a latency. A `Fact` is a wall, delays that switch, or the limiter. `compose`
-stacks their inputs and adds their forms, as design.facts describes. design.environments searches for the multipliers of
-all conditions, and design.certificate has one exact proof and one file format.
+states whether periods vary, forces have a latency, or devices have known motors. A `Fact` is a wall, delays that
+switch, or the limiter. `compose` stacks their inputs and adds their forms, as design.facts describes.
+design.environments and design.known_device search for multipliers. design.certificate proves all conditions in the same
+way, and design.coupling_file stores the proofs.
 
 To add a hands' side, derive a class from `HandsSide` and state
   `inputs`   one `Input` per scalar input. Its `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
@@ -22,7 +23,7 @@ Let `hands_side(loop)` return an instance of the class for the loops that it cov
 adds walls, limiter and switching without further code.
 
 any-environment applies Lemma 4 of the paper to any passive environment under backward Euler (`_v_hat`,
-`any_environment_demand`). `delayed_environment_demand` is for an environment with delay (design.lmi).
+`any_environment_demand`). `delayed_environment_demand` is the environment's block for psi >= 1.
 """
 
 from __future__ import annotations
@@ -93,11 +94,11 @@ def _v_hat(H: Block) -> tuple[Array, Block]:
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
     """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
-    V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. After the
-    division by |1 - 1/z|^2 this is T He R >= H* Delta_V H for H = V - Theta-hat and the second result R of `_v_hat`. A
-    Schur complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0.
-    Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a
-    multiplier.
+    V-hat must be output strictly passive with the level Delta_V, where Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with
+    Delta_V = 0 where phi is 0. After the division by |1 - 1/z|^2 this is T He R >= H* Delta_V H for H = V - Theta-hat
+    and the second result R of `_v_hat`. A Schur complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second
+    block has rows only for phi > 0. Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises
+    ValueError for a phi that is not a multiplier.
     """
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
@@ -234,7 +235,7 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 
 #: properties of a loop that a condition covers only if it names them in `covers`
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
-#: facts of the environment's side that a certificate may cover, in the order of reports and files
+#: properties of a loop that a certificate may list as its facts, in the order of reports and files
 FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 
 
@@ -326,7 +327,7 @@ class Condition(ABC):
         return self.name
 
     def fact_names(self, loop: Loop) -> tuple[str, ...]:
-        """Return the names of `FACTS` that this loop has."""
+        """Return the names of `FACTS` that a certificate of this loop lists."""
         walls, limited = loop.environment.walls, self.parameters(loop)
         present = loop.latency, walls, limited, loop.varying_delay, loop.ranges
         return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
@@ -389,7 +390,7 @@ class Condition(ABC):
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
-    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` has its block's poles."""
+    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` has the block's poles."""
     available = tuple(delta)
     if reason := unsound(system, available):
         return refusal(name, available, reason)
@@ -527,8 +528,8 @@ def asymmetric(V1: Array) -> str | None:
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     """Return the least s (k,) of the demand at w (k,), demanding nothing in directions in which V vanishes.
 
-    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. The
-    moving-average coupling vanishes at every zero of Theta-hat. If only V vanishes, the ratio is large.
+    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. A
+    moving average without a constant vanishes at every zero of Theta-hat. If only V vanishes, the ratio is large.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -549,7 +550,7 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
 
 
 def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
-    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong or negative one."""
+    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count or a negative one."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
