@@ -39,14 +39,14 @@ class Certificate(Strict, frozen=True):
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
     multipliers: dict[str, tuple[float, ...]]  # by name, exact decimals; "rho" is the limiter's stiffness [N/m]
-    matrices: dict[str, Rows]  # P, and P1, P2, .. of further environments
+    matrices: dict[str, Rows]  # P; P1, P2, .. of further environments; P_E of a delayed environment
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields
 
     @property
     def limiter(self) -> Certificate | None:
-        """The certificate itself if it covers limited forces, else None."""
+        """The certificate itself if limited forces are among its facts, else None."""
         return self if "limiter" in self.facts else None
 
 

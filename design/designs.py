@@ -184,7 +184,7 @@ def _by_own_function(loop: Loop, kind: str, condition: str | Condition | None) -
 
 def _without_force(loop: Loop) -> bool:
     """Return whether the environment has a model and never exerts a force."""
-    with suppress(SingularLoop):  # A rigid wall or a world has no E(z).
+    with suppress(SingularLoop):  # A world has no E(z).
         return silent(loop.E())
     return False
 
@@ -299,9 +299,8 @@ def _with_less_damping(
         needs = condition.judge(judged, design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            best = replace(
-                design, requirement=needs, notes=()
-            )  # The notes describe the loop with this share of the damping.
+            # The notes are dropped, because they describe the loop with a share of the damping.
+            best = replace(design, requirement=needs, notes=())
             if needs.ratio > 1 - _UNUSED:
                 return best
         if np.isinf(needs.ratio):
