@@ -1,4 +1,4 @@
-"""Is a hand-picked coupling safe for every passive human, and how much must it give?
+"""Is a hand-picked coupling safe for every passive human, and if not, which share of its gains is?
 
 The loop is the paper's: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
 """
@@ -16,7 +16,7 @@ def safe(share: float) -> bool:
 
 
 def largest_safe_share(steps: int = 20) -> float:
-    """By bisection, to a millionth."""
+    """Return the largest share of the gains that is certified, by bisection to a millionth."""
     low, high = 0.0, 1.0
     for _ in range(steps):
         middle = (low + high) / 2

@@ -1,7 +1,7 @@
 """The classics of passivity (PO/PC, energy bounding) and our couplings with the same hands. Half a minute.
 
 Columns: the rms error of the applied force; its rms above 40 Hz and peak; the share of ticks in which the layer acted;
-of 100 pairs of lossless hands how many move faster after 10 s than at their start at 0.1 m/s, and the fastest then.
+of 100 pairs of lossless hands, started at 0.1 m/s, how many are faster in the tenth second, and the largest speed then.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.passivity_layer import EnergyNet, netted
 from haptic_loop.sim.run import assemble, run, run_blocks
 
-PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # pairs of lossless hands, their time [s], their speed at the start [m/s]
+PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # pairs of lossless hands, duration of a run [s], speed at the start [m/s]
 
 
 class PassivityControl:
     """Passivity observer and series controller (Hannaford and Ryu, IEEE Trans. Robotics and Automation 18, 2002).
 
-    The observer adds up f dx; where it is negative a damper of one tick returns it. `delta` (m,) [N s/m] is our credit
-    for what the devices dissipate. It stands at the devices, behind the delays.
+    The observer adds up f dx; while the sum is negative, a damper returns it in one tick. `delta` (m,) [N s/m] is our
+    credit for what the devices dissipate. The controller acts at the devices, behind the delays.
     """
 
     at_device = True
@@ -36,7 +36,7 @@ class PassivityControl:
         self.credit, self.energy = np.broadcast_to(np.asarray(delta, float), (m,))[:, None] / T, np.zeros((m, nsim))
 
     def limit(self, wanted: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        """Return the force to apply (m, nsim) [N], of the one that arrives and the last tick's displacement [m]."""
+        """Return the force to apply (m, nsim) [N], for the force `wanted` and the last tick's displacement dx [m]."""
         self.energy += wanted * dx + self.credit * dx**2
         missing = np.maximum(-self.energy, 0.0)
         damper = np.divide(missing, dx**2, out=np.zeros_like(dx), where=dx != 0)
@@ -56,7 +56,7 @@ class EnergyBounding:
         self.c1, self.force = 2 * np.broadcast_to(np.asarray(delta, float), (m,))[:, None] / T, np.zeros((m, nsim))
 
     def limit(self, wanted: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        """Return the force to send (m, nsim) [N], of the wanted one and the last tick's displacement [m]."""
+        """Return the force to send (m, nsim) [N] for the `wanted` force [N] and the last tick's displacement dx [m]."""
         most = np.abs(self.force + self.c1 * dx)
         self.force = np.where(dx == 0, self.force, np.clip(wanted, -most, most))
         return self.force.copy()
@@ -89,7 +89,7 @@ class _Layer:
 
 @dataclass(frozen=True)
 class Classic:
-    """What `netted` puts under a loop."""
+    """The settings of a classic, from which `netted` makes a layer."""
 
     kind: type
     credited: bool = True
@@ -131,7 +131,7 @@ def row(layer: Any) -> tuple[float | None, float, float, float, int, float]:
 
 
 def left_alone(loop: Any) -> tuple[int, float]:
-    """Return how many pairs of lossless hands move faster in the last second than at first, and the largest speed."""
+    """Return how many pairs of lossless hands are faster in the last second than at first, and the top speed in it."""
     scenario, rng, shape = loop.scenario, np.random.default_rng(1), (PAIRS, loop.scenario.channels, 2)
     mass, stiffness = (np.exp(rng.uniform(*np.log(span), shape)) for span in ((0.01, 3.0), (1.0, 1e4)))
     crowd = variants(scenario.device, Crowd(np.stack([mass, np.zeros_like(mass), stiffness], axis=-1)))

@@ -30,4 +30,4 @@ print(validate(scenario, design, humans=50, engine="exact", duration=0))
 out = Path("out/first-steps")
 out.mkdir(parents=True, exist_ok=True)
 before.plot(out / "no-coupling.png")
-figure = after.plot(out / "designed-coupling.pdf")  # the last line of a cell is shown: `figure`
+figure = after.plot(out / "designed-coupling.pdf")  # evaluate `figure` to see the picture in an editor

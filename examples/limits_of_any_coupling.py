@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from haptic_loop import DesignFailed, Scenario, design_coupling, load, transparency_of
 
 BASE = load("omega-pair")  # T = 1.2 ms, theta = (1, 2) samples, 1.37 N s/m
-FLOOR = -60.0  # [dB] is drawn where the loop needs no coupling, so that the optimal one is exact
+FLOOR = -60.0  # [dB] drawn where the loop needs no coupling: the optimal one is then exact
 
 
 def scaled(factor: float) -> Scenario:
