@@ -1,4 +1,4 @@
-"""Two force-feedback devices squeeze a cube in a MuJoCo world: the scene, the run, and what is guaranteed of it."""
+"""Two force-feedback devices squeeze a cube in a MuJoCo world: the scene, the run and its guarantee."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
-"""A recurrent network of random neurons as the environment: no model, no proof, and hands that are safe with it.
+"""A recurrent network of random neurons as the environment: nobody has a model or a proof of it, but hands are safe.
 
-A coupling that is certified for any passive environment stands before it, and a shell makes it passive: it scales the
-network's forces so that they never give more energy than the budget. Put a physics engine or a trained network there.
+The network is behind a coupling certified for any passive environment. A shell makes the network passive: it scales the
+forces so that they never give more energy than the budget. Replace the network by a physics engine or a trained one.
 """
 
 import sys
@@ -14,7 +14,7 @@ BUDGET, SECONDS, NEURONS = 0.01, 6.0, 32  # [J], [s]
 
 
 class Network:
-    """Forces (2,) [N] from where its two contacts are, (2,) [m]; what it remembers it makes up by itself."""
+    """Maps the positions (2,) [m] of its contacts to forces (2,) [N], by neurons that never come to rest."""
 
     def __init__(self, seed: int = 3) -> None:
         rng = np.random.default_rng(seed)

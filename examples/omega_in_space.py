@@ -1,4 +1,4 @@
-"""Two Omegas move in x, y and z and hold a block between springs: requirement, proof, way of the handles."""
+"""Two Omegas move in x, y and z and hold a block between springs: requirement, guarantee, path of the handles."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 """Two robots joined by a position-position controller with delay: how much damping does each need, in any hands?
 
-Robot 1 feels k (x1 - x2, d samples ago), robot 2 feels k (x2 - x1, d samples ago). The answer is k (d + 1) T each.
+Robot 1 feels k (x1[n] - x2[n-d]), robot 2 feels k (x2[n] - x1[n-d]). The answer is k (d + 1) T for each robot.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ T, K, DELAYS = 1e-3, 500.0, range(9)  # [s], [N/m], [samples]
 
 
 class PositionPosition(Environment):
-    """E(z) = k [[1, -1/z^d], [-1/z^d, 1]]: the delay is inside, for each robot knows its own position at once."""
+    """E(z) = k [[1, -1/z^d], [-1/z^d, 1]]: the delay is inside, because each robot knows its own position at once."""
 
     contacts = ("robot 1", "robot 2")
 

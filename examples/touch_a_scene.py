@@ -1,13 +1,13 @@
 """python examples/touch_a_scene.py: three ways to touch one MuJoCo scene, with the same lossless hands.
 
-    contact force times a gain   what simulators of robots do: the contact stands where the device is, the device feels
-                                 a part of the contact force, clipped by its motors
+    contact force times a gain   usual in robot simulators: the contact is at the device's position, and the device
+                                 feels a part of the contact force, clipped by its motors
     environment= function        the scene behind a certified coupling, stepped outside of it, with the energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass on a spring without loss that draws it to a place, thrown at the scene. It grows where hand and device,
-whose own damping is counted, have more energy than at first, beyond what gravity and springs of the scene released and
-the shell's 2 mJ. It shakes where late in the run a force changes by a tenth of the limit from one tick to the next.
+A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. It grows if hand and device receive,
+beyond what the device's damping dissipates, more energy than gravity and springs of the scene released and the 2 mJ of
+the shell. It shakes if, in the last fifth of the run, a force changes by more than a tenth of the limit in a tick.
 """
 
 import sys
@@ -31,7 +31,7 @@ GAINS = (1.0, 0.2)  # of the contact force
 
 
 class ContactForce:
-    """The scene with its contacts moved to where they are told, and the contact forces on them."""
+    """Moves the contacts of a scene to given positions and returns the contact forces on them."""
 
     def __init__(self, scene):
         self.port = scene.port()
@@ -41,7 +41,7 @@ class ContactForce:
         self.T, self.before = scene.T, np.zeros(len(joints))
 
     def __call__(self, place):
-        """Forces fed back (m,) [N] with the contacts at `place` (m,) [m]."""
+        """Return the forces fed back (m,) [N] with the contacts at `place` (m,) [m]."""
         speed, self.before = (place - self.before) / self.T, place.copy()
         self.data.qpos[self.dofs], self.data.qvel[self.dofs] = place - self.T * speed, speed
         self.model.qpos_spring[self.dofs] = place  # the spring that the program adds stays at rest
@@ -50,7 +50,7 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Peak force [N], share of ticks limited or scaled, and how many of the hands grow, and shake."""
+    """Return the peak force [N], the share of limited or scaled ticks, and how many hands grow and how many shake."""
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):
@@ -61,8 +61,8 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
         x, v, aim = np.zeros(2), 0.3 * rng.normal(size=2), 0.03 * rng.normal(size=2)
         given = most = 0.0
         line = [np.zeros(2)] * (max(scenario.theta) + 1)
-        rotation = np.sqrt(stiffness / mass) * T  # of the hand within a tick, while a constant force acts
-        jump = 0.0  # [N] of a force from tick to tick, late in the run
+        rotation = np.sqrt(stiffness / mass) * T  # [rad] phase of a hand's oscillation in a tick
+        jump = 0.0  # [N] largest change of a force from tick to tick in the last fifth of the run
         for k in range(ticks):
             if isinstance(way, float):
                 wanted = way * outside(x)
@@ -82,7 +82,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
             x = rest + swing * np.cos(rotation) + speed * np.sqrt(mass / stiffness) * np.sin(rotation)
             v = speed * np.cos(rotation) - swing * np.sqrt(stiffness / mass) * np.sin(rotation)
             dx = x - before
-            v = v - np.array(scenario.delta) / mass * dx  # the devices' damping takes this, and at least delta dx^2/T
+            v = v - np.array(scenario.delta) / mass * dx  # by the damping, which dissipates at least delta dx^2/T
             given += -(f @ dx) - (np.array(scenario.delta) / T * dx**2).sum()
             most, peak = max(most, given), max(peak, float(np.abs(f).max()))
         limited += int(shell.limited[0])
@@ -92,7 +92,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
 
 
 def scenes(folder):
-    """The packaged stack of boxes, and a fixed block touched by tips of 2 kg, as of a robot, in contacts of 5 ms."""
+    """Return the packaged stack of boxes, and a fixed block with tips of 2 kg, like a robot's, and contacts of 5 ms."""
     stack = load("world-stack")
     (Path(folder) / "block.xml").write_text(BLOCK)
     block = Path(folder) / "block.xml"
@@ -101,7 +101,7 @@ def scenes(folder):
 
 
 def rows(hands=20, seconds=1.0):
-    """(way, scene, peak force, share of ticks, hands that grow, hands that shake)."""
+    """Yield (way, scene, peak force, share of limited ticks, hands that grow, hands that shake)."""
     with TemporaryDirectory() as folder:
         for scene, scenario in scenes(folder).items():
             coupling = design_coupling(scenario.loop("I"), "moving-average").coupling
