@@ -1,6 +1,6 @@
-"""Your device, behind the real protocol, without the device: a session of the bridge with its emulator.
+"""Rehearse a session of the bridge with an emulator of your device, over the real protocol.
 
-Both run in virtual time: handshake, delay measured, coupling designed and certified for it, armed, run, ramped out.
+A session in virtual time: handshake, measurement of the delay, coupling certified for it, arming, run, ramp to zero.
 """
 
 import sys
@@ -15,7 +15,7 @@ SECONDS = 2.0
 
 
 def _wall(delay: float | None) -> float:
-    """Damping [N s/m] that a rigid wall behind a spring asks, its force late by this [s], or by a sample."""
+    """Return the damping [N s/m] that a rigid wall behind a spring needs with this delay [s]; None: a sample."""
     theta, latency = ((1,), None) if delay is None else ((0,), ((delay, delay),))
     wall = Loop(1.2e-3, theta, (0,), theta, (MINE["damping"],), RIGID_WALL, latency=latency)
     return certify(wall, SpringDamper([1000.0], [0.0]))["this-environment"].required[0]
@@ -40,5 +40,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except (TypeError, ValueError) as error:  # numbers that no device, or no certificate, can have
+    except (TypeError, ValueError) as error:  # MINE has a number that no device or no certificate allows
         sys.exit(f"error: {error}")

@@ -94,8 +94,8 @@ def _command_starts() -> bool:
     return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
 
 
-# No command renders through MuJoCo's OpenGL context. Its import takes longer than the rest of MuJoCo, and fails if
-# MUJOCO_GL names a backend that is not installed. The setting of a user's script is not changed.
+# Commands do not use the OpenGL backend of MUJOCO_GL (sim.view opens one of its own). Its import takes longer than the
+# rest of MuJoCo, and fails if the backend is not installed. The setting of a user's script is not changed.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
 
@@ -107,5 +107,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names and the attributes of every package."""
+    """Return the public names, and the attributes that every package has."""
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
