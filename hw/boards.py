@@ -50,7 +50,7 @@ class _Board:
         self.period = 0.0  # [us] length of a tick, from INFO
         self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
-        self.last: wire.State | None = None  # None before it was configured
+        self.last: wire.State | None = None  # last STATE since the last CONFIG
         self.misses = 0  # State.misses in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
         self._steps = self._shifted = 0  # steps since the board was first paired; their number at the last shift
@@ -69,7 +69,7 @@ class _Board:
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
-        """Receive a STATE. Raises SafetyStop if the board applies a force that the host did not send."""
+        """Receive a STATE. Raises SafetyStop if the board keeps applying forces that the host did not send."""
         ticks = wire.distance(state.tick, self.last.tick) if self.last else 1
         if ticks <= 0:
             return
@@ -99,9 +99,9 @@ class _Board:
         return came[0] if came else None
 
     def follow(self, step: int, at: int, driving: bool) -> None:
-        """Shift the pairing of steps so that samples precede the leading board's by less than a period.
+        """Shift the pairing of steps so that samples precede the leading board's by about a period at most.
 
-        Raises SafetyStop if this clock is faster than the leading one, or slower by more than CLOCK_TOLERANCE.
+        Raises SafetyStop if this clock is clearly faster than the leading one, or slower by more than CLOCK_TOLERANCE.
         """
         assert self.offset is not None
         if self._shift_at is not None and wire.distance(step, self._shift_at) >= 0:
@@ -124,7 +124,7 @@ class _Board:
             self._shifted, self._shift_at = self._steps, (step + self.config.theta + 1) & 0xFFFF
 
     def _compare(self, step: int, lead: float) -> None:
-        """Raise SafetyStop if this clock is faster than the leading one, or much slower."""
+        """Raise SafetyStop if this clock is clearly faster than the leading one, or slower beyond CLOCK_TOLERANCE."""
         assert self.offset is not None
         if self._start is None or (elapsed := wire.distance(step, self._start[0])) < 0:
             self._start = step, lead, self.offset
@@ -184,7 +184,7 @@ class Boards:
         self._lead = next(board for board in self._boards if not board.behind)
         self._clock, self._wait = clock, wait
         self._infos: list[wire.Info | None] = [None] * len(devices)
-        self._asked: wire.Config | None = None  # configuration that some board has not acknowledged yet
+        self._asked: wire.Config | None = None  # configuration that not all boards have acknowledged yet
         self._step: int | None = None  # number of the last step
         self._configured, self._driving, self._misses = False, False, 0
 
@@ -224,7 +224,7 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send every board its part of a configuration, whose theta includes the board's extra delay."""
+        """Send every board its part of a configuration, with its extra delay in theta. None until all have answered."""
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:
@@ -285,7 +285,7 @@ class Boards:
         return state
 
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
-        """Return one STATE: the worst phase and margin, the sums of the counters, and the axes of all boards in order.
+        """Return one STATE: worst phase and margin, sum of errors, most misses of a board, axes of all boards in order.
 
         The phases come from the last STATE of every board, not from the samples of the step, so a fault shows at once.
         """
@@ -309,7 +309,7 @@ class Boards:
         )
 
     def _margin(self, samples: Sequence[wire.State]) -> int:
-        """Return the least margin of the boards' answers. Until forces act, waits for other boards do not count."""
+        """Return the least margin of the boards' answers. Until forces act, it excludes the wait for other boards."""
         margins = []
         for board, state in zip(self._boards, samples, strict=True):
             if state.margin_us == wire.NO_MARGIN:

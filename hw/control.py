@@ -1,9 +1,9 @@
 """Run a controller tick by tick on the host, and certify its coupling for the measured delay of the link.
 
-The link takes `link` ticks from a sample to the latch of its force, for every axis. Where a channel's delay theta_i
-in the scenario is longer, the host delays its force by the remaining theta_i - link ticks. The loop therefore has the
-scenario's delays unless the link is slower; then it has longer ones. Where the device latches a force on arrival,
-`link` is 0, and the measured latency replaces the scenario's.
+The link takes `link` ticks from a sample to the latch of its force, for every axis; several boards add `behind` ticks.
+Where a channel's delay theta_i in the scenario is longer, the host delays its force by the remaining ticks. The loop
+therefore has the scenario's delays unless the link is slower; then it has longer ones. Where the device latches a force
+on arrival, `link` is 0, and the measured latency replaces the scenario's.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # most ticks in a row with a speed change above 0.6 mm/tick; ten one way reach 5 m/s at T = 1.2 ms
+_SHAKING = 10  # most ticks in a row with a speed change above 0.6 mm/tick; ten in one direction add 5 m/s at T = 1.2 ms
 _FALLBACK = ("spring-damper", "any-environment")  # kind and condition of a reserve of the last resort
 
 
@@ -118,8 +118,8 @@ class BudgetPlan:
         """Return the plan for a device of this configuration.
 
         The device holds a force for `hold` missed ticks, then ramps it to zero. Because of its slew rate, an older
-        force acts for up to ceil(cap / slew) more ticks with an answer. After those ticks, the applied force lies
-        between forces that were sent later.
+        force still acts in up to ceil(cap / slew) later ticks with an answer, each after up to `hold` missed ticks.
+        Then the applied force lies between forces that were sent later.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -175,7 +175,7 @@ class WorldController:
 
     A force that tests a motor does not pass the coupling, so an energy budget measures its energy at the device. That
     budget starts with the energy of the shell, and its spent energy is charged to the shell afterwards. So shell and
-    budget together give at most W0.
+    budget together give at most W0 beyond what the scene released.
     """
 
     def __init__(
@@ -304,7 +304,7 @@ class Drive:
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # else each board has one
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # several boards have one each
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
@@ -368,7 +368,7 @@ class Drive:
         ticks: int,
         test: tuple[float, ...] | None,
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return the force (m,) [N] and steps that a world's energy accounts allow. A test suppresses scene forces."""
+        """Return force (m,) [N] and steps within a world's energy accounts. A test force suppresses scene forces."""
         nothing, plan = (0,) * len(steps), self._test_plan
         pushes = plan is not None and test is not None and any(test)
         allowed = world.limit(nothing if pushes else steps, self.units.force_step)
@@ -572,8 +572,8 @@ def certified_couplings(
 
     A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on none.
     It needs less damping than the previous coupling would need with these delays. It has the same kind or file; where
-    that is not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is
-    certified, the list ends. Raises SafetyStop where the first coupling is not certified.
+    that is not certified or not softer, it is the spring-damper by Theorem 4, which has the strongest guarantee. If
+    neither is possible, the list ends. Raises SafetyStop where the first coupling is not certified.
     """
     candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
@@ -610,7 +610,7 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
 
 
 def _felt_at_rest(certified: CertifiedCoupling) -> Array:
-    """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, that of the coupling alone."""
+    """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, the coupling's own stiffness."""
     loop = certified.scenario.loop(certified.case)
     V = certified.chosen.coupling.compliance(loop.T) if is_world(certified.scenario) else None
     return loop.F(certified.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())
