@@ -28,7 +28,7 @@ class Device:
         self.config: wire.Config | None = None
         self.k, self.now = 0, 0  # number of the current tick, and the clock [us] at its start
         self.zero = (0,) * info.axes
-        self.asked, self.ack = False, b""  # whether to send INFO, and the ACK to send, at the next tick
+        self.asked, self.ack = False, b""  # at the next tick: whether to send INFO, and the ACK to send
         self.clear()
         self.misses = 0
 
@@ -84,7 +84,7 @@ class Device:
             self.applied = self.config.limited(self.run, self.applied, frame.force)
 
     def halt(self, cause: wire.Cause) -> None:
-        """Go to zero force, by a ramp while armed and otherwise at once. The first cause stays."""
+        """Ramp to zero force if armed, only stop if disarmed, and keep any other phase with its first cause."""
         if self.phase in (wire.Phase.ARMED, wire.Phase.HOLDING):
             assert self.config is not None
             self.phase, self.cause = wire.Phase.RAMP, cause

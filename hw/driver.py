@@ -20,7 +20,7 @@ _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 @dataclass
 class Operator:
-    """Decide for a person when to arm and when to end a session, and act on keys. Arm without a key at most once.
+    """Decide in place of a person when to arm and end a session, and act on keys. Arm without a key at most once.
 
     With a `deadman`, forces act only while the user gives a sign every second: a key, or `deadman` returns True.
     """
@@ -28,7 +28,7 @@ class Operator:
     auto_arm: bool
     seconds: float  # time of forces at full gain in each arming
     deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
-    _asked: bool = False  # whether the operator or a key has armed the session
+    _asked: bool = False  # whether the operator or a key has already asked the session to arm
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] time of the user's last sign
     _free_at: int = 0  # [us] earliest time of arming without a key
@@ -66,7 +66,7 @@ class Operator:
         return ()
 
     def _arm_once(self, session: Session, now: int) -> Said:
-        if self._asked:  # a softer coupling is ready, and nobody is there to arm it
+        if self._asked:  # the session has disarmed to take a softer coupling
             softer = session.program.name if session.program else "none"
             return session.end(Stage.REFUSED, f"nobody is there to arm the softer coupling, {softer}", now)
         self._asked = True

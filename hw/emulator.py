@@ -41,7 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at full cap before the person starts to move; the gain reaches 1 earlier
+_SETTLED = 203  # ticks at full cap after which the person starts to move; by then the gain is 1
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
@@ -64,7 +64,7 @@ _DEVICE = {
     "reset": ("no value: the device restarts", 0.0, 0.0, 0.0),
     "leap": ("ticks by which the device's tick number leaps", 1.0, 32000.0, 300.0),
     "stuck": (
-        "no value: the device holds its force and ignores its watchdog and every STOP except ESTOP",
+        "no value: the device ignores its watchdog, IDLE and every STOP except ESTOP",
         0.0,
         0.0,
         0.0,
@@ -254,7 +254,7 @@ def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scena
 
 
 def info_of(scenario: Scenario) -> Info:
-    """Return the INFO of an emulated device: the scenario's devices, in the units of the wire."""
+    """Return the INFO of an emulated device: limits and steps of the scenario's devices, in the units of the wire."""
     r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
     encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
     step = _FORCE_STEP if scenario.unit == "m" else max(1, round(1e6 * max(limits) / 30000))
@@ -290,7 +290,7 @@ class Emulator:
         self.begun_at: int | None = None  # tick at which the person began to move
         self.unplugged = False
         self.stalled_until = 0  # [us]
-        self.stretch = 1.0  # length of a tick in T
+        self.stretch = 1.0  # length of a tick as a multiple of T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
         self._motor: Array = np.ones(scenario.channels)  # share of its force that each motor makes
         self._swapped, self._crossed = False, 0.0
