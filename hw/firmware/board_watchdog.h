@@ -1,6 +1,6 @@
 /* watchdogStart(ms) starts the board's own watchdog (15 or 30 ms on AVR), which resets the board if watchdogFeed() is not
- * called for this time. Without a watchdog, a loop that hangs keeps the last PWM for ever. After a reset the pins float and
- * ENABLE is pulled down. */
+ * called for this time. Without a watchdog, a loop that hangs keeps the last PWM for ever. After a reset the pins float, so a
+ * pull-down keeps ENABLE low. */
 #ifndef BOARD_WATCHDOG_H
 #define BOARD_WATCHDOG_H
 

@@ -7,7 +7,7 @@
  *   3. It returns at least 100 on an idle line. Two axes send an INFO of 68 bytes and STATEs of 32 bytes. With less room they
  *      wait in `queue`, which delays a STATE. The host measures this delay as part of the round trip.
  *
- * Adapt the pins, the numbers of INFO (measure them; docs/protocol.md has their units) and the functions below them. The
+ * Adapt the pins, the numbers of INFO (measure them; docs/protocol.md has their units) and the functions marked below. The
  * safety states are in haptic_link.h: do not change that file. */
 #include <Arduino.h>
 
@@ -74,8 +74,8 @@ static void serialPump()
   gone += Serial.write(queue + gone, n);
 }
 
-/* Sends all n bytes or none, so that no frame is cut in two. Drops them while the queue is partly sent; otherwise they
- * replace the queue. */
+/* Sends all n bytes or none, so that no frame is cut in two. While the queue is partly sent, drops the new
+ * bytes; otherwise they replace the queue. */
 static void serialWrite(const uint8_t *data, size_t n)
 {
   serialPump();
@@ -142,6 +142,6 @@ void loop()
   hl_deadman(&device, digitalRead(DEADMAN) == LOW); /* with --deadman device, the host ramps out on release */
   size_t n = hl_tick(&device, timeUs(), counts, force, out);
   writeForces(force);
-  watchdogFeed(); /* only here: a loop that runs without ticks must not feed the watchdog */
+  watchdogFeed(); /* only after a tick: a loop without ticks must not feed the watchdog */
   serialWrite(out, n);
 }

@@ -88,7 +88,7 @@ void loop()
   TIFR1 = _BV(OCF1A);
   MARK(1);
   watchdogFeed();
-  writeForce(runner.force[0]); /* computed from the last sample: theta = 1 */
+  writeForce(runner.force[0]); /* the force that was computed from the last sample: theta = 1 */
   int32_t counts = readSensor();
   float x = METRES_PER_COUNT * (float)(counts - home_counts) + HOME;
   int key = Serial.read();

@@ -87,7 +87,7 @@ static inline void hl_clear(hl_device *d)
     d->margin = HL_NO_MARGIN;
 }
 
-/* Goes to zero force, by a ramp while armed. The first cause stays. */
+/* Ramps to zero force if armed, or only stops if disarmed. In other phases nothing changes: the first cause stays. */
 static inline void hl_halt(hl_device *d, uint8_t cause)
 {
     if (d->phase == HL_ARMED || d->phase == HL_HOLDING) {
@@ -111,7 +111,7 @@ static inline void hl_latch_estop(hl_device *d, uint8_t cause)
 
 static inline void hl_fault(hl_device *d) { hl_halt(d, HL_BY_DEVICE); }
 static inline void hl_estop(hl_device *d) { hl_latch_estop(d, HL_ESTOP_DEVICE); }
-/* Sets whether somebody holds the deadman. Without any call with true, the host assumes that there is no deadman. */
+/* Sets whether somebody holds the deadman. With several boards, the host ignores boards that never set true. */
 static inline void hl_deadman(hl_device *d, bool held) { d->deadman = held; }
 
 /* Returns false, and leaves the device in ESTOP, if a value of the info is impossible. */
@@ -311,7 +311,7 @@ static inline size_t hl_write_state(const hl_device *d, const int32_t *counts, u
 static inline size_t hl_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *force, uint8_t *out)
 {
     bool at_once = d->configured && d->config.theta == 0;
-    hl_slot *slot = &d->slot[(uint16_t)(++d->k - at_once) % HL_SLOTS]; /* theta = 0: that of the last tick, already applied */
+    hl_slot *slot = &d->slot[(uint16_t)(++d->k - at_once) % HL_SLOTS]; /* theta = 0: slot of the last tick, already applied */
     size_t n = 0;
     d->now = now;
     if (d->phase == HL_DISARMED || d->phase == HL_ARMED || d->phase == HL_HOLDING) {

@@ -77,7 +77,7 @@ void loop()
   }
   due += PERIOD_US;
   watchdogFeed();
-  writeForces(runner.force); /* computed from the last sample: theta = 1 */
+  writeForces(runner.force); /* the force that was computed from the last sample: theta = 1 */
   double x[PROCESS_CHANNELS];
   int key = Serial.available() > 0 ? Serial.read() : -1;
   noInterrupts();
