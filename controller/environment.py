@@ -483,7 +483,8 @@ class Network(
     def across(self, parts: Sequence[Spring | Wall]) -> Array:
         """Return the displacement across each part as rows over `nodes()`: +1 at its first end, -1 at its second.
 
-        Between points with several coordinates the entries of the part's direction replace 1.
+        Between points with several coordinates the entries of the part's direction replace 1; without a direction the
+        first coordinate alone counts.
         """
         index = {name: i for i, name in enumerate(self.nodes())}
         lengths = [self._lengths(part) for part in parts]
@@ -534,8 +535,8 @@ def environment(network: Network, T: Number) -> Lti:
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
-    dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has neither mass nor
-    connections.
+    dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has no mass and
+    nothing holds it.
     """
     adrift = _adrift(network, network.springs)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)

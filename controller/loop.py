@@ -306,7 +306,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return msgspec.structs.replace(self, environment=network, ranges=None)
 
     def channel(self, i: int) -> Loop:
-        """Return channel i with a rigid wall, for conditions that do not depend on the environment."""
+        """Return channel i with delta_i and a rigid wall, for conditions that do not depend on the environment."""
         own, known, late, span = slice(i, i + 1), self.known_devices, self.latency, self.varying_delay
         return Loop(
             self.T,
@@ -337,7 +337,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.varying_delay or DelayRange(self.theta, self.theta)
 
 
-#: The key and the value of the last G over Fractions. A proof uses G three times, and most of the work is to compute G.
+#: The key and the value of the last G over Fractions. A proof may use G twice, and most of the work is to compute G.
 _exactly: list[Any] = [(None,) * 4, None]
 
 
