@@ -252,7 +252,7 @@ class ForceLimits:
     """The limiter or the clipping of forces, and the condition that covers it.
 
     Attributes:
-        rho: (m,) stiffnesses of the limiter [N/m]; None if no condition covers a limiter, so that forces are clipped.
+        rho: (m,) stiffnesses of the limiter [N/m]; None if forces are clipped.
         reason: Why a condition covers limited forces, or why none does.
         requirement: The requirement of the condition `limiter`, if it was evaluated.
         c: The multiplier of the condition `limiter`, one row per device, no unit.
@@ -383,7 +383,7 @@ class Guarantee:
         condition: The condition that gives the guarantee, or "energy-budget".
         proof: "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick.
         facts: Properties of the loop that the condition covers (Assessment.facts).
-        hands: The hands that the guarantee covers, in words.
+        hands: The hands that the guarantee covers; of an energy account "no passive hand", the subject of `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", or the restriction.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
@@ -443,7 +443,7 @@ class Assessment:
         certificate: The exact proof, if one was given or made for the ranges.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold; other conditions are reported only.
+        condition: The name of the condition that must hold for `holds`; another one may give the guarantee.
     """
 
     loop: Loop

@@ -153,7 +153,8 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
     """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound at frequencies with z^-n = -1.
 
-    The set of certified gains is convex and contains K -> 0, so there is only one edge.
+    The set of certified gains is convex and contains K -> 0, so there is only one edge. Of a matrix of damping only the
+    diagonal is used, so that these K may not be certified together.
     """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
