@@ -62,9 +62,9 @@ def _in_time() -> Iterator[None]:
 # ----------------------------------------------------------------------------------------------------
 # The certificate of a coupling is proved once, stored, and proved again from the file alone without a solver.
 #
-# The blocks are those of the condition (design.conditions, design.environments), over the rationals. The proof shows
-# that static matrices are symmetric, and positive semidefinite where required. It shows that each block at the
-# available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
+# The blocks over the rationals come from the condition (design.environments, design.known_device, or the user's own).
+# The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that each block
+# at the available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
 # any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the parameters of a Network are
 # non-negative. Other multipliers are stored.
 #

@@ -253,7 +253,7 @@ class Condition(ABC):
 
     @property
     def extensible(self) -> bool:
-        """Whether limited forces and switching delays may be proved together with this condition."""
+        """Whether `LimitedForces` and the fast sweeps of design.environments.in_each apply to this condition."""
         return False
 
     @abstractmethod

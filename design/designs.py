@@ -28,11 +28,11 @@ from haptic_loop.design.transparency import NO_FORCE, silent
 class _Kind(NamedTuple):
     """One kind of design: its conditions, its function and its options."""
 
-    conditions: tuple[Condition, ...]  # allowed conditions, the default first
-    module: str  # of design/, imported on first use
+    conditions: tuple[Condition, ...]  # allowed conditions; `usual_condition` chooses the default
+    module: str  # module of design/ that is imported on first use
     function: str  # name of the function from a loop to a Design
     takes: tuple[str, ...] = ()  # further arguments: condition, progress
-    options: tuple[str, ...] = ()  # names of design.api.DesignOptions that the function takes
+    options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether limited forces are covered by default
     softened: bool = False  # whether designs may be repeated for less damping until a second condition holds
