@@ -1,4 +1,4 @@
-"""Design three couplings for one loop and compare what each guarantees, what it costs and how transparent it is."""
+"""Design three couplings for one loop and compare guarantees, required damping and transparency."""
 
 from haptic_loop import assess, design_coupling, load, transparency_of
 

@@ -1,4 +1,4 @@
-"""A virtual wall on a Hapkit: which stiffness may a class program, and what happens beyond it?
+"""A virtual wall on a Hapkit: which stiffness may students program, and what happens beyond it?
 
 The friction and damping of a Hapkit are not published and differ from kit to kit: the numbers below are examples.
 `python -m hw.identify` measures yours.

@@ -1,4 +1,4 @@
-"""How good can any coupling be with other devices? Design the optimal one along damping, delay and period, and draw.
+"""How good can any coupling be with other devices? Design the optimal one over damping, delay and period.
 
 python examples/limits_of_any_coupling.py [damping|delay|period ..]      (a minute for all three)
 """
