@@ -34,7 +34,7 @@ from haptic_loop.sim.scenario import (
     built_in,
     held_by,
     load,
-    with_environment,
+    own_environment,
     world_environment,
 )
 
@@ -446,8 +446,6 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     """Return the scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
     speak(scenario.unit)
-    if args.environment is not None:
-        scenario = with_environment(scenario, args.environment)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     each = "channel" if scenario.channels == len(scenario.device) else "device"
     values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
@@ -455,6 +453,8 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device), each=each)
         for name, value in values.items()
     }
+    if args.environment is not None:  # in the same step as T, for which E(T) of a user's own class is computed
+        changes["environment"] = own_environment(args.environment)
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)
         with refused("--known-device: "):

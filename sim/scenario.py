@@ -113,14 +113,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
         if self.human is _UNSAID:
             msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(len(self.device)))))
-        for name in ("theta", "psi", "device", "human", "lam"):
+        self._check_counts()
+        for name in ("theta", "psi", "lam"):
             value = getattr(self, name)
-            expected = len(self.device) if name == "human" else self.channels
-            there = len(self.axis_devices) if name == "device" else len(value or ())
-            if value is not None and there != expected:
-                contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
-                raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
-            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else (), start=1):
+            for i, n in enumerate(value or (), start=1):
                 require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
@@ -153,6 +149,19 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError("environment has no force: all springs, dampers and masses are 0, and there are no walls")
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
+
+    def _check_counts(self) -> None:
+        """Raise ValueError unless lists have an entry for each channel, and humans are one per device."""
+        contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
+        if (axes := sum(len(device.free) for device in self.device)) != self.channels:
+            several = any(device.axes > 1 for device in self.device)
+            has = f"{len(self.device)} entries" + (f" with {axes} free axes in all" if several else "")
+            raise ValueError(f"device has {has}, but {contacts}")
+        for name in ("theta", "psi", "lam"):
+            if (value := getattr(self, name)) is not None and len(value) != self.channels:
+                raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
+        if len(self.human) != (devices := len(self.device)):
+            raise ValueError(f"human has {len(self.human)} entries, expected {devices}, one for each device")
 
     def _per_channel(self) -> None:
         """Convert values per device to values per channel. Raises ValueError if axes of one device differ."""
@@ -401,13 +410,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
         try:
-            if delta is not None:
-                damping = _strictly({"delta": delta}, _Damping).delta
-                if len(damping) != len(self.device):
-                    raise InputError(f"delta has {len(damping)} entries for {len(self.device)} devices")
-                fields["device"] = tuple(d.with_damping(b) for d, b in zip(self.device, damping, strict=True))
             if not isinstance(fields["environment"], Network | dict):
                 fields["environment"] = _network(fields["environment"], fields["T"])
+            if delta is not None:
+                parts = {name: fields[name] for name in ("device", "environment")}
+                fields["device"] = _strictly({**parts, "delta": delta}, _Damped).devices()
             if "human" in own:
                 fields["human"] = [_NOBODY] * len(own["human"])
             scenario = _strictly(fields, type(self))
@@ -418,14 +425,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise InputError(str(error)) from None
 
 
-def with_environment(scenario: Scenario, text: str) -> Scenario:
-    """Return the scenario with the environment of FILE.py:NAME: a Network, or an object with contacts and E or parts().
+def own_environment(text: str) -> Any:
+    """Return the environment of FILE.py:NAME: a Network, or an object with contacts and E or parts().
 
-    A class or a function is called without arguments. Raises InputError.
+    `Scenario.replace` accepts both. A class or a function is called without arguments. Raises InputError.
     """
     own = named("--environment", text)
-    own = called(f"--environment {text}", own) if callable(own) else own
-    return scenario.replace(environment=own)
+    return called(f"--environment {text}", own) if callable(own) else own
 
 
 def load(source: str | Path = DEFAULT) -> Scenario:
@@ -847,12 +853,20 @@ def _network(own: Any, T: Any) -> Network:
     return called(label, Network, tuple(contacts), block=block, elements=elements)
 
 
-class _Damping(msgspec.Struct, frozen=True):
+class _Damped(msgspec.Struct, frozen=True):
+    """Devices, and another guaranteed damping for each of them."""
+
     delta: tuple[float, ...]  # [N s/m]
+    device: tuple[Device, ...]
 
     def __post_init__(self) -> None:
         for i, damping in enumerate(self.delta, start=1):
             require(f"delta #{i}", damping, 0.0, MOST_DAMPING, "N s/m")
+        if len(self.delta) != len(self.device):
+            raise ValueError(f"delta has {len(self.delta)} entries for {len(self.device)} devices")
+
+    def devices(self) -> tuple[Device, ...]:
+        return tuple(one.with_damping(damping) for one, damping in zip(self.device, self.delta, strict=True))
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
@@ -874,7 +888,14 @@ def _plain(name: str, value: Any) -> Any:
 
     if isinstance(value, set | frozenset | bytes | bytearray):  # msgspec would take them for lists and text
         return of_numpy(value)
-    return msgspec.to_builtins(value, enc_hook=of_numpy)
+    return _lists(msgspec.to_builtins(value, enc_hook=of_numpy))
+
+
+def _lists(value: Any) -> Any:
+    """Return the value with lists in place of tuples, at every level."""
+    if isinstance(value, dict):
+        return {name: _lists(part) for name, part in value.items()}
+    return [_lists(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))  # stands for a human of a user's own class while other fields are checked

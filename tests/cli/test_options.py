@@ -3,6 +3,7 @@
 import argparse
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from haptic_loop.cli import options, render
@@ -111,3 +112,37 @@ def test_reference_and_case_must_agree():
 def test_numbers_are_one_per_device(words, said):
     with pytest.raises(InputError, match=said):
         options.scenario_from(run_parser().parse_args(["--scenario", "omega-space", *words.split()]))
+
+
+def scenario_of(words):
+    return options.scenario_from(run_parser().parse_args(words.split()))
+
+
+def test_known_bounds_and_damping_are_both_taken():
+    """Bounds of an option replace the scenario's own, with and without --delta."""
+    bounds = "--scenario omega-pair-known --known-device 0.06,14500,0.5,5"
+    scenario = scenario_of(f"{bounds} --delta 1.2 --theta 2,2 --latency 1e-4 --T 1e-3")
+    assert {bound.transmission_damping_max for bound in scenario.known_devices} == {5.0}
+    assert scenario.known_devices == scenario_of(bounds).known_devices
+    assert (scenario.delta, scenario.theta, scenario.T) == ((1.2, 1.2), (2, 2), 1e-3)
+    assert scenario.latency == ((0.0, 1e-4),) * 2
+
+
+OWN_ENVIRONMENT = """
+from haptic_loop.controller.environment import Network, Spring, environment
+
+ENDS = ("contact 1", "contact 2")
+NETWORK = Network(ENDS, springs=(Spring(ENDS, 100.0, 1.0),))
+
+class Own:
+    contacts = ENDS
+    def E(self, T):
+        return environment(NETWORK, T)
+"""
+
+
+def test_own_environments_are_computed_for_the_period(tmp_path):
+    (tmp_path / "own.py").write_text(OWN_ENVIRONMENT)
+    scenario = scenario_of(f"--T 5e-4 --environment {tmp_path}/own.py:Own")
+    stiffness = 100.0 + 1.0 / 5e-4  # backward Euler: K + B / T
+    np.testing.assert_allclose(scenario.loop("I").E().D, stiffness * np.array([[1, -1], [-1, 1]]), rtol=1e-6)

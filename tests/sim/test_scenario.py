@@ -7,9 +7,11 @@ from worlds import FIGURE_4
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
+from haptic_loop.controller.loop import DeviceBounds
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.robustness import robustness_nearby, vertices
 from haptic_loop.design.transparency import transparency
+from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
@@ -80,9 +82,12 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
     assert hands == [0.0, np.pi / 2], "who moves apart feels the spring between"
     assert made.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
     assert made.replace(theta=(1, 1)).human == made.human
-    for empty in ("psi = []", "human = []"):
-        with pytest.raises(InputError, match=rf"{empty[:3]}.* has 0 entries, but the environment has 2 contacts"):
-            parse(bare.replace("theta", f"{empty}\ntheta"))
+    for empty, expected in (
+        ("psi", "but the environment has 2 contacts"),
+        ("human", "expected 2, one for each device"),
+    ):
+        with pytest.raises(InputError, match=rf"{empty} has 0 entries, {expected}"):
+            parse(bare.replace("theta", f"{empty} = []\ntheta"))
     with pytest.raises(InputError, match=r"^x: missing T, theta; every scenario has name, T, theta, device, environ"):
         parse(bare.replace("T = 1e-3\ntheta = [3, 1]\n", ""), "x")
 
@@ -165,7 +170,8 @@ def test_scripts_and_files_make_equal_scenarios():
         ({"T": 1j}, "T holds 1j (complex), which no scenario can have"),
         ({"name": b"x"}, "name holds b'x' (bytes), which no scenario can have"),
         ({"human": None}, "human: expected `array`, got `null`"),
-        ({"device": ("a", "b")}, "device #1 = 'a': expected `object`, got `str`"),
+        ({"device": ("a", "b")}, "device #1: device is 'a', the catalogue has omega.3"),
+        ({"device": (1, 2)}, "device #1 = 1: expected `object`, got `int`"),
         ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
         ({"delta": (1.0, "x")}, "delta #2 = 'x': expected `float`, got `str`"),
         ({"delta": (float("nan"), 1.0)}, "delta #1 is nan, allowed are 0 to 10000 N s/m"),
@@ -176,6 +182,84 @@ def test_replacing_is_as_strict_as_a_file(change, message):
     with pytest.raises(InputError) as caught:
         load().replace(**change)
     assert message in str(caught.value)
+
+
+def test_damping_and_other_fields_are_replaced_together():
+    """A new damping keeps every other new field, in one step as in two steps of either order."""
+    known = load("omega-pair-known")
+    wider = DeviceBounds(0.06, 14500.0, 0.5, 5.0)
+    changes = {
+        "device": [msgspec.structs.replace(one, guaranteed=wider, force_limit=3.0) for one in known.device],
+        "theta": (2, 3),
+        "latency": ((0.0, 1e-4), (0.0, 2e-4)),
+        "human": known.human[::-1],
+        "environment": load("omega-pair-ranges").environment,
+    }
+    together = known.replace(delta=(1.0, 0.9), **changes)
+    assert together == known.replace(**changes).replace(delta=(1.0, 0.9))
+    assert together.known_devices == (wider, wider)
+    assert together.delta == (1.0, 0.9)
+    assert [one.force_limit for one in together.device] == [3.0, 3.0]
+    reversed_ = known
+    for name in reversed(changes):
+        reversed_ = reversed_.replace(delta=(1.0, 0.9), **{name: changes[name]})
+    assert reversed_ == together
+
+
+def test_the_damping_counts_the_new_devices():
+    rigid = {"kind": "rigid", "damping": 2.0}
+    assert load().replace(delta=(1.0, 0.5), device=[rigid, rigid]).device == (
+        RigidDevice(damping=1.0),
+        RigidDevice(damping=0.5),
+    )
+    with pytest.raises(InputError, match="delta has 2 entries for 1 devices"):
+        load().replace(delta=(1.0, 0.5), device=[rigid])
+
+
+def test_devices_and_environments_may_move_to_space():
+    pair, space = load(), load("omega-space")
+    moved = pair.replace(device=space.device, human=space.human)
+    assert moved.environment.contacts == tuple(f"contact {i}.{axis}" for i in (1, 2) for axis in "xyz")
+    stiffness = moved.environment.matrices()[2]
+    flat = pair.environment.matrices()[2]
+    alike = [
+        [moved.environment.nodes().index(f"{name}.{axis}") for name in ("contact 1", "contact 2", "mass")]
+        for axis in "xyz"
+    ]
+    for own in alike:  # each axis has the springs of the network on one axis
+        np.testing.assert_array_equal(stiffness[np.ix_(own, own)], flat)
+    assert space.replace(environment=pair.environment).environment == moved.environment
+    assert [one.damping for one in pair.replace(device="omega.3").device] == [1.37, 1.37]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"human": 4}, "human has 4 entries, expected 2, one for each device"),
+        ({"theta": 4}, "theta has 4 entries, expected 2, one for each device"),
+        ({"psi": 1}, "psi has 1 entries, expected 2, one for each device"),
+        ({"lam": 3}, "lam has 3 entries, expected 2, one for each device"),
+        ({"latency": 3}, "latency has 3 entries, expected 2, one for each device"),
+        ({"delta": 6}, "delta has 6 entries for 2 devices"),
+    ],
+)
+def test_lists_in_space_are_per_device(change, message):
+    space = load("omega-space")
+    entry = {"human": space.human[0], "latency": (0.0, 1e-4)}
+    ((name, count),) = change.items()
+    with pytest.raises(InputError) as caught:
+        space.replace(**{name: [entry.get(name, 1)] * count})
+    assert str(caught.value) == message
+
+
+def test_device_axes_are_counted_with_the_contacts():
+    plane = msgspec.structs.replace(load("omega-space").device[0], axes=2)
+    network = load("omega-space").environment
+    with pytest.raises(InputError) as caught:
+        load().replace(device=[plane, plane], environment=network, theta=(1, 1), psi=(0, 0))
+    assert str(caught.value).startswith(
+        "device has 2 entries with 4 free axes in all, but the environment has 6 contacts (left.x, left.y"
+    )
 
 
 @pytest.mark.parametrize("case", ["III", "i", "", None, 1])
