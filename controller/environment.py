@@ -475,11 +475,6 @@ class Network(
         signed = [(node, sign * c) for nodes, sign in ends for node, c in zip(nodes, direction, strict=True)]
         return [[(node, c) for node, c in signed if c and node != GROUND]]
 
-    def joined(self, part: Spring | Wall) -> list[list[str]]:
-        """Return the nodes that each elongation of a part joins, with ground if there is only one."""
-        free = [[node for node, _ in ends] for ends in self._lengths(part)]
-        return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
-
     def across(self, parts: Sequence[Spring | Wall]) -> Array:
         """Return the displacement across each part as rows over `nodes()`: +1 at its first end, -1 at its second.
 
@@ -536,10 +531,10 @@ def environment(network: Network, T: Number) -> Lti:
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
     dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has no mass and
-    nothing holds it.
+    nothing holds it, or if the rounding of directions alone holds it.
     """
-    adrift = _adrift(network, network.springs)
-    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
+    free = _free_directions(network, network.springs, T)
+    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
     return E + network.block.at(T) if network.block else E
 
 
@@ -551,41 +546,77 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
-    adrift = () if places else _adrift(network, (*network.springs, *network.walls))
+    free = () if places else _free_directions(network, (*network.springs, *network.walls), T)
     if places:
         across = np.vstack([np.eye(across.shape[1], dtype=across.dtype), across])
-    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
+    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, free), T)
     if not network.block:
         return E
     w = len(across)
     return E + Lti.diag(network.block.at(T), Lti.constant(np.zeros((w, w)), T))
 
 
-def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
-    """Return the bodies that no spring joins to a contact or to ground, as lists of indices of internal nodes.
+_Sum = dict[int, Fraction]  # a sum over displacements of internal nodes: index -> factor
 
-    Only dampers and inerters act on such a body, so that its position affects no force and would be an unobservable
-    integrator. `_realise` stores the positions of its nodes relative to the first node.
+
+def _free_directions(network: Network, parts: Sequence[Spring | Wall], T: Number) -> list[tuple[int, Array]]:
+    """Return the directions in which no stiffness resists the internal nodes, each as (node, displacements (n,)).
+
+    The position in such a direction affects no force and would be an unobservable integrator. The node of a direction
+    moves by 1 in it and not at all in the others; `_realise` stores positions relative to this node. A body that no
+    spring joins to a contact or to ground may move as a whole. A body that one diagonal spring ties to ground may move
+    across this spring. The elimination is exact, and the result has the arithmetic of T.
     """
-    names = network.nodes()
-    body = {name: name for name in (*names, GROUND)}  # union-find: each node points towards its body's root
+    inner = {name: i for i, name in enumerate(network.nodes()[len(network.contacts) :])}
+    lengths = [ends for part in parts if part.stiffness > 0 for ends in network._lengths(part)]
+    tied: dict[int, _Sum] = {}  # node -> its displacement as a sum over nodes before it
+    for ends in lengths:
+        row: _Sum = {inner[node]: rational(sign) for node, sign in ends if node in inner}
+        while row:
+            last = max(row)
+            own = row.pop(last)
+            if last not in tied:
+                tied[last] = {i: -v / own for i, v in row.items()}
+                break
+            row = _plus(row, own, tied[last])
+    moves: list[_Sum] = []  # by node: its displacement as a sum over the free nodes
+    for i in range(len(inner)):
+        displacement: _Sum = {} if i in tied else {i: Fraction(1)}
+        for j, factor in tied.get(i, {}).items():
+            displacement = _plus(displacement, factor, moves[j])
+        moves.append(displacement)
+    free = [i for i in range(len(inner)) if i not in tied]
+    if any(sign not in (1, -1) for ends in lengths for _, sign in ends):
+        _check_directions(lengths, inner, len(free))
+    zero = Fraction(0)
+    return [(i, numbers(np.array([displacement.get(i, zero) for displacement in moves]), T)) for i in free]
 
-    def head(name: str) -> str:
-        while body[name] != name:
-            name = body[name]
-        return name
 
-    for spring in springs:
-        if spring.stiffness > 0:
-            for first, *others in network.joined(spring):
-                for other in others:
-                    body[head(first)] = head(other)
-    held, inner = {head(name) for name in (*network.contacts, GROUND)}, names[len(network.contacts) :]
-    groups: dict[str, list[int]] = {}
-    for i, name in enumerate(inner):
-        if head(name) not in held:
-            groups.setdefault(head(name), []).append(i)
-    return list(groups.values())
+def _plus(one: _Sum, factor: Fraction, other: _Sum) -> _Sum:
+    """Return one + factor * other, without zeros."""
+    total = {i: one.get(i, 0) + factor * other.get(i, 0) for i in {**one, **other}}
+    return {i: Fraction(v) for i, v in total.items() if v}
+
+
+_SLACK = 1e-9  # smaller eigenvalues, relative to the largest one, come from the rounding of directions
+
+
+def _check_directions(lengths: Sequence[Sequence[tuple[str, float]]], inner: dict[str, int], free: int) -> None:
+    """Raise ValueError if more directions than `free` are free within rounding."""
+    rows = np.zeros((len(lengths), len(inner)))
+    for row, ends in zip(rows, lengths, strict=True):
+        for node, sign in ends:
+            if node in inner:
+                row[inner[node]] += sign
+    values, vectors = np.linalg.eigh(rows.T @ rows)
+    loose = np.flatnonzero(values <= _SLACK * values.max(initial=0.0))
+    if loose.size > free:
+        moving = np.abs(vectors[:, loose]).max(axis=1) > 1e-3
+        shown = ", ".join(name for name, i in inner.items() if moving[i])
+        raise ValueError(
+            f"springs and walls at {shown} have almost equal directions, whose rounding alone holds them: "
+            "make the directions equal, or add a spring `along` each free direction"
+        )
 
 
 def _solvable(network: Network, T: Number) -> _Matrices:
@@ -596,28 +627,7 @@ def _solvable(network: Network, T: Number) -> _Matrices:
     inner = slice(len(network.contacts), None)
     if free and np.linalg.cond((M / T + D + T * K)[inner, inner]) > 1e14:
         raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
-    if network.points:
-        _check_held(network, K[inner, inner], free)
     return M, D, K
-
-
-_SLACK = 1e-9  # smaller stiffnesses, relative to the largest one, come from the rounding of directions
-
-
-def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
-    """Raise ValueError if springs hold a body in some directions only.
-
-    A group of `_adrift` may move in one direction, which `_realise` takes for a common translation of its nodes. A
-    single diagonal spring to ground leaves another direction free and is not refused.
-    """
-    adrift = _adrift(network, network.springs)
-    loose = {i for group in adrift for i in group}
-    held = [i for i in range(len(names)) if i not in loose]
-    for group, free in ((held, 0), *((group, 1) for group in adrift)):
-        stiffness = np.linalg.eigvalsh(K[np.ix_(group, group)])
-        if stiffness.size > free and stiffness[free] <= _SLACK * stiffness[-1]:
-            shown = ", ".join(names[i] for i in group)
-            raise ValueError(f"springs hold {shown} in some directions only: add a spring `along` each free direction")
 
 
 def _realise(
@@ -625,12 +635,12 @@ def _realise(
     c: int,
     T: Any,
     across: Array | None = None,
-    adrift: Sequence[Sequence[int]] = (),
+    free: Sequence[tuple[int, Array]] = (),
 ) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C, D of E(z) for the network (M, D, K) whose first `c` nodes are contacts.
 
     With `across` (w, nodes) E has w more inputs, the forces against the displacements `across q`, and w more outputs,
-    these displacements. The positions of internal nodes in a group of `adrift` are relative to the group's first node.
+    these displacements. In each direction of `free` (node, displacements) positions are relative to the node's.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
@@ -643,8 +653,8 @@ def _realise(
     n, w = M.shape[-1] - c, 0 if across is None else len(across)
     signals = np.eye(3 * c + w + 2 * n, dtype=M.dtype)
     x, p, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, w, n, n, c]))
-    for group in adrift:
-        q_old[group[0]] = 0
+    for node, _ in free:
+        q_old[node] = 0
     vx = (x - x_old) / T
     push = times(Mii / T, v_old) - times(Kii, q_old) - times(Dic, vx) - times(Kic, x)
     if joined := (Mci != 0).any():
@@ -659,8 +669,9 @@ def _realise(
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
-    for group in adrift:
-        q[list(group)] = q[list(group)] - q[group[0]]
+    for node, displacements in free:
+        moving = np.flatnonzero(displacements)
+        q[moving] = q[moving] - displacements[moving, None] * q[node]
     inputs = c + w
     after = np.concatenate([np.broadcast_to(part, (*M.shape[:-2], *part.shape[-2:])) for part in (q, v, x, vx)], -2)
     keep = _remembered(after, force, inputs)

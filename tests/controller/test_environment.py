@@ -1,10 +1,12 @@
 """Backward-Euler networks against closed forms, and the laws every passive network keeps."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from worlds import FIGURE_4
 
-from haptic_loop.controller.environment import GROUND, Network, Networks, Spring, environment
+from haptic_loop.controller.environment import GROUND, Network, Networks, Spring, Wall, environment, walled_environment
 
 T = 1.2e-3
 W = np.geomspace(1e-3, np.pi, 80)
@@ -40,6 +42,64 @@ def test_static_stiffness_of_figure_4_has_rank_one():
 )
 def test_small_networks_are_their_closed_forms(network, force):
     np.testing.assert_allclose(environment(network, T).at(Z)[:, 0, 0], force, rtol=1e-7)
+
+
+PLANE = {"hand": ("hand.x", "hand.y"), "body": ("body.x", "body.y")}
+OBLIQUE = (0.6, 0.8)
+
+
+@pytest.mark.parametrize("period", [T, Fraction(12, 10000)])
+def test_one_diagonal_spring_leaves_its_perpendicular_free(period):
+    """A damper in series with m s^2 + k along the spring, and with m s^2 across it."""
+    springs = (Spring(("hand", "body"), 0.0, 5.0), Spring(("body", GROUND), 2000.0, along=OBLIQUE))
+    E = environment(Network(PLANE["hand"], springs, {"body": 0.1}, points=PLANE), period).floats()
+    damper, along, across = 5 * S, 0.1 * S**2 + 2000, 0.1 * S**2
+    u, n = np.array(OBLIQUE), np.array([-0.8, 0.6])
+    expected = sum((damper * z / (damper + z))[:, None, None] * np.outer(d, d) for d, z in ((u, along), (n, across)))
+    np.testing.assert_allclose(E.at(Z), expected, rtol=1e-7, atol=1e-9)
+    assert np.abs(np.linalg.eigvals(E.A)).max() < 0.999
+
+
+def test_oblique_wall_touches_free_body():
+    """The displacement across the wall is that of m s^2 + B s along the normal, under the wall's force."""
+    wall = Wall(("body", GROUND), 1000.0, normal=OBLIQUE)
+    network = Network(PLANE["hand"], (Spring(("hand", "body"), 0.0, 5.0),), {"body": 0.1}, (wall,), points=PLANE)
+    y = walled_environment(network, T).at(Z)[:, 2, :]
+    alone = 0.1 * S**2 + 5 * S
+    expected = np.array([0.6 * 5 * S / alone, 0.8 * 5 * S / alone, -1 / alone]).T
+    np.testing.assert_allclose(y, expected, rtol=1e-7)
+
+
+def oblique_networks(seed):
+    rng = np.random.default_rng(seed)
+    points = {name: tuple(f"{name}.{axis}" for axis in "xyz") for name in ("hand", "body", "other")}
+    directions = rng.normal(size=(3, 3)).round(3).tolist()
+    springs = [Spring(("hand", "body"), 0.0, 3.0), Spring(("body", "other"), 0.0, 1.0)]
+    for _ in range(rng.integers(1, 6)):
+        ends = tuple(rng.choice([*points, GROUND], 2, replace=False).tolist())
+        springs.append(Spring(ends, rng.uniform(10, 3000), rng.uniform(0, 3), along=directions[rng.integers(3)]))
+    return Network(points["hand"], tuple(springs), {"body": 0.1, "other": 0.2}, points=points)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_oblique_networks_are_their_dynamic_stiffness(seed):
+    network = oblique_networks(seed)
+    E = environment(network, T)
+    M, D, K = network.matrices()
+    stiffness = M * S[:, None, None] ** 2 + D * S[:, None, None] + K
+    expected = stiffness[:, :3, :3] - stiffness[:, :3, 3:] @ np.linalg.solve(stiffness[:, 3:, 3:], stiffness[:, 3:, :3])
+    np.testing.assert_allclose(E.at(Z), expected, atol=1e-8 * np.abs(expected).max())
+    assert np.abs(np.linalg.eigvals(E.A)).max() < 1 - 1e-6
+
+
+def test_directions_equal_up_to_rounding_are_refused():
+    """Three directions of a plane, which span space only by the rounding of their lengths."""
+    points = {"hand": ("h.x", "h.y", "h.z"), "body": ("b.x", "b.y", "b.z")}
+    springs = [Spring(("body", GROUND), 2000.0, along=d) for d in ((1.0, 2.0, 3.0), (2.0, 1.0, 1.0), (3.0, 3.0, 4.0))]
+    springs.append(Spring(("hand", "body"), 0.0, 5.0))
+    network = Network(points["hand"], tuple(springs), {"body": 0.1}, points=points)
+    with pytest.raises(ValueError, match=r"b.x, b.y, b.z"):
+        environment(network, T)
 
 
 def random_network(rng) -> Network:
