@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
-from haptic_loop.controller.environment import Environment, held
+from haptic_loop.controller.environment import RIGID_WALL, Environment, held
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
@@ -155,6 +155,11 @@ def design_by_kind(
 
     if loop.latency and (reason := made_for.beyond(loop)):
         raise ValueError(f"latency: {reason.removeprefix('latency: ')}")
+    if loop.environment is RIGID_WALL and kind != "moving-average" and made_for is not KNOWN_DEVICE_ANY:
+        other = (
+            "use moving-average, spring-damper with known-device-any, or design.audit --rigid for the stiffest spring"
+        )
+        raise ValueError(f"environment: a rigid wall has no E(z) with which {kind} is designed; {other}")
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:
@@ -183,7 +188,9 @@ def _by_own_function(loop: Loop, kind: str, condition: str | Condition | None) -
 
 
 def _without_force(loop: Loop) -> bool:
-    """Return whether the environment has a model and never exerts a force."""
+    """Return whether the environment has an E(z) and never exerts a force."""
+    if loop.environment is RIGID_WALL:
+        return False
     with suppress(SingularLoop):  # A world has no E(z).
         return silent(loop.E())
     return False

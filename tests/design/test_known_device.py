@@ -671,6 +671,20 @@ def test_the_stiffest_spring_damper_for_any_environment():
             assert ((1 / W).real < limit * np.abs(1 - 1 / z) ** 2 / loop.T).any()
 
 
+def test_rigid_wall_gets_the_stiffest_spring_damper():
+    """The wall's E(z) is unknown, but the condition holds for any environment, with 5223.8 N/m at most."""
+    loop = change(one(1.2e-3, 1.37), environment=RIGID_WALL)
+    found = design_coupling(loop, "spring-damper", "known-device-any")
+    assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)
+    assert found.coupling.B[0] == pytest.approx(7.352, rel=1e-2)
+
+
+@pytest.mark.parametrize("kind", ["spring-damper", "ccl", "optimal"])
+def test_rigid_wall_refuses_designs_that_need_its_model(kind):
+    with pytest.raises(ValueError, match=r"rigid wall has no E.* moving-average, .*known-device-any"):
+        design_coupling(change(loop_of(1e-3, (1.37,), (0,)), environment=RIGID_WALL), kind)
+
+
 @pytest.mark.parametrize(("theta", "stiffness"), [(0, 5913.6), (2, 1029.7)])
 def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     loop = one(1.2e-3, 1.37, theta)
