@@ -101,7 +101,7 @@ _NOT_CERTIFIED = "not certified, so there are no margins"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest certified stiffness [N/m] of each channel with its B, or None and the reason."""
+    """The largest certified stiffness [N/m] of each channel with its B, all together; None and the reason if none."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)
@@ -123,12 +123,12 @@ class _Sensitivity:
 
 
 def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest:
-    """Return the largest certified K: a common scale, or channel by channel if the condition is separable."""
+    """Return the largest certified K: channel by channel if the condition is separable, else a common multiple of K."""
     unknown, resolved = (None,) * loop.channels, named(condition)
     gains = coupling.figures(loop.T)
     if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
-    if resolved.separable:
+    if resolved.separable(loop):
         reason = resolved.not_varied(loop) or resolved.beyond(loop)
         return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], resolved)
     if reason := resolved.not_varied(loop):
@@ -142,19 +142,16 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
     scale = _STIFFEST / K.max()
     if suffices(ratio(scale)):
         return _Stiffest(unknown, f"certified at the stiffest K tried, {_STIFFEST:g} N/m")
-    while scale * K.max() > _SOFTEST:
-        softer = scale / _STEP
-        if suffices(ratio(softer)):
-            return _Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
-        scale = softer
-    return _Stiffest(unknown, "with this B, no multiple of K down to 1 N/m is certified")
+    largest = _largest(ratio, scale, _SOFTEST / K.max())
+    if largest is None:
+        return _Stiffest(unknown, f"with this B, no multiple of K down to {_SOFTEST:g} N/m is certified")
+    return _Stiffest(tuple((largest * K).tolist()))
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
     """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound at frequencies with z^-n = -1.
 
-    The set of certified gains is convex and contains K -> 0, so there is only one edge. Of a matrix of damping only the
-    diagonal is used, so that these K may not be certified together.
+    Without a latency the set of certified gains is convex and contains K -> 0, so there is only one edge.
     """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
@@ -169,8 +166,23 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
             return condition.judge(alone, SpringDamper([K], [B])).ratio
 
         bound = 2 * (delta - B) / loop.T
-        stiffest.append(edge(ratio, 1e-9 * bound, bound))
+        softest = 1e-9 * bound
+        largest = edge(ratio, softest, bound) if suffices(ratio(softest)) else _largest(ratio, bound, _SOFTEST)
+        stiffest.append(largest)
+        if largest is None:
+            reasons.append(f"with B = {B:g} N s/m, no K down to {_SOFTEST:g} N/m is certified")
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
+
+
+def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
+    """Return the largest certified value that steps from `most` down to `least` find, or None."""
+    outside = most
+    while outside > least:
+        inside = outside / _STEP
+        if suffices(ratio(inside)):
+            return edge(ratio, inside, outside)
+        outside = inside
+    return None
 
 
 def sensitivity(loop: Loop, coupling: Coupling, condition: _Condition) -> _Sensitivity:

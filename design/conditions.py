@@ -249,7 +249,10 @@ class Condition(ABC):
     name: str  # name in requirements, certificates and reports
     covers: tuple[str, ...] = ()  # items of `BEYOND` that the block covers; a subclass does not inherit them
     source: str | None = None  # reference for a report
-    separable: bool = False  # whether channels are judged one by one for a coupling without cross terms
+
+    def separable(self, loop: Loop) -> bool:
+        """Return whether the condition judges each channel alone for a coupling without cross terms."""
+        return False
 
     @property
     def extensible(self) -> bool:

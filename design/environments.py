@@ -624,8 +624,12 @@ class _AnyEnvironment(Multiplied):
     A latency and switching delays use the block of design.facts.compose_any.
     """
 
-    name, source, separable = "any-environment", "the paper's Theorem 4", True
+    name, source = "any-environment", "the paper's Theorem 4"
     covers = BEYOND
+
+    def separable(self, loop: Loop) -> bool:
+        # Matrix levels couple the axes of a device, and so do multipliers of a latency or of delays that switch.
+        return not loop.levels and not (loop.axes and self.unknowns(loop))
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
         """Return the facts of the environment's side that the block needs."""
@@ -704,7 +708,7 @@ class _AnyEnvironment(Multiplied):
         if _in_frame(loop):
             return self._in_frame(V, loop, multiplier)
         if not any(loop.psi):
-            channels = None if loop.levels else coupling.channels(loop.T)
+            channels = coupling.channels(loop.T) if self.separable(loop) else None
             if channels:
                 return any_environment_per_channel(channels, loop)
             return any_environment(V, loop)

@@ -141,7 +141,7 @@ class CouplingSweep(_Sweep):
         if reason:
             return np.full(K.size, np.inf)
         couplings, loops = self._couplings(K, B), [(self.loop, None)]
-        if judge.separable:
+        if judge.separable(self.loop):
             each = [None] * self.loop.channels if multiplier_of is None else [(p,) for p in multiplier_of.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)

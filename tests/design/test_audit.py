@@ -119,6 +119,46 @@ def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
     assert stiffest(*wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
 
 
+def test_the_stiffest_gains_respect_full_levels():
+    """With theta = 0 the certified K are those below 2 (least eigenvalue of Delta - B)/T."""
+    level = np.array([[1.0, 0.9], [0.9, 1.0]])
+    plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
+    loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.0, 1.0), plane, axes=(2,), levels=(tuple(map(tuple, level.tolist())),))
+    expected = 2 * (np.linalg.eigvalsh(level)[0] - 0.05) / 1e-3
+    K = stiffest(loop, SpringDamper([100.0] * 2, [0.05] * 2), "any-environment").K
+    assert np.array(K) == pytest.approx(expected, rel=1e-6)
+    assert requirement(loop, SpringDamper(K, [0.05] * 2), "any-environment").certified
+    beyond = stiffest(loop, SpringDamper([100.0] * 2, [0.3] * 2), "any-environment")
+    assert beyond.K == (None, None)
+    assert "no multiple of K" in beyond.reason
+
+
+def test_axes_of_a_late_device_share_multipliers():
+    """The stiffest K of both axes is certified together, not only axis by axis."""
+    plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
+    late = {"axes": (2,), "latency": ((0.0, 5e-4),) * 2}
+    loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.5, 0.9), plane, **late)
+    K = stiffest(loop, SpringDamper([1500.0, 900.0], [0.3] * 2), "any-environment").K
+    assert requirement(loop, SpringDamper(K, [0.3] * 2), "any-environment").certified
+
+
+@pytest.mark.parametrize("B", [0.62, 0.85, 0.899])
+def test_the_stiffest_gains_of_late_forces_are_certified(B):
+    """For large B no K is certified although B < delta, and a K near 0 may need more damping than a larger one."""
+    loop, coupling = wall(100, B, theta=1, delta=0.9)
+    loop = msgspec.structs.replace(loop, latency=((0.0, 9e-4),))
+    margin = stiffest(loop, coupling, "any-environment")
+    certified = [
+        K for K in (1.0, 10.0, 100.0) if requirement(loop, SpringDamper([K], [B]), "any-environment").certified
+    ]
+    assert (margin.K[0] is None) == (not certified)
+    if certified:
+        assert margin.K[0] >= certified[-1]
+        assert requirement(loop, SpringDamper(margin.K, [B]), "any-environment").certified
+    else:
+        assert f"with B = {B:g} N s/m, no K" in margin.reason
+
+
 def test_the_largest_period_before_a_wall_is_colgates():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
