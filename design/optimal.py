@@ -117,9 +117,8 @@ def design(
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
-    Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency or with
-    devices of several axes, for a limiter that has no design in this loop, and for a loop that no damping makes safe
-    without a coupling.
+    Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
+    that has no design in this loop, and for a loop that no damping makes safe without a coupling.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
@@ -553,9 +552,11 @@ class _Search:
 
         def constrained(case: program.Case) -> program.Case:
             beside = [each for each in case.constraints if each.name in ("high-frequency gain", "mismatch")]
-            return replace(case, constraints=(program.known_device(case.loop, self.known, beta, multipliers), *beside))
+            there = case.loop.switching(loop.varying_delay)  # The loop of a case has constant delays.
+            return replace(case, constraints=(program.known_device(there, self.known, beta, multipliers), *beside))
 
         def need(there: Loop, coupling: Coupling) -> float:
+            there = there.switching(loop.varying_delay)
             return KNOWN_DEVICE.judge(there, coupling, whole).ratio if loop.ranges else 0.0
 
         soft = program.SOFT[0] * min(error, program.SOFT[1])

@@ -122,21 +122,24 @@ def this_environment(loop: Loop) -> _Constraint:
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """Return SWITCHING as a constraint for delays that switch within the span.
 
-    Its own unknowns are alpha T/Delta, the scaled multipliers of the channels that switch. Every device must have one
-    axis.
+    Its own unknowns are the multipliers alpha of the devices whose delay varies, in units of the least damping of the
+    device's axes over T.
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
-    moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
+    moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))  # channels; each has an input for its error
+    (multiplier,) = SWITCHING.unknowns(switched)
+    units = np.array(multiplier.units)  # (devices,), 0 where the delay is constant
+    count = np.count_nonzero(units)
 
     def block(G: Sampled, own: Array) -> Sampled:
-        alpha = np.zeros(scale.size)
-        alpha[moves] = own * scale[moves]
+        alpha = np.zeros(units.size)
+        alpha[units > 0] = own * units[units > 0]
         demand = SWITCHING.block(G, switched, alpha)
         return demand.free + demand.gain * (1 - MARGIN)
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
-    return _Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
+    return _Constraint("switching delays", block, unit, start=(0.5,) * count, cost=(0.0,) * count)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.coupling_file import load as load_stored
 from haptic_loop.design.optimal import design_with
 from haptic_loop.design.result import DesignFailed
@@ -100,5 +101,24 @@ def test_an_optimal_coupling_for_switching_delays():
     links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, 2, 1, 3)))
     links[..., 1] = 0.0
     loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
+    held_by = variants(loop.scenario.device, Crowd(links))
+    assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact > 0).any()
+
+
+@pytest.mark.slow
+def test_optimal_couplings_of_known_devices_take_switching():
+    """Proved with known motors; lossless hands under the worst switching do not grow."""
+    scenario = load("omega-pair-known")
+    loop = scenario.loop("I").switching(DelayRange(*RANGE))
+    made = design_with(loop, "known-device", bases=((4, 3),))
+    guarantee = assess(loop, made.coupling, certificate=made.certificate).guarantee
+    assert (guarantee.condition, guarantee.proof) == ("known-device", "rational")
+    assert guarantee.delays == loop.varying_delay
+    # found: -29.3 dB over this basis
+    assert 20 * np.log10(made.objective) < -29.0
+    rng = np.random.default_rng(0)
+    links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, 2, 1, 3)))
+    links[..., 1] = 0.0
+    loop = assemble(scenario.replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
     held_by = variants(loop.scenario.device, Crowd(links))
     assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact > 0).any()
