@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
@@ -307,9 +308,10 @@ class Frame:
     mean: Array  # (m,) mean force fed back since the last frame [N]
     low: Array  # (m,) least force since the last frame [N]
     high: Array  # (m,) largest force since the last frame [N]
+    at_limit: NDArray[np.bool_]  # (m,) whether a force since the last frame was at the limit of its axis or vector
     push: Array  # (m,) force of the mouse or the script on each handle [N]
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
-    clipped: int  # ticks in `history` in which the force on some axis reaches `force_limit`
+    clipped: int  # ticks in `history` in which some force is at its limit (controller.tick.at_limit)
     prepared: PreparedLoop
     note: str  # the last event, or the reason why it was refused
     overruns: int
@@ -376,7 +378,8 @@ class LiveLoop:
         history = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
         recent = self._history[-1:] if history is None else history
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
-        n, limit = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process.force_limit
+        n, process = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process
+        over, last = (at_limit(f[:, :, None], process.force_limit, process.balls)[:, :, 0] for f in (shown, recent))
         world = self.world
         return Frame(
             pose=world and world.ports[0].data.qpos.copy(),
@@ -389,7 +392,8 @@ class LiveLoop:
             high=recent.max(axis=0),
             push=push,
             history=shown.copy(),
-            clipped=int((np.abs(shown) >= limit).any(axis=1).sum()),
+            at_limit=np.any(last, axis=0),
+            clipped=int(np.any(over, axis=1).sum()),
             prepared=self.prepared,
             note=self._note,
             overruns=self.pace.overruns,

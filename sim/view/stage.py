@@ -230,9 +230,8 @@ class _ShownScene:
             handles = np.array(self.scene.handles)[channels]
             axes, reach = self.model.jnt_axis[handles], _LONGEST / self.force_limit[channels]
             at = self.data.xpos[self.model.jnt_bodyid[handles[0]]] + np.array([0, 0, 0.045])
-            clipped = np.maximum(-frame.low, frame.high)[channels] >= self.force_limit[channels]
             for axis, low, high, each, over in zip(
-                axes, frame.low[channels], frame.high[channels], reach, clipped, strict=True
+                axes, frame.low[channels], frame.high[channels], reach, frame.at_limit[channels], strict=True
             ):
                 band = (*_ALARM, 0.6) if over else (*own, 0.35)
                 _connect(drawn, _BAR, 0.010, at - high * each * axis, at - low * each * axis, band)
@@ -623,8 +622,7 @@ class _FlatPictures:
             return
         (i,) = channels
         reach = per_metre * _LONGEST / self.force_limit[i]
-        clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
-        shade = _ALARM if clipped else _colour(device)
+        shade = _ALARM if frame.at_limit[i] else _colour(device)
         pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(shade), 3)
         pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(_colour(device)), 4)
         if frame.push[i]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from PIL import Image
 
 from haptic_loop import simulate
@@ -20,7 +21,7 @@ from haptic_loop.cli import view as command
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.result import Chosen
 from haptic_loop.models.hold import hold
-from haptic_loop.models.human import Human, Link, Person
+from haptic_loop.models.human import Human, Link, Person, Voluntary
 from haptic_loop.models.scene import APART, build, plant
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
@@ -173,6 +174,24 @@ def test_the_oscillation_starts_and_dies(none):
     assert calm.prepared.mode.growth < 0
     assert np.abs(calm.history[-200:]).max() < 2  # the voluntary motion is still felt
     assert [what for _, what, _ in running.log] == ["start", "theta+2", "theta-3", "published"]
+
+
+def test_vectors_at_their_limit_are_counted():
+    """A frame counts a force vector at its longest, although no axis alone reaches the limit."""
+    space = load("omega-space")
+    pushed = Human((Link(0.3, 3.0, 200.0),), Voluntary(0.05, 2.0, along=(1.0, 1.0, 1.0)))
+    limit = 0.3
+    devices = [structs.replace(one, force_limit=limit) for one in space.device]
+    running = session(first_loop(Menu("I"), space.replace(device=devices, human=[pushed, pushed], tap=None), "none"))
+    frame = running.frame(0.5)
+    lengths = np.linalg.norm(frame.history.reshape(-1, 2, 3), axis=2)
+    assert np.abs(frame.history).max() < limit
+    assert frame.clipped == (lengths.max(axis=1) > limit * (1 - 1e-9)).sum() > 10
+    assert frame.clipped == running.clipped
+    recent = running.frame(0.52)
+    count = round(recent.t / space.T) - round(frame.t / space.T)
+    over = np.linalg.norm(recent.history[-count:].reshape(-1, 2, 3), axis=2).max(axis=0) > limit * (1 - 1e-9)
+    np.testing.assert_array_equal(recent.at_limit, np.repeat(over, 3))
 
 
 def replace_theta(prepared, theta):
