@@ -261,6 +261,7 @@ class ForceLimits:
         less: Whether the limiter is proved in one environment only, while the guarantee covers more.
         energy_budget: The energy W0 [J] that forces may give in total; None without a budget.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
+        proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
     """
 
     rho: tuple[float, ...] | None
@@ -272,6 +273,7 @@ class ForceLimits:
     less: bool = False
     energy_budget: float | None = None
     void: bool = False
+    proof: str = "sampled"
 
     def within(self, force_limit: Sequence[float]) -> ForceLimits:
         """Return the record with other limits (m,) [N], which no proof depends on."""
@@ -297,8 +299,8 @@ class ForceLimits:
 
     @property
     def proved(self) -> bool:
-        """Whether the limiter needs no proof of its own, or has one in exact arithmetic."""
-        return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
+        """Whether exact arithmetic proves the condition that covers the limiter in this loop."""
+        return self.rho is not None and self.proof == "rational"
 
     def part(self) -> dict[str, Any]:
         """Return the fields of its JSON."""
@@ -319,9 +321,10 @@ def _covered_limits(
     is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise multipliers
     are searched for a limiter of the same beta. `known` is a certificate that has been verified.
     """
-    for each in requirements.values():
-        if each.certified and each.lag is not None:
-            return ForceLimits(each.lag, f"{each.condition} covers limited forces")
+    covering = [each for each in requirements.values() if each.certified and each.lag is not None]
+    for each in sorted(covering, key=lambda each: each.proof != "rational"):
+        swept = "" if each.proof == "rational" else "by a refined sweep, without an exact proof: "
+        return ForceLimits(each.lag, f"{swept}{each.condition} covers limited forces", proof=each.proof)
     extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
     if not extended:
         return ForceLimits(None, "no certified condition that extends to limited forces")
@@ -345,7 +348,7 @@ def _by_its_own_block(
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
             c = _rows(condition, loop, requirement)
-            return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof)
+            return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof, proof=requirement.proof)
         except NotProved:  # The proof belongs to another loop.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
@@ -360,7 +363,7 @@ def _by_its_own_block(
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
         return ForceLimits(rho, f"swept, not proved: {refused}", requirement, c)
-    return ForceLimits(rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
+    return ForceLimits(rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved, proof="rational")
 
 
 def _rows(
@@ -381,7 +384,8 @@ class Guarantee:
 
     Attributes:
         condition: The condition that gives the guarantee, or "energy-budget".
-        proof: "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick.
+        proof: "rational": exact arithmetic, also for limited forces if `forces` names them; "sampled": a refined sweep;
+            "account": an energy account at every tick.
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers; of an energy account "no passive hand", the subject of `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
@@ -717,12 +721,13 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
     """Return the guarantee of a certified requirement in these environments."""
     loop, limits = assessment.loop, assessment.force_limits
     forces = BELOW_LIMITS if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
+    proof = by.proof if limits.rho is None or limits.proved else "sampled"
     longest = loop.T_max or loop.T
     facts = tuple(fact for fact in assessment.facts if environments != ANY or fact not in ("walls", "ranges"))
     bounded = by.condition in KNOWN_CONDITIONS
     hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
     facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)
-    return Guarantee(by.condition, by.proof, facts, hands, environments, forces, loop.delays, longest)
+    return Guarantee(by.condition, proof, facts, hands, environments, forces, loop.delays, longest)
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:

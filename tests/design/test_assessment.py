@@ -15,11 +15,12 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design import assessment as assessment_module
 from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
-from haptic_loop.design.result import HERE
+from haptic_loop.design.result import HERE, NotProved
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.scenario import load
@@ -96,6 +97,33 @@ def test_a_clipped_guarantee_says_where_it_ends():
     assert lost.force_limits.words == "limited to 12 N, without a guarantee"
     unstable = assess(loop, SpringDamper([1e5, 1e5], [0.0, 0.0]), force_limit=(12.0, 12.0))
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
+
+
+def test_a_sweep_of_limited_forces_is_no_proof():
+    """A coefficient of 130 decimals has no exact proof: any-environment, which covers the limiter, is only swept."""
+    loop = change(LOOP, theta=(0, 0), lam=(0, 0))
+    for B, proof in ((0.01, "rational"), (1e-130, "sampled")):
+        assessment = assess(loop, SpringDamper([100.0] * 2, [B] * 2), force_limit=(12.0, 12.0))
+        limits = assessment.force_limits
+        assert assessment.requirements["any-environment"].proof == assessment.guarantee.proof == proof
+        assert limits.rho == (0.0, 0.0)
+        assert limits.proved == (proof == "rational")
+        assert limits.words.startswith("proved") == (proof == "rational")
+        assert ("without an exact proof" in limits.words) == ("without an exact proof" in verdict(assessment))
+
+
+def test_a_proof_without_the_limiter_is_partial(monkeypatch):
+    """The linear loop is proved, its limiter only swept: the guarantee, also at the limits, rests on a sweep."""
+
+    def refuse(*args, **kwargs):
+        raise NotProved("a proof takes long")
+
+    monkeypatch.setattr(assessment_module, "prove", refuse)
+    swept = assess(LOOP, HERE_ONLY, force_limit=(12.0, 12.0))
+    assert swept.requirements["this-environment"].proof == "rational"
+    assert (swept.guarantee.proof, swept.force_limits.proved) == ("sampled", False)
+    assert "without an exact proof" in verdict(swept)
+    assert assess(LOOP, HERE_ONLY, limiter=False).guarantee.proof == "rational"
 
 
 def test_lost_packets_end_the_guarantee():
