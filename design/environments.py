@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.arithmetic import SingularLoop, positive_definite
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -58,7 +58,16 @@ from haptic_loop.design.facts import (
     hands_side,
 )
 from haptic_loop.design.files import InputError
-from haptic_loop.design.frequency import Response, frequencies, hermitian, on_circle, peaks, supremum, sweeping
+from haptic_loop.design.frequency import (
+    Response,
+    frequencies,
+    hermitian,
+    largest_eigenvalue,
+    on_circle,
+    peaks,
+    supremum,
+    sweeping,
+)
 from haptic_loop.design.lmi import RESERVE, Ports, balanced, lemma1, packed, symmetric_from, unit_environment
 from haptic_loop.design.result import (
     MAKING,
@@ -558,23 +567,29 @@ _ROOM = 1e-6  # increase of Phi, relative to the damping, that covers the solver
 
 
 def least_phi(loop: Loop) -> Array | None:
-    """Return a small Phi (m,) [N s/m] that is verified at every frequency, or None for psi = 0, which needs no Phi."""
+    """Return a small Phi (m,) [N s/m] that is verified, or None for psi = 0, which needs no Phi.
+
+    Phi covers every frequency and is below Delta_D. Raises Infeasible or DesignFailed if no such Phi is found.
+    """
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
+    if not positive_definite(even_level(loop) - np.diag(phi)):
+        why = f"the multiplier Phi = {phi.tolist()} is not below the damping: with psi = {loop.psi} nothing is left"
+        raise DesignFailed(None, (), f"{why} for a coupling")
     if not covers(loop, phi):
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} may leave some frequency uncovered")
     return phi
 
 
-_MOST_STATES = 30  # The least trace is computed up to so many states of E-hat: 42 take ten seconds, 400 take 20 GB.
+_MOST_STATES = 30  # A storage matrix is found up to so many states of E-hat: 42 take ten seconds, 400 take 20 GB.
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return a diagonal Phi < Delta_D (m,) [N s/m] with E-hat + Phi passive.
+    """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, both within rounding.
 
-    With few states the sum of Phi_i/delta_i is least. With many states and matrix levels, Phi < Delta_D is not ensured.
-    Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
+    With few states the sum of Phi_i/delta_i is least. Raises Infeasible, with the damping that would be needed, if even
+    a full Phi is not below Delta_D, and DesignFailed if no diagonal one is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
@@ -586,15 +601,21 @@ def least_multiplier(loop: Loop) -> Array:
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
-    if regular.order > _MOST_STATES:
-        return max(each, 0.0) * delta
     # The Phi of least trace may reach Delta_D, which leaves no damping for the coupling. So Phi stays below a level
     # halfway between its least possible value and Delta_D.
-    return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
+    most = (1 + least) / 2 * level
+    if regular.order <= _MOST_STATES:
+        return np.maximum(_of_least_trace(balanced(regular), most, bool(loop.levels)), 0.0) * delta
+    if loop.levels and each >= np.linalg.eigvalsh(most)[0]:
+        return _of_least_trace_at_frequencies(regular, most) * delta
+    return max(each, 0.0) * delta
 
 
-def _of_least_trace(regular: Lti, most: Array) -> Array:
-    """Return the entries of the diagonal Phi <= most (m, m) with least trace for which `regular` + Phi is passive."""
+def _of_least_trace(regular: Lti, most: Array, positive: bool) -> Array:
+    """Return the entries of the diagonal Phi <= most (m, m) with least trace for which `regular` + Phi is passive.
+
+    The entries are not negative if `positive`.
+    """
     m, n = regular.inputs, regular.order
     ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
@@ -603,10 +624,37 @@ def _of_least_trace(regular: Lti, most: Array) -> Array:
 
     size = range(m + packed(n))
     storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: most - np.diag(x[:m])
-    problem = ConeProgram(
-        np.repeat([1.0, 0.0], [m, packed(n)]), [Inequality.of(passive, size), storage, Inequality.of(room, size)]
-    )
-    return problem.solve("the multiplier Phi of the environment")[:m]
+    blocks = [Inequality.of(passive, size), storage, Inequality.of(room, size)]
+    if positive:
+        blocks.append(Inequality.least(range(m), 0.0))
+    return ConeProgram(np.repeat([1.0, 0.0], [m, packed(n)]), blocks).solve(_PROBLEM)[:m]
+
+
+_PROBLEM = "the multiplier Phi of the environment"
+
+
+def _of_least_trace_at_frequencies(regular: Lti, most: Array) -> Array:
+    """Return the entries, >= 0, of a diagonal Phi <= most (m, m) with small trace, by cutting planes over frequency.
+
+    `regular` + Phi is passive by a sweep, and Phi exceeds `most` by at most _ROOM. Raises Infeasible or DesignFailed.
+    """
+    m, grid = regular.inputs, np.concatenate([[0.0], frequencies(regular)])
+    blocks = [Inequality.least(range(m), 0.0), Inequality.of(lambda x: most - np.diag(x), range(m))]
+    w = grid[[0, -1]]
+    for _ in range(budgets.MULTIPLIER_ROUNDS):
+        response = hermitian(regular.at(on_circle(w)))
+        entries = (np.eye(m)[:, None, :, None] * np.eye(m)).astype(complex)
+        blocks.append(Inequality(response, np.repeat(entries, w.size, axis=1), range(m)))
+        phi = ConeProgram(np.ones(m), blocks).solve(_PROBLEM)
+
+        def short(w: Array, phi: Array = phi) -> Array:
+            return largest_eigenvalue(-hermitian(regular.at(on_circle(w))) - np.diag(phi))
+
+        shortage, worst = supremum(short, grid)
+        if shortage <= _ROOM:
+            return np.maximum(phi, 0.0) + max(shortage, 0.0)
+        w = np.append(peaks(short, grid, -np.inf, near=_NEAR)[:_MOST_PEAKS], worst)
+    raise DesignFailed(None, (), f"{_PROBLEM} was not found within {budgets.MULTIPLIER_ROUNDS} rounds")
 
 
 def _needs(psi: Sequence[int], delta: Array, least: float) -> str:

@@ -1,6 +1,7 @@
 """Devices with several axes: matrix levels Delta_i in the loop, its conditions, proofs, designs and limiter."""
 
 from fractions import Fraction
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -21,7 +22,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.conditions import encoder_friction
 from haptic_loop.design.designs import design_by_kind
-from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.environments import ANY_ENVIRONMENT, SWITCHING, LimitedForces
 from haptic_loop.design.gain_search import SwitchingLoop
 from haptic_loop.design.known_device import KNOWN_DEVICE, _principal_axes
 
@@ -724,3 +725,33 @@ def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
     needs = required_damping(loop, design.coupling, LimitedForces(0.0, 1))
     assert design.requirement.certified
     assert len(needs.multiplier or ()) == len(loop.devices)
+
+
+def _chains(stiffness: float, c: float) -> Loop:
+    """Two delayed chains of eight masses, more states than a storage matrix is found for, on one device of two axes."""
+    springs = [Spring(("a.x", "x0"), stiffness, 0.05), Spring(("a.y", "y0"), 0.7 * stiffness, 0.05)]
+    for axis in "xy":
+        nodes = [*(f"{axis}{i}" for i in range(8)), "ground"]
+        springs += [Spring((one, other), stiffness, 5.0) for one, other in pairwise(nodes)]
+    springs.append(Spring(("x0", "y0"), stiffness / 2))
+    network = Network(("a.x", "a.y"), tuple(springs), {f"{axis}{i}": 0.2 for axis in "xy" for i in range(8)})
+    across = c * np.sqrt(1.5)
+    levels = (((1.0, across), (across, 1.5)),)
+    return Loop(1e-3, (0, 0), (1, 1), (0, 0), (1.0, 1.5), network, axes=(2,), levels=levels)
+
+
+@pytest.mark.parametrize(("stiffness", "c"), [(50.0, 0.93), (100.0, 0.9), (100.0, 0.91)])
+def test_phi_is_below_the_level_with_many_states(stiffness: float, c: float) -> None:
+    """Phi is positive and below Delta_D, and the environment's dynamic stiffness with Phi is passive on a fine grid."""
+    loop = _chains(stiffness, c)
+    assert loop.E().order > 30
+    needs = ANY_ENVIRONMENT.judge(loop, SpringDamper((20.0, 20.0), (0.3, 0.3)))
+    phi = np.array(needs.multiplier)
+    assert (phi >= 0).all()
+    assert np.linalg.eigvalsh(loop.Delta() - np.diag(phi))[0] > 0.01
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 20000))
+    network = loop.environment
+    E = Networks(network.contacts, network.matrices()).sampled(z, loop.T).G
+    hat = E * (loop.T / (z - 1))[:, None, None]  # T z/(z-1) times the delay 1/z
+    assert np.linalg.eigvalsh((hat + hat.conj().swapaxes(1, 2)) / 2 + np.diag(phi))[:, 0].min() > -1e-9
+    assert np.isfinite(needs.ratio)

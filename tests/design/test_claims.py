@@ -21,7 +21,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.assessment import Guarantee, assess
 from haptic_loop.design.conditions import covers
-from haptic_loop.design.environments import LimitedForces, least_multiplier
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LimitedForces, least_multiplier
 from haptic_loop.design.lmi import Shaping
 from haptic_loop.design.result import RANGES, Infeasible
 from haptic_loop.design.spring_damper import _GainSet, step
@@ -427,6 +427,15 @@ def test_one_environment_sample_exceeds_the_devices_damping():
     assert least.max() == pytest.approx(1.479, abs=5e-4)
     with pytest.raises(Infeasible, match=r"1\.479"):
         least_multiplier(Loop(T, (0, 0), (1, 1), (0, 0), (DELTA, DELTA), FIGURE_4))
+
+
+@pytest.mark.parametrize("unused", [5e-7, 1e-8])
+def test_delayed_spring_that_uses_all_damping_is_refused(unused):
+    """A spring of K N/m behind a delay of one sample uses K T/2 N s/m of the damping; Phi needs a margin above it."""
+    spring = Network(("a",), (Spring(("a", "ground"), 2000 * (1 - unused)),))
+    needs = ANY_ENVIRONMENT.judge(Loop(1e-3, (0,), (1,), (0,), (1.0,), spring), SpringDamper((50.0,), (0.1,)))
+    assert not needs.certified
+    assert "not below the damping" in needs.shortfall
 
 
 def test_every_step_of_the_convex_sequence_improves():
