@@ -1,10 +1,17 @@
 """Who may import whom, without circles of files or of folders, and which package lives where."""
 
 import ast
+import tomllib
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import pytest
+from oldest import floors
+from packaging.requirements import Requirement
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from haptic_loop.models.device import CompliantDevice
 
 ROOT = Path(__file__).parents[2]
 WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
@@ -170,3 +177,28 @@ def test_replaced_fields_exist():
         if keyword.arg and keyword.arg not in fields
     ]
     assert not wrong
+
+
+def test_installed_versions_satisfy_the_lower_bounds():
+    """`make oldest` finds the least version of each package, and every requirement admits that of constraints.txt."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [Requirement(one) for one in [*project["dependencies"], *project["optional-dependencies"]["dev"]]]
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    pinned = dict(line.split("==") for line in lines)
+    assert [one.name for one in named if one.name not in pinned or not one.specifier.contains(pinned[one.name])] == []
+    oldest = dict(one.split("==") for one in floors())
+    assert set(oldest) >= {Requirement(one).name for one in project["dependencies"]}
+
+
+def test_least_msgspec_checks_replaced_fields_again():
+    """msgspec 0.20 replaces a struct's fields without __post_init__, so that a negative mass could be made."""
+    assert "msgspec==0.21.*" in floors()
+    with pytest.raises(ValueError, match="motor_mass is -1"):
+        msgspec.structs.replace(CompliantDevice(), motor_mass=-1.0)
+
+
+def test_least_threadpoolctl_finds_the_blas_of_numpy():
+    """threadpoolctl 3.4 does not know scipy-openblas, so that designs would compute with every core."""
+    assert "threadpoolctl==3.5.*" in floors()
+    with threadpool_limits(1, user_api="blas"):
+        assert [lib["num_threads"] for lib in threadpool_info() if "numpy" in lib["filepath"]] == [1]
