@@ -217,16 +217,20 @@ _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 def _interior(problem: ConeProgram) -> tuple[Array, str]:
     """Solve the problem by a primal-dual method; return x and one of Clarabel's status names."""
-    blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
-    size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
+    blocks, cost = problem.blocks, problem.cost
+    x: Array = np.zeros(len(cost))
+    size: float = max(_largest(part) for block in blocks for part in (block.constant, block.slopes, cost))
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
-    Z, best, least = S, x, np.inf
+    Z: _Parts = S
+    best = x
+    error: float
+    least: float = np.inf
     for _ in range(budgets.CONE_STEPS):
-        missing = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
+        missing: _Parts = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
         wrong = cost - _inner(problem, Z)
-        gap = abs(cost @ x + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))
+        gap = abs(float(cost @ x) + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))
         far = max(np.abs(part).max() / size for part in (wrong, *missing))
-        if (error := max(far, gap / (1 + abs(cost @ x)))) < least:
+        if (error := max(far, gap / (1 + abs(float(cost @ x))))) < least:
             best, least = x, error
         if not _GAP < error < least / _ENOUGH:
             break
@@ -234,17 +238,20 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
             newton = _Newton(problem, S, Z, missing, wrong)
         except np.linalg.LinAlgError:  # The equations are singular to rounding.
             break
-        mu = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
+        mu: float = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
         _, dS, dZ, of_S, of_Z = newton.direction(0.0, [0.0] * len(S))
-        gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
-        left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
+        gains = map(_product, _moved(S, of_S, dS), _moved(Z, of_Z, dZ))
+        left = min(1.0, max(0.0, sum(gains) / sum(map(_product, S, Z))))
         dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
         if min(of_S, of_Z) < _SHORT:  # The point is too near the boundary, so the step goes towards the central path.
             dx, dS, dZ, of_S, of_Z = newton.direction(_CENTRING * mu, [0.0] * len(S))
         x = x + of_S * dx
-        S = [hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
-        Z = [hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]
+        S, Z = _moved(S, of_S, dS), _moved(Z, of_Z, dZ)
     return best, "Solved" if least < _ENOUGH else "NumericalError"
+
+
+def _moved(parts: _Parts, step: float, change: _Parts) -> _Parts:
+    return [hermitian(part + step * by) for part, by in zip(parts, change, strict=True)]
 
 
 class _Newton:
@@ -308,3 +315,7 @@ def _adjoint(X: Any) -> Any:
 def _product(X: Any, Y: Any) -> float:
     """Return the inner product of Hermitian matrices."""
     return float(np.real(np.vdot(X, Y)))
+
+
+def _largest(part: Any) -> float:
+    return float(np.abs(part).max(initial=1.0))

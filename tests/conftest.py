@@ -1,5 +1,6 @@
 """What holds for every test: one BLAS thread, and no verdict on how fast the machine is."""
 
+import gc
 import os
 import signal
 import sys
@@ -20,6 +21,9 @@ sys.dont_write_bytecode = False
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
+
+# Python's default, 700 new objects, has it look through all modules and fixtures thousands of times.
+gc.set_threshold(100_000)
 
 settings.register_profile("no-clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("no-clock")
