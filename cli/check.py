@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.ranges import where_proved
 from haptic_loop.controller.units import speak
 from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
 from haptic_loop.design.certificate import (
@@ -79,8 +80,10 @@ def main(argv: list[str]) -> int:
         anew = own is not None and not (stored.certificate and stored.certificate.condition == own.name)
         stored, verdict = _anew(stored, own) if own and anew else (stored, verify(stored, own))
     searched = _searched(stored, own) if verdict.proved else None
-    if searched and not suffices(searched.worst[0].ratio):
-        verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
+    ranges = stored.loop.ranges
+    if ranges and searched and not suffices(searched.worst[0].ratio):
+        where = where_proved(stored.loop.network, ranges)
+        verdict = Verdict(False, violated_between(where, searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
@@ -173,7 +176,8 @@ def _checked(
 def _table(checked: _Checked) -> render.Table:
     title = "not proved"
     if checked.proved:
-        between = ", at every vertex; between them searched, not proved" if checked.between else ""
+        ranges = checked.assessment and checked.assessment.ranges
+        between = f", at {ranges.where}; between them searched, not proved" if ranges and checked.between else ""
         anew = "proved anew, not from the file" if checked.anew else "proved"
         title = f"{anew}, in exact arithmetic{between}"
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]

@@ -57,7 +57,6 @@ def assessment_of(
 #: environments of a guarantee -> the touched objects in words
 _OBJECTS = {
     ANY: "any passive object",
-    RANGES: "every vertex of the ranges (between them searched, not proved)",
     HERE: "this object",
     RIGID_WALL.here: "a rigid wall",
     MAKING: "this object, whose walls may be touched and left",
@@ -124,6 +123,8 @@ def lost(assessment: Assessment, nearby: Robustness | None) -> str:
 def _who(guarantee: Guarantee) -> str:
     """Return the hands and objects of a guarantee: 'every passive hand with this object'."""
     place = _OBJECTS.get(guarantee.environments, guarantee.environments)
+    if guarantee.environments == RANGES:
+        place = f"{guarantee.vertices} of the ranges (between them searched, not proved)"
     delays, facts = guarantee.delays, guarantee.facts
     late = f", with delays that switch within {delays}" if "switching" in facts else ""
     return f"{guarantee.hands} with {place}{late}"
@@ -180,8 +181,7 @@ def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
     exact = ranges.certificate is not None
     ratio = f"{requirement.ratio:.4f} of the damping" if math.isfinite(requirement.ratio) else _NEVER
     proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {ranges.reason}"
-    every = f" (of {ranges.vertices}; these have every combination of ends of any three parameters)"
-    of = every if ranges.vertices > count + 1 else ""
+    of = "" if ranges.where == "every vertex" else f"; {ranges.where}"
     yield "ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"
     yield "ranges, worst vertex", f"{ratio}, at {member.name}"
     yield "ranges, between", str(part["search"])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import prod
+from random import Random
 from typing import Any
 
 import msgspec
@@ -65,7 +66,9 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """Return the environment, then the vertices of the ranges that differ from it: all, or at most 128 of them.
+    """Return the environment, then the vertices of the ranges that differ from it: all, or 128 of them.
+
+    The nominal environment may be one of the 128; then 127 differ from it.
 
     Raises ValueError with the field's name if the ranges do not fit the network or have too many parameters.
     """
@@ -82,12 +85,13 @@ def number_of_vertices(network: Network, ranges: Ranges) -> int:
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Return each vertex as the numbers of the parts' corners: all vertices, or the 128 words of a linear code.
+    """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that include a linear code.
 
     Each bit of a corner's number is the parity of the bitwise AND of the word's number and a mask. All masks have the
     highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
     pairs of ends meet in every combination, unless one belongs to a part with ranges that may also be absent.
-    Such a part has 3 or 5 corners, and some combinations may be missing.
+    Such a part has 3 or 5 corners, so that several words are the same vertex, and some combinations may be missing.
+    Random vertices then replace these words; they leave out fewer combinations than shifted words would.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -98,13 +102,23 @@ def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     single = [0, *(1 << i for i in range(half.bit_length() - 1)), half - 1]
     masks = iter([half + low for low in dict.fromkeys([*single, *range(half)])])
     own = [[next(masks) for _ in range(count)] for count in bits]
-    return [
+    vertices = dict.fromkeys(
         tuple(
             sum(((word & mask).bit_count() & 1) << i for i, mask in enumerate(bit_masks)) % size
             for bit_masks, size in zip(own, sizes, strict=True)
         )
         for word in range(_MOST_VERTICES)
-    ]
+    )
+    rng = Random(0)  # The numbers of `random()` are the same in every version of Python.
+    while len(vertices) < _MOST_VERTICES:
+        vertices.setdefault(tuple(int(rng.random() * size) for size in sizes))
+    return vertices
+
+
+def where_proved(network: Network, ranges: Ranges) -> str:
+    """Return the vertices among the members of ranges in words: "every vertex", or "128 of 625 vertices"."""
+    count = number_of_vertices(network, ranges)
+    return "every vertex" if count <= _MOST_VERTICES else f"{_MOST_VERTICES} of {count} vertices"
 
 
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:

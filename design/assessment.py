@@ -22,7 +22,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.ranges import Member, inside, number_of_vertices
+from haptic_loop.controller.ranges import Member, inside, number_of_vertices, where_proved
 from haptic_loop.design.arguments import of_kind
 from haptic_loop.design.certificate import (
     condition_of,
@@ -52,7 +52,6 @@ from haptic_loop.design.frequency import too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import (
     ANY,
-    AT_VERTICES,
     CONDITIONS,
     KNOWN_CONDITIONS,
     RANGES,
@@ -85,6 +84,7 @@ class RangesResult:
         samples: Environments drawn from inside the ranges.
         at_samples: The requirement of each sample.
         vertices: The number of vertices of the ranges; at most 128 of them are members.
+        where: The vertices that are members, in words: every vertex, or 128 of 625 vertices.
         searched: The search between the vertices.
         at_found: The requirement at the worst environment of the search.
         seed: The seed of the samples.
@@ -97,6 +97,7 @@ class RangesResult:
     samples: tuple[Member, ...]
     at_samples: tuple[Requirement, ...]
     vertices: int
+    where: str
     searched: Searched
     at_found: Requirement
     seed: int
@@ -207,6 +208,7 @@ def check_ranges(
         drawn,
         tuple(at_samples),
         number_of_vertices(loop.network, loop.ranges),
+        where_proved(loop.network, loop.ranges),
         searched,
         at_found,
         seed,
@@ -215,7 +217,7 @@ def check_ranges(
     )
     if certificate and not result.proved:
         place, requirement = result.worst_found
-        result = replace(result, reason=violated_between(place, requirement.ratio))
+        result = replace(result, reason=violated_between(result.where, place, requirement.ratio))
     return result
 
 
@@ -234,10 +236,10 @@ def _proved_ranges(
         return None, str(error), multiplier
 
 
-def violated_between(place: Member, ratio: float) -> str:
-    """Return the reason why ranges with proved vertices are not guaranteed: a violation between the vertices."""
+def violated_between(where: str, place: Member, ratio: float) -> str:
+    """Return why ranges are not guaranteed that are proved at the vertices `where`: a violation between them."""
     needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
-    return f"proved at the vertices, but violated between them: {needs} at {place.name}"
+    return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -394,6 +396,7 @@ class Guarantee:
         periods: The longest period [s].
         energy_J: Bound of the energy [J] that a hand receives beyond the dissipation of the devices; None for a
             guarantee that the loop comes to rest.
+        vertices: The proved vertices of "these ranges" in words: every vertex, or 128 of 625 vertices.
     """
 
     condition: str
@@ -405,6 +408,7 @@ class Guarantee:
     delays: DelayRange
     periods: float
     energy_J: float | None = None
+    vertices: str = "every vertex"
 
     def __repr__(self) -> str:
         return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, {self.forces})"
@@ -421,7 +425,9 @@ class Guarantee:
             join = "" if self.environments.startswith("and ") else ","
             amount = f"more than {self.energy_J:g} J" if self.energy_J else "any energy"
             return f"{self.hands} is given {amount} beyond what the devices dissipate{join} {self.environments}"
-        return AT_VERTICES if self.environments == RANGES else self.environments
+        if self.environments == RANGES:
+            return f"{RANGES}: proved at {self.vertices}, searched between them"
+        return self.environments
 
     def part(self) -> dict[str, Any]:
         """Return the fields of its JSON."""
@@ -714,7 +720,8 @@ def _over_ranges(assessment: Assessment) -> Guarantee | None:
     name = str(ranges.worst[1].condition)
     if assessment.loop.varying_delay:
         name = {THIS_ENVIRONMENT.name: SWITCHING.name}.get(name, name)
-    return _stated(assessment, replace(assessment.requirements[name], proof="rational"), RANGES)
+    stated = _stated(assessment, replace(assessment.requirements[name], proof="rational"), RANGES)
+    return replace(stated, vertices=ranges.where)
 
 
 def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:

@@ -19,6 +19,7 @@ from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, Bal
 from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.ranges import where_proved
 from haptic_loop.design.certificate import Verdict, lag
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.result import RANGES, listed, switching_guarantee
@@ -890,8 +891,9 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
     delays = f"; {switching_guarantee(stored.loop.varying_delay)}" if stored.loop.varying_delay else ""
     how = f"{claim.condition}, proof: {claim.proof}"
-    if claim.guarantee == RANGES:
-        how += "; proved at the vertices only: design.check searches between them"
+    if claim.guarantee == RANGES and stored.loop.ranges:
+        where = where_proved(stored.loop.network, stored.loop.ranges)
+        how += f"; proved at {where} only: design.check searches between them"
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
         "also while forces are limited." if limited else "linear forces only."
     )

@@ -30,7 +30,6 @@ PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDIT
 MAKING = "this environment, whose walls may make and break contact, have any gap, and be softer in proportion"
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
-AT_VERTICES = "these ranges: proved at the vertices, searched between them"  # RANGES in words
 #: limits of every certificate
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "

@@ -504,4 +504,4 @@ def test_a_guarantee_over_ranges_names_its_vertices():
     scenario = load("omega-pair-ranges")
     delays = scenario.loop("I").delays
     words = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3).words
-    assert "proved at the vertices, searched between them" in words
+    assert "proved at every vertex, searched between them" in words

@@ -14,13 +14,14 @@ from haptic_loop.cli.check import main as check_main
 from haptic_loop.cli.design import main as design_main
 from haptic_loop.cli.run import main as run_main
 from haptic_loop.cli.validate import main as validate_main
+from haptic_loop.cli.verdict import range_rows, verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as StoredSpringDamper
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
+from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices, where_proved
 from haptic_loop.design import optimal
-from haptic_loop.design.assessment import check_ranges
+from haptic_loop.design.assessment import assess, check_ranges
 from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, sealed
@@ -137,6 +138,40 @@ def test_any_three_parameters_meet_in_all_ends(links):
         assert len(found) == 8
         assert set(times) == {16}
     assert number_of_vertices(*chain(links)) == 2**links
+
+
+def absences(links: int) -> tuple[Network, Ranges]:
+    """Springs in a row, each of 50 to 200 N/m or absent."""
+    network, ranges = chain(links)
+    return network, Ranges(tuple(msgspec.structs.replace(spring, absent=True) for spring in ranges.springs))
+
+
+@pytest.mark.parametrize("links", [5, 6, 8])
+def test_absent_springs_leave_128_different_vertices(links):
+    """Words of the code alone gave 41, 41 and 81 of 243, 729 and 6561 vertices."""
+    chosen = members(*absences(links))[1:]
+    ends = {tuple(spring.stiffness for spring in member.network.springs) for member in chosen}
+    assert len(chosen) == len(ends) == 128
+    assert all(stiffness in (0.0, 50.0, 200.0) for each in ends for stiffness in each)
+    assert where_proved(*absences(links)) == f"128 of {3**links} vertices"
+
+
+def test_all_vertices_are_proved_if_there_are_few():
+    assert len(members(*absences(4))[1:]) == 81
+    assert where_proved(*absences(4)) == "every vertex"
+
+
+def test_reports_say_that_half_the_vertices_are_proved():
+    """Four springs in a row with two ranges each have 256 vertices, of which 128 are proved."""
+    nodes = ["tip", "a", "b", "c", "ground"]
+    springs = tuple(Spring(ends, 100.0, 0.5) for ends in pairwise(nodes))
+    ranges = Ranges(tuple(UncertainSpring(s.between, (80.0, 120.0), (0.4, 0.6)) for s in springs))
+    loop = Loop(1e-3, (1,), (0,), (0,), (1.4,), Network(("tip",), springs), ranges)
+    coupling = SpringDamper((5000.0,), (0.3,))  # too stiff for any environment
+    assessment = assess(loop, coupling)
+    assert assessment.guarantee.words == "these ranges: proved at 128 of 256 vertices, searched between them"
+    assert "128 of 256 vertices of the ranges" in verdict(assessment)
+    assert dict(range_rows(assessment.ranges))["ranges, vertices"].endswith("; 128 of 256 vertices")
 
 
 def test_the_number_of_parameters_is_limited():

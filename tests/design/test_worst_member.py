@@ -178,7 +178,7 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
     assert not known.proved
     part = known.part()
     assert (part["proof"], part["certified"], part["search"].violated) == ("rational", False, True)
-    assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
+    assert part["reason"].startswith("proved at every vertex, but violated between them: 1.04")
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():
@@ -204,7 +204,7 @@ def test_design_check_repeats_the_search(tmp_path, capsys):
     assert check_main([str(file), "--json", "-"]) == 1
     result = json.loads(capsys.readouterr().out)
     assert (result["proved"], result["guarantee"]) == (False, None)
-    assert result["reason"].startswith("proved at the vertices, but violated between them")
+    assert result["reason"].startswith("proved at every vertex, but violated between them")
     assert result["between"]["violated"]
 
 
