@@ -338,11 +338,12 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
     _check_part(loop, coupling, condition, certificate, certificate.matrices)
 
 
+@_in_time()
 def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
     """Return the requirement of a certificate's condition and multipliers in this loop, proved with its matrices.
 
     `known` is a certificate that this process has proved for this loop and coupling; for it the exact proof is not
-    repeated. Raises NotProved if the certificate does not hold in the loop.
+    repeated. Raises NotProved if the certificate does not hold in the loop, or if the proof would take minutes.
     """
     is_proved = known is certificate and certificate.scenario == digest(loop, coupling.form())
     try:

@@ -13,13 +13,14 @@ from haptic_loop.cli.validate import main as validate
 from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
-from haptic_loop.controller.environment import Network, Spring
-from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design import assessment as assessment_module
 from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
+from haptic_loop.design.environments import LIMITER
 from haptic_loop.design.result import HERE, NotProved
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
@@ -124,6 +125,17 @@ def test_a_proof_without_the_limiter_is_partial(monkeypatch):
     assert (swept.guarantee.proof, swept.force_limits.proved) == ("sampled", False)
     assert "without an exact proof" in verdict(swept)
     assert assess(LOOP, HERE_ONLY, limiter=False).guarantee.proof == "rational"
+
+
+def test_a_limiter_on_file_meets_a_longer_loop():
+    """The file's proof is for one sample of delay; the loop has more states than a proof may have."""
+    loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
+    coupling = SpringDamper([1.0], [0.01])
+    on_file = prove(loop, coupling, LIMITER)
+    longer = assess(change(loop, theta=(801,)), coupling, limiter_proof=on_file, force_limit=(4.0,))
+    assert longer.requirements["this-environment"].certified
+    assert (longer.guarantee.proof, longer.force_limits.proved) == ("sampled", False)
+    assert assess(loop, coupling, limiter_proof=on_file).force_limits.proved
 
 
 def test_lost_packets_end_the_guarantee():
