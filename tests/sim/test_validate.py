@@ -410,7 +410,7 @@ def test_a_negative_range_is_refused(tmp_path):
         ("[[human]]\nlinks = []\n", "length >= 1"),
         (
             TWO + "[[person]]\nholds = [1, 3]\nmass = 1.0\ndamping = 0\nstiffness = 0\n",
-            "has channel 3, allowed are 1 to 2",
+            "has device 3, allowed are 1 to 2",
         ),
         (TWO + "[[person]]\nholds = [1]\nmass = 1.0\ndamping = 0\nstiffness = 0\n", "two or more different devices"),
         (TWO + "[[person]]\nholds = [1, 2]\nmass = 0\ndamping = 0\nstiffness = 0\n", "mass is 0, allowed are"),
