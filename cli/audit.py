@@ -69,6 +69,9 @@ def main(argv: list[str]) -> int:
             )
         return _list_devices(args)
     args = _with_device(args)
+    if replaced := [name for name in ("world", "environment") if args.rigid and getattr(args, name)]:
+        wall = "CHAI3D's gains are judged on a rigid wall; give --K and --B"
+        raise InputError(f"--{replaced[0]} with --device {args.device}: {wall}")
     scenario = options.scenario_from(args)
     if args.world:
         scenario = options.in_world(scenario, args.world)
@@ -133,6 +136,12 @@ def _parser() -> options.Parser:
     parser.add_varying_delay(switching)
     parser.add_details()
     parser.add_output()
+    parser.only("without --rigid, whose wall replaces the scene", lambda args: not args.rigid, "world")
+    loop = ("reference", "scenario", "environment", "theta", "psi", "lam", "delta", "T", "T_max", "known_device")
+    rest = ("latency", "condition", "world", "varying_delay", "details", "out", "seed")
+    parser.only(
+        "without --devices: the list is always the whole catalogue", lambda args: not args.devices, *loop, *rest
+    )
     return parser
 
 
@@ -191,6 +200,7 @@ def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
     from haptic_loop.design.result import Chosen
     from haptic_loop.sim.couplings import choose
 
+    world.check_audit(args)
     if args.coupling and Path(args.coupling).exists():
         chosen = choose(scenario, args.case, args.coupling)
     elif args.K or args.B or args.coupling or args.case == "none":

@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     seconds, most = "time at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
     parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
     parser.add_details()
-    parser.add_output(picture=True)
+    session_cli.add_output_options(parser, picture=True)
     return parser
 
 

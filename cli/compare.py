@@ -49,6 +49,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
     parser.add_condition("the condition of designs that name none; your own condition judges all couplings")
     parser.add_output(picture=True)
+    parser.only("with --coupling: the runs of every coupling draw nothing", lambda args: args.coupling, "seed")
     return parser
 
 

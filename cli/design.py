@@ -47,7 +47,7 @@ def main(argv: list[str]) -> int:
     if is_world(scenario):
         from haptic_loop.cli import world
 
-        return world.design(args, scenario, out)
+        return world.design(args, scenario, out, {} if args.limiter is not None else _options_of(args, args.coupling))
     loop = _loop(args, scenario)
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)

@@ -18,6 +18,7 @@ from pathlib import Path
 from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import (
     add_link_options,
+    add_output_options,
     boards_behind,
     check_link,
     hold_session,
@@ -158,10 +159,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--transmission", action="store_true", help=known)
     rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
     add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
-    parser.add_output()
+    add_output_options(parser)
     parser.only("with --rehearse", lambda args: args.rehearse, "hand")
     parser.only("with --rehearse", lambda args: not args.port, "coulomb")
     parser.only("with --port", lambda args: args.port, "same_place")
+    parser.only("for commands with a coupling", lambda args: False, "psi", "lam", "reference")
     return parser
 
 

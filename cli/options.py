@@ -184,6 +184,8 @@ class Parser(argparse.ArgumentParser):
         """Add --rigid, a rigid wall in place of the environment."""
         wall = "a rigid wall in place of the environment; one channel, the scenario's first"
         self.add_argument("--rigid", action="store_true", help=wall)
+        replaced = "without --rigid: its wall replaces the environment and its reference"
+        self.only(replaced, lambda args: not args.rigid, "environment", "lam")
 
     def add_human(self, more: str = "") -> None:
         """Add --human."""
@@ -216,6 +218,8 @@ class Parser(argparse.ArgumentParser):
         loss = "probability that a force is lost; the device then holds the last one"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)
         group.add_argument("--playout", action="store_true", help="a buffer that gives every force the largest delay")
+        alike = "without --playout, with which every force has the largest delay"
+        self.only(alike, lambda args: not args.playout or args.pattern not in _DRAWN, "pattern")
 
     def add_output(
         self,
@@ -446,6 +450,9 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     """Return the scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
     speak(scenario.unit)
+    if (args.reference or args.case == "II") and (args.lam or scenario.lam is not None):
+        option = f"--reference {args.reference}" if args.reference else "--case II"
+        raise InputError(f"{option} with {'--lam' if args.lam else 'lam of the scenario'}: both are the reference")
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     each = "channel" if scenario.channels == len(scenario.device) else "device"
     values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
@@ -533,8 +540,9 @@ def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:
 
 def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """Return the loop of one channel before a rigid wall. Raises InputError for values of several channels."""
-    for name in ("theta", "psi", "delta"):
-        per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
+    for name in ("theta", "psi", "delta", "latency", "known_device"):
+        option = name.replace("_", "-")
+        per_channel(f"--rigid is one channel: --{option}", tuple(getattr(args, name) or (0,)), 1)
     with refused():
         return scenario.before_a_rigid_wall(scenario.psi[:1] if args.psi else (0,))
 

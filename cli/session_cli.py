@@ -72,7 +72,15 @@ def add_link_options(parser: options.Parser) -> None:
     parser.only("with --rehearse: a device has faults of its own", lambda args: args.rehearse, "fault")
     parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
     parser.only(f"with --port {FORCE_DIMENSION}", host_clocked, "clamped")
+    uart = f"with a serial port or --rehearse: {FORCE_DIMENSION} has no UART"
+    parser.only(uart, lambda args: not host_clocked(args), "baud")
     parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
+
+
+def add_output_options(parser: options.Parser, picture: bool = False) -> None:
+    """Add the options for files, and --seed of a rehearsal."""
+    parser.add_output(picture=picture)
+    parser.only("with --rehearse: a session with a device draws nothing", lambda args: args.rehearse, "seed")
 
 
 def add_safety_options(parser: options.Parser) -> None:

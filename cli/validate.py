@@ -105,6 +105,8 @@ def _parser() -> options.Parser:
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")
+    traced = "with traces of MuJoCo: --engine exact and --duration 0 have none"
+    parser.only(traced, lambda args: args.engine != "exact" and args.duration != 0, "traces")
     return parser
 
 

@@ -193,6 +193,9 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
     text = args.script if args.script is not None else _SCRIPT if usual else None
     script = () if text is None else parse_script(text, channels)
     if script and script[0][0] == 0 and isinstance(script[0][1], Couple):
+        if args.coupling is not None:
+            name = script[0][1].name
+            raise InputError(f"--coupling {args.coupling} with --script 0:{name}: give the first coupling once")
         return script[0][1].name, script[1:]
     return label, script
 

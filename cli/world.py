@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -95,6 +95,17 @@ def world_start(args: argparse.Namespace) -> float:
     return float(start)
 
 
+_OPTIONS = {"limiter": "no-limiter", "band_hz": "band"}  # options whose name differs from their argument's
+
+
+def refuse(args: argparse.Namespace, why: str, **defaults: object) -> None:
+    """Raise InputError if an argument differs from its default, because it has no effect in a world."""
+    for name, default in defaults.items():
+        if (value := getattr(args, name)) != default:
+            option = "limiter" if value is True and name == "limiter" else _OPTIONS.get(name, name.replace("_", "-"))
+            raise InputError(f"--{option}: with environment.world {why}; leave it out")
+
+
 def _common_rows(report: _Report) -> Iterator[tuple[str, str | None]]:
     needs = report.assessment.requirements[ANY_ENVIRONMENT.name]
     for name, unit in (("K", "N/m"), ("B", "N s/m"), ("stiffness", "N/m")):
@@ -125,6 +136,8 @@ def _energy(joules: float) -> str:
 # ----------------------------------------------------------------------------------------------------
 # sim.run
 
+_SHELL = "the energy account bounds the forces, and no limiter runs"
+_WHOLE = "the report has no further lines"
 _WRITTEN = ("scene.xml", "world.xml")  # the model of the devices, and that of the scene with its springs
 
 
@@ -134,6 +147,9 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         if getattr(args, name, None):
             shown = name.replace("_", "-")
             raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
+    refuse(args, "no transparency error is computed", band_hz=None)
+    refuse(args, _SHELL, limiter=None)
+    refuse(args, _WHOLE, details=False)
     from haptic_loop.models.world import files_of  # loads MuJoCo
     from haptic_loop.sim.view.drawn_object import scene_xml
 
@@ -198,6 +214,12 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         raise InputError("--adversary: for a world, `design.audit` reports the energy that adversaries gained")
     if args.duration == 0:
         raise InputError("--duration 0: a world has no eigenvalues, give the length of the traces [s]")
+    refuse(
+        args, "the engine of the scene simulates all hands in one process", engine="both", traces="sampled", shards=1
+    )
+    refuse(args, "the scenario's population sets the number of masses", links=None)
+    refuse(args, "there are no ranges", environments="nominal")
+    refuse(args, _SHELL, limiter=None)
     began, chosen = time.perf_counter(), _chosen(args, scenario)
     report = _reported(args, scenario, chosen, START_J)
     with render.progress("validating") as move:
@@ -233,17 +255,31 @@ def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[st
 # design and design.audit
 
 
-def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
-    """Design a coupling for a world and store it. Return 0 if it is certified for any environment, 1 if not."""
+def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Mapping[str, Any]) -> int:
+    """Design a coupling for a world and store it. Return 0 if it is certified for any environment, 1 if not.
+
+    `further` are the options of the design by argument name.
+    """
+    refuse(args, "there is no network whose parameters could vary", ranges=None)
+    refuse(args, "delays are constant", varying_delay=None)
+    refuse(args, _SHELL, limiter=None)
     loop, kind = scenario.loop(args.case), args.coupling
     condition = args.condition or ANY_ENVIRONMENT.name
     with options.refused(args=args), render.designing(loop, kind, condition) as progress:
-        designed = proved(loop, design_by_kind(loop, kind, condition, progress))
+        designed = proved(loop, design_by_kind(loop, kind, condition, progress, **further))
     filed = store(loop, designed, out)
     report = _reported(args, scenario, replace(designed, kind=kind), START_J)
     rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
     _publish(args, report, report.guarantee, rows)
     return options.exit_code(report.guaranteed)
+
+
+def check_audit(args: argparse.Namespace) -> None:
+    """Raise InputError for options of design.audit that have no effect in a world."""
+    if args.condition != ANY_ENVIRONMENT.name:
+        refuse(args, f"the audit judges {ANY_ENVIRONMENT.name} only", condition=None)
+    refuse(args, "the audit judges constant delays only", varying_delay=None)
+    refuse(args, _WHOLE, details=False)
 
 
 def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Path) -> int:

@@ -44,6 +44,8 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
+    if args.case == "II" and of_coupling:
+        raise InputError("--case II is only with --coupling: certificates of a map's spring-dampers need no reference")
     chosen = chosen_by(args, scenario) if args.coupling else None  # one coupling for the whole map
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -108,6 +110,8 @@ def _parser() -> options.Parser:
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the map varies the environment"
     parser.only(gains, lambda args: args.coupling is None, "rigid")
+    compared = "with --coupling: certificates of a map's spring-dampers need no reference"
+    parser.only(compared, lambda args: args.coupling, "lam", "reference")
     return parser
 
 

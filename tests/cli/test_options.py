@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.run import _parser as run_parser
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.design.files import one_line
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 
 
 def parser():
@@ -146,3 +147,75 @@ def test_own_environments_are_computed_for_the_period(tmp_path):
     scenario = scenario_of(f"--T 5e-4 --environment {tmp_path}/own.py:Own")
     stiffness = 100.0 + 1.0 / 5e-4  # backward Euler: K + B / T
     np.testing.assert_allclose(scenario.loop("I").E().D, stiffness * np.array([[1, -1], [-1, 1]]), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "option"),
+    [
+        ("audit", "--rigid --K 100 --B 0 --world scene.xml", "--world"),
+        ("audit", "--rigid --K 100 --B 0 --environment own.py:Own", "--environment"),
+        ("audit", "--rigid --K 100 --B 0 --lam 0", "--lam"),
+        ("audit", "--rigid --K 100 --B 0 --latency 1e-4,2e-4", "--latency"),
+        (
+            "audit",
+            "--rigid --K 100 --B 0 --scenario omega-pair-known" + 2 * " --known-device 0.06,14500,0.5,5",
+            "--known-d",
+        ),
+        ("audit", "--device omega.3 --world scene.xml", "--world"),
+        ("audit", "--device omega.3 --environment own.py:Own", "--environment"),
+        *(("audit", f"--devices {words}", words.split()[0]) for words in ("--T 1e-3", "--condition any-environment")),
+        *(
+            ("audit", f"--devices {words}", words.split()[0])
+            for words in ("--scenario three-rigid", "--out x", "--details")
+        ),
+        ("audit", "--scenario world-cube --condition this-environment", "--condition"),
+        ("audit", "--scenario world-cube --varying-delay 0,1", "--varying-delay"),
+        ("audit", "--scenario world-cube --details", "--details"),
+        ("design", "--scenario world-cube --ranges 10%", "--ranges"),
+        ("design", "--scenario world-cube --varying-delay 0,1", "--varying-delay"),
+        ("design", "--scenario world-cube --limiter", "--limiter"),
+        ("design", "--scenario world-cube --no-limiter", "--no-limiter"),
+        ("design", "--scenario world-cube --objective sup", "--objective"),
+        ("run", "--scenario world-cube --no-limiter", "--no-limiter"),
+        ("run", "--scenario world-cube --band 1,20", "--band"),
+        ("run", "--scenario world-cube --details", "--details"),
+        ("run", "--lam 0,0 --reference II", "--reference II with --lam"),
+        ("run", "--lam 0,0 --case II", "--case II with --lam"),
+        ("run", "--varying-delay 1,2 --pattern bursty --playout", "--pattern"),
+        ("validate", "--scenario world-cube --links 2", "--links"),
+        ("validate", "--scenario world-cube --engine exact", "--engine"),
+        ("validate", "--scenario world-cube --traces all", "--traces"),
+        ("validate", "--scenario world-cube --shards 2", "--shards"),
+        ("validate", "--scenario world-cube --environments ranges", "--environments"),
+        ("validate", "--scenario world-cube --no-limiter", "--no-limiter"),
+        ("validate", "--engine exact --traces all", "--traces"),
+        ("validate", "--duration 0 --traces all", "--traces"),
+        ("compare", "--seed 5", "--seed"),
+        ("zwidth", "--lam 0,0", "--lam"),
+        ("zwidth", "--reference I", "--reference"),
+        ("zwidth", "--case II", "--case II"),
+        ("bridge", "--port /dev/null --arm --seed 3", "--seed"),
+        ("identify", "--port /dev/null --arm --seed 3", "--seed"),
+        ("bridge", "--port force-dimension --arm --baud 9600", "--baud"),
+        *(("identify", f"--rehearse {words}", words.split()[0]) for words in ("--psi 0", "--lam 0", "--reference II")),
+        ("view", "--coupling none --script 0:published --video x.gif", "--coupling none with --script 0:published"),
+    ],
+)
+def test_options_without_effect_are_refused(command, words, option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        import_module(f"haptic_loop.cli.{command}").main(words.split())
+    message = str(caught.value)
+    assert option in message
+    assert "No such file" not in message
+    assert "\n" not in message
+
+
+def test_two_references_are_refused(tmp_path):
+    """lam of a scenario is the reference of both cases, so that --reference II would change nothing."""
+    assert load().replace(lam=(0, 1)).loop("I").lam == load().replace(lam=(0, 1)).loop("II").lam
+    text = (SCENARIOS / "omega-pair.toml").read_text()
+    (tmp_path / "own.toml").write_text(text.replace("psi = ", "lam = [0, 1]\npsi = "))
+    for words in ("--reference II", "--case II"):
+        with pytest.raises(InputError, match=f"^{words} with lam of the scenario"):
+            scenario_of(f"--scenario {tmp_path}/own.toml {words}")
