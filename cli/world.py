@@ -14,7 +14,6 @@ import numpy as np
 from haptic_loop.cli import options, render
 from haptic_loop.design.api import proved, store
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.files import write
@@ -277,8 +276,7 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Map
 
 def check_audit(args: argparse.Namespace) -> None:
     """Raise InputError for options of design.audit that have no effect in a world."""
-    if args.condition is not None and named(args.condition) is not ANY_ENVIRONMENT:
-        refuse(args, f"the audit judges {ANY_ENVIRONMENT.name} only", condition=None)
+    refuse(args, f"the audit judges {ANY_ENVIRONMENT.name}, and no other condition", condition=None)
     refuse(args, "the audit judges constant delays only", varying_delay=None)
     refuse(args, _WHOLE, details=False)
 
