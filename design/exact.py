@@ -99,18 +99,30 @@ def _congruence(X: _Integers, M: _Integers) -> _Integers:
 
 @dataclass(frozen=True)
 class _Definiteness:
-    """The result of the exact elimination of a symmetric matrix."""
+    """The result of the exact elimination of a symmetric matrix.
+
+    Attributes:
+        definite: Whether the matrix is positive definite.
+        semidefinite: Whether the matrix is positive semidefinite.
+        rows: The rows, from 1, of a principal minor that is zero if the matrix is semidefinite and negative if it is
+            not; () for a definite matrix.
+    """
 
     definite: bool
     semidefinite: bool
-    minor: int | None = None  # order of the minor that decides, without the skipped rows before it; 1-based
-    sign: int | None = None  # sign of that minor: -1, or 0
+    rows: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         if self.definite:
             return "positive definite"
-        sign = "negative" if self.sign == -1 else "zero"
-        return f"the leading minor of order {self.minor} is {sign}"
+        order = len(self.rows)
+        leading = self.rows == tuple(range(1, order + 1))
+        minor = (
+            f"leading minor of order {order}"
+            if leading
+            else f"principal minor of rows {', '.join(map(str, self.rows))}"
+        )
+        return f"the {minor} is {'zero' if self.semidefinite else 'negative'}"
 
 
 _MANY_ROWS = 8  # number of rows above which `_strictly_positive` is tried before the elimination
@@ -119,8 +131,9 @@ _MANY_ROWS = 8  # number of rows above which `_strictly_positive` is tried befor
 def definiteness(S: Matrix) -> _Definiteness:
     """Decide whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
-    The pivots of the elimination are the leading minors themselves. If a pivot is zero, S is semidefinite only if the
-    pivot's entire row in the Schur complement is zero; the row is then skipped. A large matrix is tested with
+    Each pivot is the principal minor of its row and the rows before it that were not skipped. If a pivot is zero, S is
+    semidefinite only if the pivot's entire row in the Schur complement is zero; the row is then skipped. Otherwise an
+    entry e of this row gives the negative minor -e^2/(previous pivot). A large matrix is tested with
     `_strictly_positive` first. Raises ValueError if S is not exactly symmetric.
     """
     if S.shape[0] > _MANY_ROWS and _strictly_positive(S):
@@ -128,19 +141,22 @@ def definiteness(S: Matrix) -> _Definiteness:
     work = S.reduced().num.copy()
     if not (work == work.T).all():
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
-    previous, singular = 1, None
+    previous, used = 1, list[int]()  # the last positive pivot, and the rows of the positive pivots
+    singular: tuple[int, ...] = ()
     for k in range(work.shape[0]):
         pivot, column = work[k, k], work[k + 1 :, k].copy()
+        rows = (*used, k + 1)
         if pivot < 0:
-            return _Definiteness(False, False, k + 1, -1)
+            return _Definiteness(False, False, rows)
         if pivot == 0:
-            if (column != 0).any():
-                return _Definiteness(False, False, k + 1, 0)
-            singular = singular or k + 1
+            if coupled := np.flatnonzero(column != 0).tolist():
+                return _Definiteness(False, False, (*rows, k + 2 + coupled[0]))
+            singular = singular or rows
             continue
         work[k + 1 :, k + 1 :] = (pivot * work[k + 1 :, k + 1 :] - np.outer(column, column)) // previous
         previous = pivot
-    return _Definiteness(singular is None, True, singular, None if singular is None else 0)
+        used.append(k + 1)
+    return _Definiteness(not singular, True, singular)
 
 
 # ----------------------------------------------------------------------------------------------------

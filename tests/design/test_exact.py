@@ -62,6 +62,8 @@ def test_definiteness_agrees_with_eigenvalues():
     seen = set()
     for _ in range(300):
         S = symmetric_integers(rng, int(rng.integers(1, 7)))
+        idle = rng.integers(0, 5, len(S)) == 0
+        S[idle], S[:, idle] = 0, 0
         least = np.linalg.eigvalsh(S)[0]
         outcome = definiteness(Matrix.of(S.tolist()))
         if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
@@ -69,10 +71,31 @@ def test_definiteness_agrees_with_eigenvalues():
             assert _strictly_positive(Matrix.of(S.tolist())) == (least > 0)
         assert outcome.semidefinite == (least > -1e-9)
         seen.add(outcome.definite)
-        if not outcome.definite:
-            minor = round(np.linalg.det(S[: outcome.minor, : outcome.minor]))
-            assert np.sign(minor) == outcome.sign
+        assert bool(outcome.rows) != outcome.definite
+        if outcome.rows:
+            minor = S[np.ix_(*[np.array(outcome.rows) - 1] * 2)]
+            assert np.sign(round(np.linalg.det(minor))) == (0 if outcome.semidefinite else -1)
     assert seen == {True, False}
+
+
+@pytest.mark.parametrize(
+    ("S", "words"),
+    [
+        (np.diag([0, -1]), "the principal minor of rows 2 is negative"),
+        (np.diag([1, 0, -1]), "the principal minor of rows 1, 3 is negative"),
+        (np.diag([2, -1]), "the leading minor of order 2 is negative"),
+        ([[0, 1], [1, 5]], "the leading minor of order 2 is negative"),
+        ([[0, 0, 1], [0, 3, 0], [1, 0, 5]], "the principal minor of rows 1, 3 is negative"),
+        ([[1, 1], [1, 1]], "the leading minor of order 2 is zero"),
+        (np.diag([0, 3]), "the leading minor of order 1 is zero"),
+    ],
+)
+def test_indefinite_matrices_name_a_minor_that_shows_it(S, words):
+    S = np.array(S)
+    outcome = definiteness(Matrix.of(S.tolist()))
+    assert str(outcome) == words
+    minor = np.linalg.det(S[np.ix_(*[np.array(outcome.rows) - 1] * 2)])
+    assert np.sign(round(minor)) == (0 if np.linalg.eigvalsh(S)[0] > -1e-9 else -1)
 
 
 def test_singular_matrices_with_negative_directions_are_rejected():
