@@ -84,12 +84,15 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
     """Raise InputError for options that exclude each other, or that no certificate covers."""
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    arrival = "--latch arrival"
+    if session_cli.host_clocked(args):
+        arrival = f"--port {args.port}, whose forces latch on arrival"
     if at_once and args.condition:
         choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
         if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
-            raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
+            raise InputError(f"--condition {choice.name} with {arrival}: {reason}")
     if args.energy_budget and at_once:
-        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; drop one")
+        raise InputError(f"--energy-budget with {arrival}: the budget counts forces that latch at ticks; drop one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError(
             "--energy-budget is 0 J: arming tests the encoders with a small force, give for example 0.01 J"

@@ -123,7 +123,7 @@ def test_a_session_replays_bit_for_bit(tmp_path, capsys):
     [
         (
             ["--condition", "any-environment", "--psi", "1"],
-            "--latch arrival with --condition any-environment: with delay in the environment",
+            "--condition any-environment with --latch arrival: with delay in the environment",
         ),
         (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
         (["--latency", "1e-4"], "latency: hw.bridge does not simulate this key"),
@@ -132,3 +132,11 @@ def test_a_session_replays_bit_for_bit(tmp_path, capsys):
 def test_what_does_not_go_together(more, said):
     with pytest.raises(InputError, match=said):
         bridge(["--rehearse", "--latch", "arrival", *more])
+
+
+@pytest.mark.parametrize("more", [["--condition", "any-environment", "--psi", "1"], ["--energy-budget", "0.01"]])
+def test_refusals_name_the_port_that_was_given(more):
+    with pytest.raises(InputError, match=" with --port force-dimension:0x,1x, whose") as refused:
+        bridge(["--port", "force-dimension:0x,1x", "--arm", "--no-dead-man", *more])
+    assert str(refused.value).startswith(more[0])
+    assert "--latch" not in str(refused.value)
