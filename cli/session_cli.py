@@ -102,6 +102,8 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
     add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
     parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man")
+    held = "with --port: in a rehearsal only --deadman device acts"
+    parser.only(held, lambda args: args.port or args.deadman == "device", "deadman")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 

@@ -136,6 +136,10 @@ def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tupl
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:
     """Return the loop, the humans and the engines of the validation. Raises InputError."""
     # A user's own population need not have `links`.
+    if args.links and not isinstance(scenario.population, Population):
+        raise InputError(
+            f"--links {args.links} with --human {args.human}: a population of your own draws its own masses"
+        )
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
     lag, every = assessment.force_limits.rho, args.traces == "all"

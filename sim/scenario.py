@@ -565,6 +565,10 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 def _humans_of(text: str, source: str) -> _HumanFile:
     """Return the humans of a file: measured transfer functions (A, B, C, D) and chains."""
     people: _HumanFile = _converted(text, _HumanFile, source)
+    if people.population is not None:
+        raise InputError(
+            f"{source}: [population] belongs into a scenario; a file of humans has [[human]] and [[person]]"
+        )
     humans = []
     for i, human in enumerate(people.human, start=1):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human

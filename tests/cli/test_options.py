@@ -149,6 +149,15 @@ def test_own_environments_are_computed_for_the_period(tmp_path):
     np.testing.assert_allclose(scenario.loop("I").E().D, stiffness * np.array([[1, -1], [-1, 1]]), rtol=1e-6)
 
 
+OWN_POPULATION = """
+from haptic_loop.sim.scenario import load
+
+class Own:
+    def draw(self, rng, n):
+        return [load().human[0]] * n
+"""
+
+
 @pytest.mark.parametrize(
     ("command", "words", "option"),
     [
@@ -196,6 +205,9 @@ def test_own_environments_are_computed_for_the_period(tmp_path):
         ("zwidth", "--case II", "--case II"),
         ("bridge", "--port /dev/null --arm --seed 3", "--seed"),
         ("identify", "--port /dev/null --arm --seed 3", "--seed"),
+        ("bridge", "--rehearse --deadman FILE", "--deadman"),
+        ("validate", "--human humans.py:Own --links 2 --humans 2 --duration 0", "--links 2 with --human"),
+        ("validate", "--human population.toml --humans 2 --duration 0", "[population]"),
         ("bridge", "--port force-dimension --arm --baud 9600", "--baud"),
         *(("identify", f"--rehearse {words}", words.split()[0]) for words in ("--psi 0", "--lam 0", "--reference II")),
         ("view", "--coupling none --script 0:published --video x.gif", "--coupling none with --script 0:published"),
@@ -203,6 +215,9 @@ def test_own_environments_are_computed_for_the_period(tmp_path):
 )
 def test_options_without_effect_are_refused(command, words, option, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    hand = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
+    (tmp_path / "population.toml").write_text(f"{hand}{hand}[population]\nlinks = 2\n")
+    (tmp_path / "humans.py").write_text(OWN_POPULATION)
     with pytest.raises(InputError) as caught:
         import_module(f"haptic_loop.cli.{command}").main(words.split())
     message = str(caught.value)
