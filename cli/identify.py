@@ -163,7 +163,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.only("with --rehearse", lambda args: args.rehearse, "hand")
     parser.only("with --rehearse", lambda args: not args.port, "coulomb")
     parser.only("with --port", lambda args: args.port, "same_place")
-    parser.only("for commands with a coupling", lambda args: False, "psi", "lam", "reference")
+    coupled = "psi", "lam", "reference", "environment", "known_device"
+    parser.only("for commands with a coupling", lambda args: False, *coupled)
     return parser
 
 

@@ -210,6 +210,8 @@ class Own:
         ("validate", "--human population.toml --humans 2 --duration 0", "[population]"),
         ("bridge", "--port force-dimension --arm --baud 9600", "--baud"),
         *(("identify", f"--rehearse {words}", words.split()[0]) for words in ("--psi 0", "--lam 0", "--reference II")),
+        ("identify", "--rehearse --environment own.py:Own", "--environment"),
+        ("identify", "--rehearse --known-device 0.06,14500,0.5,5", "--known-device"),
         ("view", "--coupling none --script 0:published --video x.gif", "--coupling none with --script 0:published"),
     ],
 )
