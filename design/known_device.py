@@ -631,9 +631,11 @@ def positive(H: Complex) -> NDArray[np.bool_]:
         pivot = H[..., i, i].real
         holds &= pivot > 0
         column = H[..., i + 1 :, i]
-        H[..., i + 1 :, i + 1 :] -= (
-            column[..., :, None] * np.conj(column[..., None, :]) / np.where(holds, pivot, 1.0)[..., None, None]
-        )
+        # A matrix that does not hold keeps pivot 1, with which its other entries may overflow; it stays refused.
+        with np.errstate(over="ignore", invalid="ignore"):
+            H[..., i + 1 :, i + 1 :] -= (
+                column[..., :, None] * np.conj(column[..., None, :]) / np.where(holds, pivot, 1.0)[..., None, None]
+            )
     return holds
 
 

@@ -40,6 +40,7 @@ from haptic_loop.design.known_device import (
     _exact_cost,
     _q_bounds,
     period_cost,
+    positive,
 )
 from haptic_loop.design.necessary import _alias_sums, _necessary_share, left_over
 from haptic_loop.design.result import NotProved
@@ -1180,3 +1181,15 @@ def test_shortest_periods_are_positive(T_min):
     for make in (partial(msgspec.structs.replace, KNOWN), load().replace):
         with pytest.raises(ValueError, match=r"T_min is .*, expected above 0"):
             make(T_min=T_min)
+
+
+def test_huge_indefinite_matrices_are_not_positive():
+    """Pivots of matrices that do not hold overflow without a warning; the others are judged as by eigvalsh."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(20, 6, 6)) + 1j * rng.normal(size=(20, 6, 6))
+    H = A @ np.conj(np.swapaxes(A, 1, 2)) - np.arange(20)[:, None, None] / 10 * np.eye(6)
+    huge = 1e160 * H
+    huge[:, 0, 0] *= -1
+    both = np.concatenate([H, huge])
+    np.testing.assert_array_equal(positive(both), np.linalg.eigvalsh(both)[:, 0] > 0)
+    assert 0 < positive(H).sum() < 20
