@@ -123,6 +123,8 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
     if args.port and not args.deadman and not args.no_dead_man:
         args.deadman = "key"
+    if args.rehearse and args.deadman not in (None, "device"):
+        raise InputError(f"--deadman {args.deadman} needs --port; a rehearsal allows --deadman device (fault letgo)")
     if args.deadman and args.no_dead_man:
         raise InputError("--no-dead-man contradicts --deadman: give one of them")
     if args.deadman == "key" and not sys.stdin.isatty():

@@ -9,7 +9,7 @@ of the line, and a prefix such as `axis2:` selects another axis than the first:
     unplug@1          the cable is pulled, 1 s after arming
     axis2:freeze@1    encoder 2 shows the same count from 1 s after arming on
 
-Without @ a fault acts from the start. Only faults of the line end after DURATION. All random numbers are seeded.
+Without @ a fault acts from the start. Only faults of the line take a DURATION. All random numbers are seeded.
 """
 
 from __future__ import annotations
@@ -117,6 +117,8 @@ class FaultInjection:
             raise InputError(f"--fault {text}: {kind} happens to the device, not to one direction of the line")
         if where and where.startswith("axis") and kind not in _AXIS:
             raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(_AXIS)} do")
+        if duration and kind not in _LINE:
+            raise InputError(f"--fault {text}: {kind} does not end, so it takes no DURATION; {', '.join(_LINE)} do")
         what, low, high, default = KINDS[kind]
         try:
             number = default if value is None else float(value)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Self
 
@@ -109,6 +110,10 @@ class ForceDimension:
         return self._info
 
     def configure(self, config: wire.Config) -> int:
+        with self._off_after_an_error():
+            return self._configure(config)
+
+    def _configure(self, config: wire.Config) -> int:
         self._device.configure(config)
         (ack,) = self._decoder.feed(self._device.ack)
         self._device.ack = b""
@@ -121,6 +126,10 @@ class ForceDimension:
         return ack.refused
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
+        with self._off_after_an_error():
+            return self._exchange(force)
+
+    def _exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
             self._device.receive(wire.encode(force), came := self._now())
             self._write(self._device.applied)
@@ -130,8 +139,7 @@ class ForceDimension:
             self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
         now = self._clock()
         self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
-        if self._device.phase in RUNNING:
-            self._check_status()
+        self._check_status()
         before = self._device.applied
         _, out = self._device.tick(self._now(), self._counts())
         if self._device.applied != before or force is None:
@@ -141,17 +149,32 @@ class ForceDimension:
     def stop(self, reason: wire.Reason) -> None:
         self._device.receive(wire.encode(wire.Stop(reason)), self._now())
         if self._device.phase == wire.Phase.ESTOP:
-            self._write(self._device.zero)
+            self._zero()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         """Set zero force and switch the motors off, whatever came before."""
+        self._zero()
         for ID in self._ids.values():
-            self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
             self._sdk.enableForce(False, ID=ID)
             self._sdk.close(ID=ID)
+
+    def _zero(self) -> None:
+        """Set zero force at every device, also after one that does not accept it."""
+        for ID in self._ids.values():
+            self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
+
+    @contextmanager
+    def _off_after_an_error(self) -> Iterator[None]:
+        """Take the force off every device as soon as one of them has an error, and give none again."""
+        try:
+            yield
+        except Exception:
+            self._device.estop(wire.Cause.DEVICE)
+            self._zero()
+            raise
 
     def _now(self) -> int:
         return round(1e6 * (self._clock() - self._begun))
@@ -170,21 +193,26 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device is not ready: without power or link, in error, reset, or with its forces off."""
+        """Raise SafetyStop if a device has no power or link or is in error; while armed, also if in reset or force-off."""
+        armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():
             status = self._status[index]
             self._heeded(self._sdk.getStatus(status, ID=ID))
             troubles = {
                 "has no power": not status.power,
                 "is not connected": not status.connected,
-                "is in reset mode: calibrate it": status.reset,
                 f"reports error {status.error}": status.error,
+                "is in reset mode: calibrate it": armed and status.reset,
             }
-            if not status.force:
-                cause = self._sdk.ForceOffCause(status.forceoffcause).name.lower()
-                troubles[f"has switched its forces off, cause {cause}"] = 1
+            if armed and not status.force:
+                troubles[f"has switched its forces off, cause {self._cause(status.forceoffcause)}"] = 1
             if wrong := next((words for words, there in troubles.items() if there), None):
                 raise wire.SafetyStop(f"device {index} {wrong}")
+
+    def _cause(self, number: int) -> str:
+        """Return the name of the cause for which a device has switched its forces off, or its number if it has none."""
+        known = {cause.value: cause.name.lower() for cause in self._sdk.ForceOffCause}
+        return known.get(number, str(number))
 
     def _write(self, steps: tuple[int, ...]) -> None:
         forces = {index: [0.0, 0.0, 0.0] for index in self._ids}

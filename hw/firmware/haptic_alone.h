@@ -5,8 +5,8 @@
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
  *   ha_home   call while the handles stand at their reference; no force acts before
- *   ha_arm    tests each axis by a small force, then raises the gain
- *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN), or drops the force at once (every other cause, and during a test)
+ *   ha_arm    tests each axis, whose handle nobody holds, by a small force; then raises the gain
+ *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN, HA_DEAD), or drops the force at once (every other cause, and during a test)
  *   ha_tick   call once per period; it computes the forces for the next period
  */
 #ifndef HAPTIC_ALONE_H
@@ -14,35 +14,63 @@
 
 #include <stdbool.h>
 #include <stdint.h>
+#include <string.h>
 
 #ifndef HA_REAL
 #define HA_REAL double /* float if the file was exported with --float */
 #endif
 typedef HA_REAL ha_real;
 
-#define HA_RISE 0.25f   /* [s] from zero to full gain */
-#define HA_FALL 0.1f    /* [s] from full gain to zero */
-#define HA_TEST_MAX 0.8f /* [N] an axis is dead if neither this force nor half the cap moves it */
-#define HA_TEST 0.2f    /* [s] in which the test force grows to its maximum */
-#define HA_SWING 0.03f  /* [s] after which the test force changes its sign */
+#define HA_RISE 0.25f    /* [s] from zero to full gain */
+#define HA_FALL 0.1f     /* [s] from full gain to zero */
+#define HA_TEST_MAX 0.8f /* [N] test force in the last block, or half the cap if that is less */
+#define HA_SWING 0.03f   /* [s] between two changes of the test force's sign */
+#define HA_BLOCKS 4      /* blocks of four swings; each is twice as strong as the one before */
+#define HA_DEGREE 5      /* of the polynomial that is subtracted from a motion: gravity, drift and the user's hand */
+#define HA_FIT 0.8f      /* least share of a motion's sum of squares with the shape of a free mass's answer */
+#define HA_REST 0.1f     /* [s] window at rest in which the noise of the sensors is measured */
+#define HA_PRESSING 0.3f /* [N] a sensor that stands still for HA_PRESSED [s] under a larger force is dead */
+#define HA_PRESSED 0.5f
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
-enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD };
+enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD, HA_SCALE };
 
 typedef struct {
     ha_real range; /* [m] a handle beyond +-range stops the session */
     ha_real speed; /* [m/s] a faster handle stops the session */
     ha_real cap;   /* [N] largest force; a test force is at most half of it */
-    ha_real count; /* [m] encoder step; a test ends after a path of 12 steps */
+    ha_real count; /* [m] encoder step */
+    ha_real mass;  /* [kg] of a handle that nobody holds; without it no axis passes its test */
 } ha_limits;
+
+typedef struct { /* the test of one axis: sums over the ticks of a block */
+    uint16_t tick;
+    uint8_t block;
+    ha_real acting;              /* [N] force since the last tick */
+    ha_real velocity, path, from; /* velocity [N s] and path [N s2] of a mass of 1 under this force; position [m] at first */
+    ha_real paths, moves, both;  /* sums of squares of path and motion, and of their product */
+    ha_real path_in[HA_DEGREE + 1], move_in[HA_DEGREE + 1]; /* sums of products with the orthogonal polynomials */
+} ha_answer;
 
 typedef struct {
     process_state process;
     uint8_t phase, cause, axis; /* axis: the one under test */
-    uint16_t tick;              /* ticks of the test so far */
-    ha_real gain, path, work;   /* path [m] and work [J] of the axis under test */
+    uint16_t rested;            /* ticks at rest in this window */
+    bool known;                 /* whether the noise of the sensors is known */
+    ha_answer answer;
+    ha_real gain;
     ha_real before[PROCESS_CHANNELS], reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
+    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] range of positions at rest, or since the last motion */
+    ha_real still[PROCESS_CHANNELS];                       /* [m] range in which a sensor rests */
+    uint16_t pressed[PROCESS_CHANNELS];                    /* ticks under a force since the last motion */
 } ha_runner;
+
+static inline void ha_rest(ha_runner *r)
+{
+    int i;
+    r->rested = 0;
+    for (i = 0; i < PROCESS_CHANNELS; i++) r->low[i] = r->high[i] = r->before[i];
+}
 
 static inline void ha_home(ha_runner *r)
 {
@@ -50,14 +78,18 @@ static inline void ha_home(ha_runner *r)
     r->phase = HA_READY;
     r->cause = HA_NONE;
     r->gain = 0;
+    r->known = false;
     for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = r->force[i] = 0;
+    ha_rest(r);
 }
 
-static inline void ha_test_axis(ha_runner *r, uint8_t axis)
+static inline void ha_block(ha_runner *r, uint8_t block)
 {
-    r->axis = axis;
-    r->tick = 0;
-    r->path = r->work = 0;
+    ha_real acting = block ? r->answer.acting : 0;
+    memset(&r->answer, 0, sizeof r->answer);
+    r->answer.block = block;
+    r->answer.acting = acting;
+    r->answer.from = r->before[r->axis];
 }
 
 static inline void ha_arm(ha_runner *r)
@@ -66,48 +98,128 @@ static inline void ha_arm(ha_runner *r)
     r->phase = HA_TESTING;
     r->cause = HA_NONE;
     r->gain = 0;
-    ha_test_axis(r, 0);
+    r->axis = 0;
+    ha_block(r, 0);
 }
 
 static inline void ha_stop(ha_runner *r, uint8_t cause)
 {
     int i;
-    if (r->phase != HA_TESTING && r->phase != HA_RUNNING) return;
+    bool ramp = cause == HA_ASKED || cause == HA_DEADMAN || cause == HA_DEAD;
+    if (r->phase < HA_TESTING || (r->phase == HA_STOPPING && ramp)) return;
     r->cause = cause;
-    if (r->phase == HA_RUNNING && (cause == HA_ASKED || cause == HA_DEADMAN)) {
+    if (r->phase == HA_RUNNING && ramp) {
         r->phase = HA_STOPPING;
         return;
     }
     r->phase = HA_READY;
     for (i = 0; i < PROCESS_CHANNELS; i++) r->force[i] = 0;
+    ha_rest(r);
 }
 
-/* The test force changes its sign and grows until the handle has moved. Its work on a passive handle is positive; a wrong
- * sign of motor or sensor makes the work negative. */
+/* Measures the noise at rest: the least range of positions in a window. A range above one count is doubled, since noise
+ * goes farther in a longer time; a sensor with a broken channel toggles by one count. */
+static inline void ha_listen(ha_runner *r, const ha_limits *l, const ha_real *x)
+{
+    int i;
+    for (i = 0; i < PROCESS_CHANNELS; i++) {
+        if (r->rested == 0 || x[i] < r->low[i]) r->low[i] = x[i];
+        if (r->rested == 0 || x[i] > r->high[i]) r->high[i] = x[i];
+    }
+    if (++r->rested * (ha_real)PROCESS_PERIOD < (ha_real)HA_REST) return;
+    for (i = 0; i < PROCESS_CHANNELS; i++) {
+        ha_real range = r->high[i] - r->low[i], count = l->count * (ha_real)1.5; /* 1.5: rounded positions */
+        ha_real still = range < count ? count : 2 * range + count / 3;
+        if (!r->known || still < r->still[i]) r->still[i] = still;
+    }
+    r->known = true;
+    r->rested = 0;
+}
+
+/* Starts the coupling where the handles are. */
+static inline void ha_run(ha_runner *r, const ha_real *x)
+{
+    int i;
+    process_reset(&r->process);
+    for (i = 0; i < PROCESS_CHANNELS; i++) {
+        r->reference[i] = r->low[i] = r->high[i] = x[i];
+        r->pressed[i] = 0;
+    }
+    r->phase = HA_RUNNING;
+}
+
+/* Judges a block of n ticks. The motion of a free mass is the twice integrated force over the mass; both are compared after
+ * the polynomials of degree HA_DEGREE are subtracted from them. */
+static inline void ha_judge(ha_runner *r, const ha_limits *l, const ha_real *x, uint16_t n)
+{
+    ha_answer *a = &r->answer;
+    ha_real norm = n, size;
+    bool follows;
+    int k;
+    for (k = 0; k <= HA_DEGREE; k++) {
+        if (k) norm *= (ha_real)(k * k) * (1 - (ha_real)(k * k) / ((ha_real)n * n)) / (4 * k * k - 1);
+        a->paths -= a->path_in[k] * a->path_in[k] / norm;
+        a->moves -= a->move_in[k] * a->move_in[k] / norm;
+        a->both -= a->path_in[k] * a->move_in[k] / norm;
+    }
+    size = l->mass * a->both / a->paths;
+    follows = a->both * a->both >= (ha_real)HA_FIT * a->paths * a->moves && a->moves > n * l->count * l->count / 6;
+    if (follows && size < 0) {
+        ha_stop(r, HA_SIGN);
+    } else if (follows && size > 2) {
+        ha_stop(r, HA_SCALE);
+    } else if (follows && size >= (ha_real)0.5) {
+        if (++r->axis < PROCESS_CHANNELS) ha_block(r, 0);
+        else ha_run(r, x);
+    } else if (a->block + 1 < HA_BLOCKS) { /* a stronger force: friction hides small motions */
+        ha_block(r, (uint8_t)(a->block + 1));
+    } else {
+        ha_stop(r, follows ? HA_SCALE : HA_DEAD);
+    }
+}
+
+/* Pushes the axis by a force that changes its sign, and sums up its answer. */
 static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
-    ha_real step = x[r->axis] - r->before[r->axis], most = l->cap / 2 < (ha_real)HA_TEST_MAX ? l->cap / 2 : (ha_real)HA_TEST_MAX;
-    ha_real size = most * (ha_real)(PROCESS_PERIOD / HA_TEST) * r->tick;
-    uint16_t swing = (uint16_t)(HA_SWING / PROCESS_PERIOD);
-    r->work += r->force[r->axis] * step;
-    r->path += step < 0 ? -step : step;
+    ha_answer *a = &r->answer;
+    uint16_t swing = 2 * (uint16_t)(HA_SWING / 2 / PROCESS_PERIOD + 0.5f), n = 4 * swing;
+    ha_real most = l->cap / 2 < (ha_real)HA_TEST_MAX ? l->cap / 2 : (ha_real)HA_TEST_MAX;
+    ha_real u = (ha_real)(2 * (int)a->tick - (n - 1)) / n, p = 1, last = 0, motion = x[r->axis] - a->from;
+    int k;
+    a->path += (a->velocity + a->acting * (ha_real)(PROCESS_PERIOD / 2)) * (ha_real)PROCESS_PERIOD;
+    a->velocity += a->acting * (ha_real)PROCESS_PERIOD;
+    a->acting = r->force[r->axis];
+    a->paths += a->path * a->path;
+    a->moves += motion * motion;
+    a->both += a->path * motion;
+    for (k = 0; k <= HA_DEGREE; k++) { /* polynomials that are orthogonal over the ticks of the block */
+        ha_real next = u * p - (ha_real)(k * k) * (1 - (ha_real)(k * k) / ((ha_real)n * n)) / (4 * k * k - 1) * last;
+        a->path_in[k] += p * a->path;
+        a->move_in[k] += p * motion;
+        last = p;
+        p = next;
+    }
+    r->force[r->axis] = (a->tick + swing / 2) / swing % 2 ? -most : most;
+    for (k = a->block + 1; k < HA_BLOCKS; k++) r->force[r->axis] /= 2;
+    if (++a->tick < n) return;
     r->force[r->axis] = 0;
-    if (r->path > 12 * l->count) {
-        if (r->work <= 0) {
-            ha_stop(r, HA_SIGN);
-        } else if (r->axis + 1 < PROCESS_CHANNELS) {
-            ha_test_axis(r, (uint8_t)(r->axis + 1));
-        } else {
-            int i;
-            process_reset(&r->process);
-            for (i = 0; i < PROCESS_CHANNELS; i++) r->reference[i] = x[i];
-            r->phase = HA_RUNNING;
+    ha_judge(r, l, x, n);
+}
+
+/* Ramps out if a sensor stands still under a force: no hand holds a pushed handle within the noise for half a second. */
+static inline void ha_watch(ha_runner *r, const ha_limits *l, const ha_real *x)
+{
+    ha_real least = l->cap / 2 < (ha_real)HA_PRESSING ? l->cap / 2 : (ha_real)HA_PRESSING;
+    int i;
+    for (i = 0; i < PROCESS_CHANNELS; i++) {
+        if (x[i] < r->low[i]) r->low[i] = x[i];
+        if (x[i] > r->high[i]) r->high[i] = x[i];
+        if (r->high[i] - r->low[i] > r->still[i]) {
+            r->low[i] = r->high[i] = x[i];
+            r->pressed[i] = 0;
+        } else if (r->force[i] > least || r->force[i] < -least) {
+            if (++r->pressed[i] * (ha_real)PROCESS_PERIOD > (ha_real)HA_PRESSED) ha_stop(r, HA_DEAD);
         }
-    } else if (size > most) {
-        ha_stop(r, HA_DEAD);
-    } else {
-        r->force[r->axis] = (r->tick / swing) % 2 ? -size : size;
-        r->tick++;
     }
 }
 
@@ -122,7 +234,9 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
         if (x[i] > l->range || x[i] < -l->range) ha_stop(r, HA_RANGE);
         if (step > most || step < -most) ha_stop(r, HA_SPEED);
     }
-    if (r->phase == HA_TESTING) ha_test(r, l, x);
+    if (r->phase == HA_READY || (r->phase == HA_TESTING && !r->known)) ha_listen(r, l, x);
+    else if (r->phase == HA_TESTING) ha_test(r, l, x);
+    if (r->phase == HA_RUNNING) ha_watch(r, l, x);
     if (r->phase == HA_RUNNING || r->phase == HA_STOPPING) {
         for (i = 0; i < PROCESS_CHANNELS; i++) from[i] = x[i] - r->reference[i];
         process_step(&r->process, from, f);
@@ -131,6 +245,7 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
         if (r->gain <= 0) {
             r->gain = 0;
             r->phase = HA_READY;
+            ha_rest(r);
         }
         for (i = 0; i < PROCESS_CHANNELS; i++) {
             ha_real force = -r->gain * f[i]; /* the devices feel -f */

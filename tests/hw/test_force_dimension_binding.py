@@ -42,14 +42,23 @@ with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
     said["forces"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
     said["limits"] = [stub.stub_limit(1), stub.stub_limit(0)]
     said["watchdogs"] = [stub.stub_watchdog(0), stub.stub_watchdog(1)]
-    for index, value in ((3, 1), (9, 7), (0, 0), (5, 0)):
-        stub.stub_status(1, index, value)
+for index, value in ((3, 1), (9, 7), (0, 0), (1, 0), (5, 0), (5, 99)):
+    with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
+        device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
+        state = device.exchange(None)
+        for command, force in ((Command.ARM, (0, 0)), (Command.RUN, (1000, -500))):
+            state = device.exchange(Force(command, state.tick, state.tick, force))
+        pushed = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
+        stub.stub_status(1, index, value % 99)  # 99: no known cause
+        stub.stub_status(1, 14, value if index == 5 else 0)
         try:
-            device.exchange(Force(Command.RUN, state.tick, state.tick, (0, 0)))
-            said[index] = None
+            device.exchange(Force(Command.RUN, state.tick, state.tick, (1000, -500)))
+            trouble = None
         except SafetyStop as fault:
-            said[index] = str(fault)
-        stub.stub_status(1, index, int(index in (0, 5)))
+            trouble = str(fault)
+        stub.stub_status(1, index, int(index in (0, 1, 5)))
+        device.exchange(Force(Command.RUN, state.tick, state.tick, (1000, -500)))
+        said[f"{index}={value}"] = [trouble, pushed, [stub.stub_force(1, 0), stub.stub_force(0, 1)]]
 said["after"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
 with ForceDimension(load(), "sn4711x,sn4712x", sdk, clock, sleep) as device:
     device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
@@ -121,10 +130,20 @@ def test_three_axes_of_a_device_share_a_limit(session):
 
 @pytest.mark.parametrize(
     ("index", "words"),
-    [("3", "is in reset mode"), ("9", "reports error 7"), ("0", "has no power"), ("5", "has switched its forces off")],
+    [
+        ("3=1", "is in reset mode"),
+        ("9=7", "reports error 7"),
+        ("0=0", "has no power"),
+        ("1=0", "is not connected"),
+        ("5=0", "has switched its forces off, cause forces_not_off"),
+        ("5=99", "has switched its forces off, cause 99"),
+    ],
 )
-def test_bad_status_stops_the_session(session, index, words):
-    assert session[index].startswith(f"device sn4712 {words}")
+def test_bad_status_takes_every_force_at_once(session, index, words):
+    trouble, pushed, then = session[index]
+    assert trouble.startswith(f"device sn4712 {words}")
+    assert pushed == pytest.approx([0.4, -0.2])
+    assert then == [0.0, 0.0]  # also at the other device, and at the next tick
 
 
 def test_no_force_is_left_behind(session):

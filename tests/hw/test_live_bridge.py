@@ -378,6 +378,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--rehearse", "--T", "0.05"], "T is 0.05 s"),
         (["--rehearse", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
         (["--rehearse", "--fault", "nonsense"], "--fault is 'nonsense'"),
+        (["--rehearse", "--fault", "freeze@0.5+1"], "freeze does not end, so it takes no DURATION"),
     ],
 )
 def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):

@@ -189,12 +189,18 @@ def test_a_second_of_clipped_forces_counts(scenario, rungs, cut, stage):
         (["--continuous-force", "1,2,3"], "--continuous-force has 3 entries"),
         (["--continuous-force", "5"], "continuous #1 is 5"),
         (["--thermal-time", "nan"], "--thermal-time is nan"),
-        (["--deadman", "key"], "--deadman key needs a terminal"),
+        (["--port", "/nowhere", "--deadman", "key"], "--deadman key needs a terminal"),
+        (["--rehearse", "--deadman", "key"], "--deadman key needs --port"),
+        (["--rehearse", "--deadman", "switch.txt"], "--deadman switch.txt needs --port"),
     ],
 )
 def test_impossible_limits_are_refused(scenario, options, words):
     with pytest.raises(InputError) as error:
-        session_for(scenario, LinkSettings(), **limits_from(_parser().parse_args(["--rehearse", *options]), scenario))
+        session_for(
+            scenario,
+            LinkSettings(),
+            **limits_from(_parser().parse_args([*options, *["--rehearse"] * ("--port" not in options)]), scenario),
+        )
     assert words in str(error.value)
 
 

@@ -1,0 +1,156 @@
+"""Arming and stopping of a board without a host (hw/firmware/haptic_alone.h), compiled for this processor.
+
+The handle is a mass with damping, Coulomb friction and a constant force such as gravity, stepped ten times a tick.
+"""
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
+T, MASS, COUNT = 1e-3, 0.08, 2e-5
+READY, RUNNING = 1, 3
+ASKED, SPEED, SIGN, DEAD, SCALE = 1, 5, 6, 7, 8
+#: a spring of 300 N/m with a little damping in the place of the exported file; the board's force is -f
+SOURCE = """
+#define PROCESS_CHANNELS 2
+#define PROCESS_PERIOD 1e-3
+typedef struct { REAL last[2]; } process_state;
+static inline void process_reset(process_state *s) { s->last[0] = s->last[1] = 0; }
+static inline void process_step(process_state *s, const REAL *x, REAL *f) {
+    for (int i = 0; i < 2; i++) { f[i] = 300 * x[i] + (x[i] - s->last[i]) / (REAL)1e-3; s->last[i] = x[i]; }
+}
+#define HA_REAL REAL
+#include "haptic_alone.h"
+static ha_runner runner;
+static const ha_limits limits = {0.1, 1.0, 4.0, 2e-5, 0.08};
+void home(void) { ha_home(&runner); }
+void arm(void) { ha_arm(&runner); }
+void stop(int cause) { ha_stop(&runner, (uint8_t)cause); }
+int tick(const double *x, double *force) {
+    REAL own[2] = {(REAL)x[0], (REAL)x[1]};
+    ha_tick(&runner, &limits, own);
+    for (int i = 0; i < 2; i++) force[i] = runner.force[i];
+    return runner.phase + 16 * runner.cause;
+}
+"""
+
+
+@pytest.fixture(scope="module", params=["double", "float"])
+def board(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone")
+    (folder / "board.c").write_text(SOURCE)
+    command = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-shared", "-fPIC"]
+    command += [f"-DREAL={request.param}", f"-I{FIRMWARE}", "-o", "board.so", "board.c"]
+    subprocess.run(command, cwd=folder, check=True)
+    return ctypes.CDLL(str(folder / "board.so"))
+
+
+class Bench:
+    """Two handles before a board: axis 2 may be wrong."""
+
+    def __init__(self, board, seed=0, noise=0.0, friction=0.0, gravity=0.0, speed=0.0, motor=1.0, sensor=1.0):
+        self.board, self.rng, self.noise = board, np.random.default_rng(seed), noise
+        self.friction, self.gravity, self.motor, self.sensor = friction, gravity, motor, sensor
+        self.x, self.v = [0.0, 0.0], [speed, speed]
+        self.force, self.seen = (ctypes.c_double * 2)(), (ctypes.c_double * 2)()
+        self.fastest, self.stuck, self.hand = 0.0, None, 0.0
+        board.home()
+
+    def tick(self):
+        """Run a tick, and return the board's phase and cause."""
+        acting = self.force[0], self.motor * self.force[1]  # computed from the last sample
+        noise = self.noise * self.rng.standard_normal(2)
+        shown = [round(x / COUNT + n) * COUNT for x, n in zip(self.x, noise, strict=True)]
+        self.seen[0], self.seen[1] = shown[0], self.sensor * shown[1] if self.stuck is None else self.stuck
+        told = self.board.tick(self.seen, self.force)
+        for i, force in enumerate(acting):
+            for _ in range(10):
+                pushed = force + self.gravity + self.hand - 0.5 * self.v[i] - self.friction * np.tanh(self.v[i] / 1e-3)
+                self.v[i] += 1e-4 * pushed / MASS
+                self.x[i] += 1e-4 * self.v[i]
+        self.fastest = max(self.fastest, *map(abs, self.v))
+        return told % 16, told // 16
+
+    def armed(self):
+        """Arm, and return phase and cause once the tests are over."""
+        for _ in range(150):
+            self.tick()
+        self.board.arm()
+        for _ in range(1300):
+            if (state := self.tick())[0] in (READY, RUNNING):
+                return state
+        raise AssertionError("the test does not end")
+
+
+SEEDS = range(6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("load", [{}, {"friction": 0.2}, {"gravity": 0.05}, {"speed": 0.03}], ids=str)
+def test_right_axes_are_armed(board, noise, load):
+    for seed in SEEDS:
+        assert Bench(board, seed, noise, **load).armed() == (RUNNING, 0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize(
+    ("wrong", "causes"),
+    [
+        ({"motor": -1.0}, {SIGN}),
+        ({"sensor": -1.0}, {SIGN}),
+        ({"motor": 0.0}, {DEAD}),
+        ({"sensor": 0.0}, {DEAD}),
+        ({"motor": 0.35}, {SCALE, DEAD}),  # a weak motor may stay below the noise
+        ({"sensor": 2.5}, {SCALE}),
+        ({"motor": -1.0, "friction": 0.2}, {SIGN, DEAD}),
+        ({"motor": -1.0, "speed": 0.05}, {SIGN}),
+        ({"motor": 0.0, "speed": 0.05}, {DEAD}),
+        ({"motor": 0.0, "gravity": 0.05}, {DEAD}),
+    ],
+    ids=str,
+)
+def test_wrong_axes_are_never_armed(board, noise, wrong, causes):
+    for seed in SEEDS:
+        bench = Bench(board, seed, noise, **wrong)
+        phase, cause = bench.armed()
+        assert phase == READY
+        assert cause in causes
+        assert list(bench.force) == [0.0, 0.0]
+        assert bench.fastest < 0.35  # [m/s] at a free handle
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_sensor_that_dies_under_a_force_ends_in_a_ramp(board, noise):
+    bench = Bench(board, 1, noise)
+    assert bench.armed() == (RUNNING, 0)
+    for k in range(1500):
+        bench.hand = 1.5 * min(1, k / 500) * (1 + 0.02 * np.sin(2 * np.pi * 9 * T * k))  # with a hand's tremor
+        assert bench.tick() == (RUNNING, 0)
+    assert abs(bench.force[1]) > 1.0
+    bench.stuck = bench.sensor * round(bench.x[1] / COUNT) * COUNT
+    pushed = []
+    for _ in range(620):
+        told = bench.tick()
+        pushed.append(abs(bench.force[1]))
+    assert told == (READY, DEAD)
+    assert pushed[-1] == 0.0
+    assert max(np.abs(np.diff(pushed))) < 0.05  # a ramp of 100 ms
+
+
+def test_a_fast_handle_cuts_the_ramp_short(board):
+    bench = Bench(board)
+    assert bench.armed() == (RUNNING, 0)
+    for k in range(600):
+        bench.hand = 1.5 * min(1, k / 500)
+        bench.tick()
+    board.stop(ASKED)
+    bench.tick()
+    assert any(bench.force)
+    bench.v[0] = 1.5
+    bench.tick()
+    assert bench.tick() == (READY, SPEED)
+    assert list(bench.force) == [0.0, 0.0]
