@@ -95,7 +95,7 @@ void loop()
   if (key == 'h' && runner.phase <= HA_READY) {
     home_counts = counts;
     ha_home(&runner);
-    x = runner.before[0] = HOME;
+    x = runner.before[0] = runner.older[0] = HOME;
   }
   bool held = digitalRead(DEADMAN) == LOW;
   if (key == 'a' && held) ha_arm(&runner);

@@ -28,12 +28,18 @@ typedef HA_REAL ha_real;
 #define HA_BLOCKS 4      /* blocks of four swings; each is twice as strong as the one before */
 #define HA_DEGREE 5      /* of the polynomial that is subtracted from a motion: gravity, drift and the user's hand */
 #define HA_FIT 0.8f      /* least share of a motion's sum of squares with the shape of a free mass's answer */
-#define HA_REST 0.1f     /* [s] window at rest in which the noise of the sensors is measured */
+#define HA_REST 0.1f     /* [s] window without forces in which the noise of the sensors is measured */
 #define HA_PRESSING 0.3f /* [N] a sensor that stands still for HA_PRESSED [s] under a larger force is dead */
 #define HA_PRESSED 0.5f
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
 enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD, HA_SCALE };
+
+/* ticks of a block, and the weights of the recursion p[k + 1] = u p[k] - weight[k] p[k - 1] of polynomials that are orthogonal
+ * over these ticks, u from -1 to 1 */
+#define HA_TICKS (8 * (uint16_t)(HA_SWING / 2 / PROCESS_PERIOD + 0.5f))
+#define HA_WEIGHT(k) ((ha_real)(k * k) * (1 - (ha_real)(k * k) / ((ha_real)HA_TICKS * HA_TICKS)) / (4 * k * k - 1))
+static const ha_real HA_WEIGHTS[HA_DEGREE + 1] = {0, HA_WEIGHT(1), HA_WEIGHT(2), HA_WEIGHT(3), HA_WEIGHT(4), HA_WEIGHT(5)};
 
 typedef struct {
     ha_real range; /* [m] a handle beyond +-range stops the session */
@@ -55,22 +61,16 @@ typedef struct { /* the test of one axis: sums over the ticks of a block */
 typedef struct {
     process_state process;
     uint8_t phase, cause, axis; /* axis: the one under test */
-    uint16_t rested;            /* ticks at rest in this window */
+    uint16_t rested;            /* ticks of the window in which noise is measured */
     bool known;                 /* whether the noise of the sensors is known */
     ha_answer answer;
     ha_real gain;
-    ha_real before[PROCESS_CHANNELS], reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
-    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] range of positions at rest, or since the last motion */
+    ha_real before[PROCESS_CHANNELS], older[PROCESS_CHANNELS]; /* [m] positions at the last tick and the one before */
+    ha_real reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
+    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] range of positions since the last motion */
     ha_real still[PROCESS_CHANNELS];                       /* [m] range in which a sensor rests */
     uint16_t pressed[PROCESS_CHANNELS];                    /* ticks under a force since the last motion */
 } ha_runner;
-
-static inline void ha_rest(ha_runner *r)
-{
-    int i;
-    r->rested = 0;
-    for (i = 0; i < PROCESS_CHANNELS; i++) r->low[i] = r->high[i] = r->before[i];
-}
 
 static inline void ha_home(ha_runner *r)
 {
@@ -79,16 +79,14 @@ static inline void ha_home(ha_runner *r)
     r->cause = HA_NONE;
     r->gain = 0;
     r->known = false;
-    for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = r->force[i] = 0;
-    ha_rest(r);
+    r->rested = 0;
+    for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = r->older[i] = r->force[i] = 0;
 }
 
 static inline void ha_block(ha_runner *r, uint8_t block)
 {
-    ha_real acting = block ? r->answer.acting : 0;
     memset(&r->answer, 0, sizeof r->answer);
     r->answer.block = block;
-    r->answer.acting = acting;
     r->answer.from = r->before[r->axis];
 }
 
@@ -107,37 +105,37 @@ static inline void ha_stop(ha_runner *r, uint8_t cause)
     int i;
     bool ramp = cause == HA_ASKED || cause == HA_DEADMAN || cause == HA_DEAD;
     if (r->phase < HA_TESTING || (r->phase == HA_STOPPING && ramp)) return;
-    r->cause = cause;
+    if (r->phase != HA_STOPPING) r->cause = cause; /* the first cause stays */
     if (r->phase == HA_RUNNING && ramp) {
         r->phase = HA_STOPPING;
         return;
     }
     r->phase = HA_READY;
+    r->rested = 0;
     for (i = 0; i < PROCESS_CHANNELS; i++) r->force[i] = 0;
-    ha_rest(r);
 }
 
-/* Measures the noise at rest: the least range of positions in a window. A range above one count is doubled, since noise
- * goes farther in a longer time; a sensor with a broken channel toggles by one count. */
+/* Measures the noise of the sensors while no force acts: the largest second difference of positions in a window, which a
+ * hand that moves the handle hardly changes. The least of all windows counts. */
 static inline void ha_listen(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
     int i;
     for (i = 0; i < PROCESS_CHANNELS; i++) {
-        if (r->rested == 0 || x[i] < r->low[i]) r->low[i] = x[i];
-        if (r->rested == 0 || x[i] > r->high[i]) r->high[i] = x[i];
+        ha_real bend = x[i] - 2 * r->before[i] + r->older[i];
+        if (bend < 0) bend = -bend;
+        if (r->rested == 0 || bend > r->high[i]) r->high[i] = bend;
     }
-    if (++r->rested * (ha_real)PROCESS_PERIOD < (ha_real)HA_REST) return;
-    for (i = 0; i < PROCESS_CHANNELS; i++) {
-        ha_real range = r->high[i] - r->low[i], count = l->count * (ha_real)1.5; /* 1.5: rounded positions */
-        ha_real still = range < count ? count : 2 * range + count / 3;
+    if (++r->rested < (uint16_t)(HA_REST / PROCESS_PERIOD)) return;
+    r->rested = 0;
+    for (i = 0; i < PROCESS_CHANNELS; i++) { /* 1.5: noise goes farther in a longer time; a broken channel toggles by a count */
+        ha_real still = (ha_real)1.5 * (r->high[i] + l->count);
         if (!r->known || still < r->still[i]) r->still[i] = still;
     }
     r->known = true;
-    r->rested = 0;
 }
 
 /* Starts the coupling where the handles are. */
-static inline void ha_run(ha_runner *r, const ha_real *x)
+static inline void ha_begin(ha_runner *r, const ha_real *x)
 {
     int i;
     process_reset(&r->process);
@@ -145,32 +143,31 @@ static inline void ha_run(ha_runner *r, const ha_real *x)
         r->reference[i] = r->low[i] = r->high[i] = x[i];
         r->pressed[i] = 0;
     }
-    r->phase = HA_RUNNING;
 }
 
-/* Judges a block of n ticks. The motion of a free mass is the twice integrated force over the mass; both are compared after
- * the polynomials of degree HA_DEGREE are subtracted from them. */
-static inline void ha_judge(ha_runner *r, const ha_limits *l, const ha_real *x, uint16_t n)
+/* Judges a block. The motion of a free mass is the twice integrated force over the mass; both are compared after the
+ * polynomials of degree HA_DEGREE are subtracted from them. */
+static inline void ha_judge(ha_runner *r, const ha_limits *l)
 {
     ha_answer *a = &r->answer;
-    ha_real norm = n, size;
+    ha_real norm = HA_TICKS, size;
     bool follows;
     int k;
     for (k = 0; k <= HA_DEGREE; k++) {
-        if (k) norm *= (ha_real)(k * k) * (1 - (ha_real)(k * k) / ((ha_real)n * n)) / (4 * k * k - 1);
+        if (k) norm *= HA_WEIGHTS[k];
         a->paths -= a->path_in[k] * a->path_in[k] / norm;
         a->moves -= a->move_in[k] * a->move_in[k] / norm;
         a->both -= a->path_in[k] * a->move_in[k] / norm;
     }
     size = l->mass * a->both / a->paths;
-    follows = a->both * a->both >= (ha_real)HA_FIT * a->paths * a->moves && a->moves > n * l->count * l->count / 6;
+    follows = a->both * a->both >= (ha_real)HA_FIT * a->paths * a->moves && a->moves > HA_TICKS * l->count * l->count / 6;
     if (follows && size < 0) {
         ha_stop(r, HA_SIGN);
     } else if (follows && size > 2) {
         ha_stop(r, HA_SCALE);
     } else if (follows && size >= (ha_real)0.5) {
         if (++r->axis < PROCESS_CHANNELS) ha_block(r, 0);
-        else ha_run(r, x);
+        else r->phase = HA_RUNNING; /* from the next tick on */
     } else if (a->block + 1 < HA_BLOCKS) { /* a stronger force: friction hides small motions */
         ha_block(r, (uint8_t)(a->block + 1));
     } else {
@@ -178,32 +175,36 @@ static inline void ha_judge(ha_runner *r, const ha_limits *l, const ha_real *x, 
     }
 }
 
-/* Pushes the axis by a force that changes its sign, and sums up its answer. */
+/* Pushes the axis by a force that changes its sign, and sums up its answer; judges it in the tick after a block, because
+ * both together take too long for an ATmega328P. */
 static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
     ha_answer *a = &r->answer;
-    uint16_t swing = 2 * (uint16_t)(HA_SWING / 2 / PROCESS_PERIOD + 0.5f), n = 4 * swing;
     ha_real most = l->cap / 2 < (ha_real)HA_TEST_MAX ? l->cap / 2 : (ha_real)HA_TEST_MAX;
-    ha_real u = (ha_real)(2 * (int)a->tick - (n - 1)) / n, p = 1, last = 0, motion = x[r->axis] - a->from;
+    ha_real u = (2 * (int)a->tick - (int)(HA_TICKS - 1)) * ((ha_real)1 / HA_TICKS), p = 1, last = 0, motion;
     int k;
+    if (a->tick == HA_TICKS) {
+        ha_judge(r, l);
+        return;
+    }
+    motion = x[r->axis] - a->from;
     a->path += (a->velocity + a->acting * (ha_real)(PROCESS_PERIOD / 2)) * (ha_real)PROCESS_PERIOD;
     a->velocity += a->acting * (ha_real)PROCESS_PERIOD;
     a->acting = r->force[r->axis];
     a->paths += a->path * a->path;
     a->moves += motion * motion;
     a->both += a->path * motion;
-    for (k = 0; k <= HA_DEGREE; k++) { /* polynomials that are orthogonal over the ticks of the block */
-        ha_real next = u * p - (ha_real)(k * k) * (1 - (ha_real)(k * k) / ((ha_real)n * n)) / (4 * k * k - 1) * last;
+    for (k = 0; k <= HA_DEGREE; k++) {
+        ha_real next = u * p - HA_WEIGHTS[k] * last;
         a->path_in[k] += p * a->path;
         a->move_in[k] += p * motion;
         last = p;
         p = next;
     }
-    r->force[r->axis] = (a->tick + swing / 2) / swing % 2 ? -most : most;
-    for (k = a->block + 1; k < HA_BLOCKS; k++) r->force[r->axis] /= 2;
-    if (++a->tick < n) return;
-    r->force[r->axis] = 0;
-    ha_judge(r, l, x, n);
+    a->tick++;
+    for (k = a->block + 1; k < HA_BLOCKS; k++) most /= 2;
+    if (a->tick == HA_TICKS) most = 0;
+    r->force[r->axis] = (a->tick + HA_TICKS / 8) / (HA_TICKS / 4) % 2 ? -most : most;
 }
 
 /* Ramps out if a sensor stands still under a force: no hand holds a pushed handle within the noise for half a second. */
@@ -218,7 +219,7 @@ static inline void ha_watch(ha_runner *r, const ha_limits *l, const ha_real *x)
             r->low[i] = r->high[i] = x[i];
             r->pressed[i] = 0;
         } else if (r->force[i] > least || r->force[i] < -least) {
-            if (++r->pressed[i] * (ha_real)PROCESS_PERIOD > (ha_real)HA_PRESSED) ha_stop(r, HA_DEAD);
+            if (++r->pressed[i] > (uint16_t)(HA_PRESSED / PROCESS_PERIOD)) ha_stop(r, HA_DEAD);
         }
     }
 }
@@ -234,10 +235,13 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
         if (x[i] > l->range || x[i] < -l->range) ha_stop(r, HA_RANGE);
         if (step > most || step < -most) ha_stop(r, HA_SPEED);
     }
-    if (r->phase == HA_READY || (r->phase == HA_TESTING && !r->known)) ha_listen(r, l, x);
-    else if (r->phase == HA_TESTING) ha_test(r, l, x);
+    if (r->phase == HA_RUNNING && r->gain == 0) ha_begin(r, x);
     if (r->phase == HA_RUNNING) ha_watch(r, l, x);
-    if (r->phase == HA_RUNNING || r->phase == HA_STOPPING) {
+    if (r->phase == HA_READY || (r->phase == HA_TESTING && !r->known)) {
+        ha_listen(r, l, x);
+    } else if (r->phase == HA_TESTING) {
+        ha_test(r, l, x);
+    } else if (r->phase != HA_HOMING) {
         for (i = 0; i < PROCESS_CHANNELS; i++) from[i] = x[i] - r->reference[i];
         process_step(&r->process, from, f);
         r->gain += r->phase == HA_RUNNING ? rise : -fall;
@@ -245,14 +249,17 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
         if (r->gain <= 0) {
             r->gain = 0;
             r->phase = HA_READY;
-            ha_rest(r);
+            r->rested = 0;
         }
         for (i = 0; i < PROCESS_CHANNELS; i++) {
             ha_real force = -r->gain * f[i]; /* the devices feel -f */
             r->force[i] = force > l->cap ? l->cap : force < -l->cap ? -l->cap : force;
         }
     }
-    for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = x[i];
+    for (i = 0; i < PROCESS_CHANNELS; i++) {
+        r->older[i] = r->before[i];
+        r->before[i] = x[i];
+    }
 }
 
 #endif

@@ -13,7 +13,7 @@ import pytest
 FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
 T, MASS, COUNT = 1e-3, 0.08, 2e-5
 READY, RUNNING = 1, 3
-ASKED, SPEED, SIGN, DEAD, SCALE = 1, 5, 6, 7, 8
+ASKED, SIGN, DEAD, SCALE = 1, 6, 7, 8
 #: a spring of 300 N/m with a little damping in the place of the exported file; the board's force is -f
 SOURCE = """
 #define PROCESS_CHANNELS 2
@@ -65,7 +65,9 @@ class Bench:
         acting = self.force[0], self.motor * self.force[1]  # computed from the last sample
         noise = self.noise * self.rng.standard_normal(2)
         shown = [round(x / COUNT + n) * COUNT for x, n in zip(self.x, noise, strict=True)]
-        self.seen[0], self.seen[1] = shown[0], self.sensor * shown[1] if self.stuck is None else self.stuck
+        self.seen[0], self.seen[1] = shown[0], self.sensor * shown[1]
+        if self.stuck is not None:
+            self.seen[1] = self.stuck + round(noise[1]) * COUNT
         told = self.board.tick(self.seen, self.force)
         for i, force in enumerate(acting):
             for _ in range(10):
@@ -138,7 +140,7 @@ def test_a_sensor_that_dies_under_a_force_ends_in_a_ramp(board, noise):
         pushed.append(abs(bench.force[1]))
     assert told == (READY, DEAD)
     assert pushed[-1] == 0.0
-    assert max(np.abs(np.diff(pushed))) < 0.05  # a ramp of 100 ms
+    assert max(np.abs(np.diff(pushed))) < 0.05 + 0.3 * noise  # a ramp of 100 ms
 
 
 def test_a_fast_handle_cuts_the_ramp_short(board):
@@ -152,5 +154,5 @@ def test_a_fast_handle_cuts_the_ramp_short(board):
     assert any(bench.force)
     bench.v[0] = 1.5
     bench.tick()
-    assert bench.tick() == (READY, SPEED)
+    assert bench.tick() == (READY, ASKED)  # the first cause stays
     assert list(bench.force) == [0.0, 0.0]
