@@ -28,7 +28,7 @@ from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import KINDS, Emulator, FaultInjection
 from haptic_loop.hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
-from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, axis_by_axis
@@ -88,7 +88,7 @@ def add_safety_options(parser: options.Parser) -> None:
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions); of a rotary device, at the radius of the hand"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
-    speed = "fastest motion of a hand while forces act (default 1, at most the devices' least credible_speed)"
+    speed = "fastest motion of a hand while forces act (default 0.7, at most the devices' least credible_speed)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
     heat = "force that each motor bears without end, or one number for all; larger forces are limited in time by I2t "
     heat += "(default: not watched)"
@@ -123,8 +123,6 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
     if args.port and not args.deadman and not args.no_dead_man:
         args.deadman = "key"
-    if args.rehearse and args.deadman not in (None, "device"):
-        raise InputError(f"--deadman {args.deadman} needs --port; a rehearsal allows --deadman device (fault letgo)")
     if args.deadman and args.no_dead_man:
         raise InputError("--no-dead-man contradicts --deadman: give one of them")
     if args.deadman == "key" and not sys.stdin.isatty():
@@ -136,7 +134,7 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
     """Return the speed [m/s or rad/s] at which a session stops. Raises InputError if the damping is unknown there."""
     known = scenario.lever * min(device.credible_speed for device in scenario.axis_devices)
     if args.max_speed is None:
-        return min(1.0, known) / scenario.lever
+        return min(SafetyLimits.speed, known) / scenario.lever
     if args.max_speed > known:
         raise InputError(
             f"--max-speed is {args.max_speed:g}, the devices' least credible_speed is {known:g} metres/s at the hand: "

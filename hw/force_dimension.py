@@ -193,7 +193,7 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device has no power or link or is in error; while armed, also if in reset or force-off."""
+        """Raise SafetyStop if a device lacks power, link or, while armed, calibration or force, or has an error."""
         armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():
             status = self._status[index]

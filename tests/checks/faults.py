@@ -171,7 +171,10 @@ CASES = (
     *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
     *_signed("shaking by {} mm, encoder {}", "shake", 2, "encoder {axis} shakes", _STOP + 2 * _T_MS),
     *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} shakes", _STOP + 12 * _T_MS),
-    *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at 1", _STOP + 12 * _T_MS),
+    *_signed(
+        "{} m/s, below the limit, handle {}", "drift", 0.69, "axis {axis} moves at 0.7|encoder {axis} is at", None
+    ),
+    *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at", _STOP + 12 * _T_MS),
     *_signed(
         "{} mm, out of the range of encoder {}", "jump", 200, r"encoder {axis} is at {sign}\d.*its range is", None, ""
     ),

@@ -154,7 +154,7 @@ def test_a_displacement_that_is_no_number_never_passes(x):
 
 
 def test_values_at_a_limit_are_allowed():
-    LIMITS.check_speed((1e-3, 0.0), (0.0, 0.0), 1e-3)
+    LIMITS.check_speed((0.7e-3, 0.0), (0.0, 0.0), 1e-3)
     LIMITS.check_jump((3e-3, 0.0), (0.0, 0.0), 1)
     LIMITS.check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0))
     Units.of(INFO).check_range((10**5, -(10**5)))
@@ -295,8 +295,8 @@ def test_motion_checks_cover_channels_and_signs(channel, sign):
         (f"encoder {channel + 1} shakes", 1.4e-3, 1.6e-3, lambda x: LIMITS.check_jolt((0.0, 0.0), x, (0.0, 0.0))),
         (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jolt((0.0, 0.0), (0.0, 0.0), x)),
         (f"encoder {channel + 1} is at", 10**5, 10**5 + 1, lambda n: Units.of(INFO).check_range(n)),
-        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: LIMITS.check_speed(x, (0.0, 0.0), 0.01)),
-        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
+        (f"axis {channel + 1} moves at", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed(x, (0.0, 0.0), 0.01)),
+        (f"axis {channel + 1} moves at", 6.9e-3, 7.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
     ):
         check(on(channel, sign * inside))
         with pytest.raises(SafetyStop, match=name):
