@@ -1,4 +1,4 @@
-"""The messages between host and device, as tuples of integers, and the frames that carry them.
+"""The messages between host and device, as named tuples, and the frames that carry them.
 
 A frame on the wire is payload + CRC-32, COBS-stuffed, ended by 0x00; docs/protocol.md lists every byte. A payload is a
 type byte, fixed fields, then one group of fields per axis: the number of axes follows from the length. All integers are
@@ -20,7 +20,7 @@ PROTOCOL = 2
 _MAX_AXES = 8
 MAX_THETA = 15
 MAX_RELEASE_NS = 20_000_000  # longest sum of hold and ramp: in 20 ms, 12 N bring a free mass of 0.25 kg to 1 m/s
-NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the last STATE
+NO_MARGIN = -32768  # in State.margin_us: no usable FORCE came since the last STATE
 DEADMAN = 0x80  # in State.status: the deadman at the device is held
 
 
@@ -116,7 +116,7 @@ class Config(NamedTuple):
     theta: int  # a force answers tick k and is latched at tick k + theta; 0: as soon as it comes, within tick k
     hold: int  # ticks for which the last force is held when frames are missing
     ramp: int  # ticks of the ramp from the held force to zero
-    ramp_in: int  # ticks over which the cap grows from zero after arming; 0: at once
+    ramp_in: int  # FORCEs over which the cap grows from zero after arming; 0: at once
     cap: tuple[int, ...]  # [steps]
     slew: tuple[int, ...]  # [steps per tick]
 
@@ -153,17 +153,17 @@ class Ack(NamedTuple):
 
 
 class State(NamedTuple):
-    """Device to host, every tick: state, encoder counts and applied forces."""
+    """Device to host, every tick after a CONFIG: state, encoder counts and applied forces."""
 
     status: int  # phase, cause and deadman
     tick: int
-    echo: int  # the source of the last FORCE that came
-    margin_us: int  # time from the last FORCE to its latch, negative: too late; NO_MARGIN: none since the last STATE
+    echo: int  # the source of the last usable FORCE
+    margin_us: int  # time from that FORCE to its latch (theta = 0: to its tick's end), negative: too late; or NO_MARGIN
     crc_errors: int  # frames that the device rejected, modulo 256
     misses: int  # ticks without a FORCE in time, modulo 256
     t_us: int  # the device's clock at this tick, modulo 2^32
     counts: tuple[int, ...]  # encoders, sampled at this tick
-    applied: tuple[int, ...]  # forces that act from this tick on [steps]
+    applied: tuple[int, ...]  # forces that act from this tick to the next latch [steps]
 
     @property
     def axes(self) -> int:

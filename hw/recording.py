@@ -1,7 +1,7 @@
 """The record of a session: its trace, and the replay of the trace through the controller, bit by bit.
 
-A trace is the npz of sim.run with arrays of the link added, so that it can be replayed. Its metadata hold the recipe
-for the replay (the limits, coupling and scenario of every arming). A digest detects changes of the file.
+A trace is the npz of sim.run with arrays of the link added. Its metadata hold the recipe for the replay (the limits,
+coupling and scenario of every arming); a MuJoCo world cannot be replayed. A digest detects changes of the file.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from haptic_loop.hw.protocol import NO_MARGIN, SafetyStop
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace
 
-#: names of the link's arrays in a trace, each with one entry per tick
+#: names of the link's arrays in a trace, each with one row per tick
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")
-_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers with one entry per row, not one per axis
+_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers with one entry per tick, not one per axis
 
 
 class Recorder:
-    """Collect the rows of a trace as bytes, about 100 bytes per tick."""
+    """Collect the rows of a trace as bytes: 32 m + 29 bytes per tick for m channels."""
 
     def __init__(self, channels: int) -> None:
         m = self.channels = channels
@@ -61,7 +61,7 @@ class Recorder:
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
-        """Return the ticks [first, stop) of each arming with a linear loop: full gain, before cap, slew or budget act.
+        """Return rows [first, stop) with a linear loop, for each arming with full gain: before cap, slew or budget act.
 
         Missed ticks are included. `force_step` is (m,) [N].
         """

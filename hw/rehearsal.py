@@ -124,7 +124,7 @@ class _Further:
 class Rehearsal:
     """A session and its emulated devices in virtual time: the session's ports lead to the emulators.
 
-    `actions` of a person are pairs: (seconds after arming, call).
+    `actions` of a person are pairs: (seconds after the first arming, call).
     """
 
     session: Session
@@ -322,7 +322,8 @@ def rehearse(
     addition to the scenario's theta, which may be 0. If no coupling is certified for the delay, the session is refused.
     A refusal is a result, not an error: see `stage` and `cause`.
 
-    Raises InputError for a scenario that cannot run behind a serial link, TypeError for an argument of another type.
+    Raises InputError for a scenario that cannot run behind a serial link, or a case or time that is not allowed;
+    TypeError for an argument of another type.
     """
     of_kind("scenario", scenario, Scenario, 'a Scenario, as load("omega-pair") gives it')
     if coupling is not None:

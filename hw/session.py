@@ -4,7 +4,7 @@
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
 
 Every other end is a stage of its own with a cause in the log: refused, stopped, lost, e-stop. A session that has ended
-never arms again. It only repeats its STOP to a device that still drives.
+never arms again. It only repeats its STOP until the device rests, for 50 ms to a silent one.
 """
 
 from __future__ import annotations
@@ -153,10 +153,10 @@ class Session:
         return (SentBudget(plan) if budget else None), (plan if tests else None)
 
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
-        """End the session as planned: by a ramp where forces act, at once where none do.
+        """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
-        After the ramp the motors are tested once more. Where the user `let_go` of the deadman, no test force may act,
-        so the session ends as stopped.
+        After the ramp the motors are tested once more, if encoders are tested. Where the user `let_go`
+        of the deadman, no test force may act, so the session ends as stopped.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -207,7 +207,7 @@ class Session:
             return understand(heard)
         except wire.SafetyStop as fault:
             return self.end(Stage.STOPPED, str(fault), now)
-        except Exception as error:  # after any error, stop the device first
+        except Exception as error:  # any error stops the device
             return self.end(Stage.STOPPED, f"{type(error).__name__} in the bridge: {error}", now)
 
     def poll(self, now: int) -> Said:
@@ -407,7 +407,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
     """Return a session whose forces at the hand are at most `cap` [N].
 
     Raises:
-        InputError: A limit or T is impossible.
+        InputError: A limit or T is impossible, or a rotary scenario has no radius.
     """
     scenario = axis_by_axis(scenario)
     if scenario.unit == "rad" and scenario.radius is None:

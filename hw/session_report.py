@@ -35,8 +35,8 @@ _PIECE = 100_000  # ticks whose ages are computed at a time, to save memory
 class IncidentLog:
     """A log file that is complete up to the last second, however the process ends.
 
-    Each line is a JSON object. Every change of the stage is written at once, the state of the session every second. The
-    lines survive SIGKILL, but may not survive a power failure.
+    Each line is a JSON object. Every entry of the session's log is written at once, its state every second. The lines
+    survive SIGKILL, but may not survive a power failure.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +49,7 @@ class IncidentLog:
         self._written = 0  # [us]
 
     def attach(self, session: Session) -> None:
-        """Write a header, and from now on every change of the session's stage."""
+        """Write a header, and from now on every entry of the session's log."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write(event._asdict())
 
@@ -69,7 +69,7 @@ class IncidentLog:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change of the stage and its cause."""
+    """An entry of the session's log: a stage, and why it began or what happened in it."""
 
     t_s: float  # since the session began
     stage: str
@@ -180,7 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """Return the report of an ended session. It changes the end from finished to stopped if `_doubt` has a reason."""
+    """Return the report of an ended session. First change its end from finished to stopped if `_doubt` has a reason."""
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
     steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []

@@ -53,7 +53,7 @@ class _Joint:
     """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay, 0].
 
     m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
-    is the motor's damping, and the forces have a lag and a delay [s].
+    is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model calls b d, and delta b.
     """
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:
@@ -88,8 +88,8 @@ def transmission_bounds(
 ) -> TransmissionBounds:
     """Return the bounds of one axis from its records: (displacements [m], forces [N]) (N,) each, with period T [s].
 
-    `step` [m] is the encoder step, `friction` was estimated from the free record. On a rotary axis with the hand at the
-    radius `lever` [m], radians and N m are converted to metres and N at the hand.
+    `step` [m] is the encoder step, `friction` was estimated from the free record. A rotary axis with the hand at the
+    radius `lever` [m] has radians and N m everywhere; only the fit is made in metres and N at the hand.
 
     Raises:
         ValueError: Two masses with a spring and a damper in parallel do not explain the records, the clamped mode is
@@ -127,7 +127,7 @@ def transmission_bounds(
     if not (least[0] > 0 and least[2] > 0):
         shown, lowest = lever**2 * b, lever**2 * least[2]
         raise ValueError(
-            f"motor mass or transmission damping, {shown:.3g} N s/m, cannot be told from 0: at least {lowest:.2g}"
+            f"motor mass or transmission damping, {shown:.3g} N s/m, cannot be told from 0: damping >= {lowest:.2g}"
         )
     figures = least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0)
     return at_radius(TransmissionBounds(*figures), lever)

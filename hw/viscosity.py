@@ -5,7 +5,7 @@ that has a memory (a dashpot behind a spring, a belt, a rubber mount), has no su
 and frequencies where a session needs the damping. A record that shows either kind of friction is refused.
 
 Speed: a stroke goes from one turning point to the next. Its kinetic energy begins and ends at zero, so the work of the
-motor is W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, c is dry friction, f0 a
+motor is W = b S2 + g S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt. Here S_n = int |v|^n dt, g is dry friction, f0 a
 constant force, k a spring's stiffness and l the lag of an amplifier. For viscous and dry friction q = 0 at every
 amplitude. Where friction thins, q < 0, and the damping at the speed v is b + q v.
 
@@ -55,7 +55,7 @@ class Viscosity:
     """The loss of damping with speed and with frequency that a record shows."""
 
     speed: float  # [m/s] highest speed of the record
-    thinning: float  # [N s/m] damping lost between slow motion and that speed; 0 if friction does not thin
+    thinning: float  # [N s/m] damping lost between slow motion and that speed; 0 if none, or with few strokes
     thinning_error: float  # [N s/m] standard error of `thinning`
     lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left at high frequency
     memory: float  # [s] time constant of the memory that this bound assumes
@@ -91,7 +91,10 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
-    """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m]."""
+    """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m].
+
+    The error is infinite where fewer than _FEW strokes count.
+    """
     import scipy
 
     n = max(3, round(6e-3 / T) | 1)  # At 3 Hz, cubics over 6 ms fit to far below a count.

@@ -241,7 +241,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(motor, handle, stiffness, min(damping, most))
 
     def of(self, device: Device) -> Device:
-        """Return the device with these mechanics. Raises ValueError if they are outside its guaranteed bounds."""
+        """Return the device with these mechanics. Raises ValueError if it is rigid or they are out of bounds."""
         if isinstance(device, RigidDevice):
             raise ValueError("a rigid device has no transmission that could be drawn")
         return msgspec.structs.replace(device, **msgspec.structs.asdict(self))
@@ -323,7 +323,7 @@ def _check_damping(self: Any) -> None:
 
 # ----------------------------------------------------------------------------------------------------
 # Published parameters of devices that can be bought or built, with their sources. A scenario that names a device must
-# give its damping and force limit if nobody publishes them, for example as measured by `python -m hw.identify`.
+# give its damping (which `python -m hw.identify` measures) and its force limit if nobody publishes them.
 
 
 @dataclass(frozen=True)
@@ -410,7 +410,7 @@ CATALOGUE: Mapping[str, Listed] = {
     "hapkit": Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
-_NEEDED = ("damping", "force_limit")  # fields for which a RigidDevice must not use its assumed default
+_NEEDED = ("damping", "force_limit")  # fields for which a device of the catalogue must not use its assumed default
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
@@ -437,5 +437,5 @@ def fields_of(name: str, own: Mapping[str, Any]) -> dict[str, Any]:
     fields |= own
     if missing := [field for field in _NEEDED if field not in fields]:
         unknown = " and ".join(f"{field} [{'N' if field == 'force_limit' else 'N s/m'}]" for field in missing)
-        raise ValueError(f"nobody publishes {unknown} of {key}: give it beside `device`, as measured by hw.identify")
+        raise ValueError(f"nobody publishes {unknown} of {key}: give it beside `device` (hw.identify measures damping)")
     return fields

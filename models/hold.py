@@ -118,11 +118,11 @@ def expm_each(matrices: _Array) -> _Array:
 
 
 def _units(A: _Array, h: float) -> _Array:
-    """Return units (nsim, 2n) for the states of s' = A s in which exp(h A) is computed accurately.
+    """Return units (nsim, states) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    The unit of velocities is a rate near that of the fastest mode. For a stiff plant the norm of h A is then about this
-    rate times h, and the exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two, so
-    that scaling is exact.
+    The unit of the second half of the states (without impedances, the velocities) is a rate near that of the fastest
+    mode. For a stiff plant the norm of h A is then about this rate times h, and the exponential has a rounding error of
+    1e-16 instead of 1e-11. The units are powers of two, so that scaling is exact.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
@@ -147,8 +147,8 @@ _Which = NDArray[np.intp]
 def product_of(matrices: _Array) -> Product:
     """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
 
-    A plant splits into independent blocks (each device with its human). The zeros of the matrices show the blocks, and
-    only entries inside a block are multiplied.
+    A plant splits into independent blocks, such as a device with its human. The zeros of many matrices show the blocks,
+    and only entries inside a block are multiplied.
     """
     if matrices.ndim == 2:
         return np.ascontiguousarray(matrices).dot
@@ -169,7 +169,7 @@ def product_of(matrices: _Array) -> Product:
 
 
 def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
-    """Return rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
+    """Return rows and columns of the independent blocks of a (states, states + inputs) pattern of nonzeros.
 
     The arrays have the shapes (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
     """

@@ -40,7 +40,7 @@ class Impedance:
     with leading axes hold many impedances of the same order.
 
     Raises:
-        ValueError: The impedance is not stable, or Re Z(jw) < 0 at some frequency.
+        ValueError: A shape does not match, the impedance is not stable, or Re Z(jw) >= 0 fails or cannot be decided.
     """
 
     A: _Array  # (..., n, n)
@@ -263,7 +263,7 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
     """
     A, B, C, D = (np.atleast_2d(np.asarray(part, dtype=float)) for part in (A, B, C, D))
     stiffness = 0.0
-    right, sizes, left = np.linalg.svd(A)  # if A is singular, the last vectors span its right and left null spaces
+    right, sizes, left = np.linalg.svd(A)  # if A is singular, left[-1] spans its null space, right[:, -1] its left one
     if A.size and sizes[-1] <= 1e-12 * max(sizes[0], 1e-300):
         null, left = left[-1], right[:, -1]
         if abs(left @ null) <= 1e-9:
