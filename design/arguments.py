@@ -49,11 +49,12 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
         if option not in allowed:
             close = difflib.get_close_matches(option, allowed, n=1)
             hint = f" (did you mean {close[0]}?)" if close else ""
-            raise TypeError(f"{option} is no option of {what}{hint}, allowed are {', '.join(allowed)}")
+            choices = f"allowed are {', '.join(allowed)}" if allowed else "which has none: leave it out"
+            raise TypeError(f"{option} is no option of {what}{hint}, {choices}")
 
 
 def shown(value: Any) -> str:
-    """Return the value as a short text with its type."""
+    """Return the value and its type as a short text; for a long value only the type, for None only "None"."""
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

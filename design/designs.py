@@ -35,7 +35,7 @@ class _Kind(NamedTuple):
     options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
     limited: bool = False  # whether limited forces are covered by default
-    softened: bool = False  # whether designs may be repeated for less damping until a second condition holds
+    softened: bool = False  # whether designs may be repeated for less damping until a user's own condition holds
 
 
 KINDS = {
@@ -115,8 +115,9 @@ def design_by_kind(
         condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed for
             the kind's usual condition, with the largest share of the damping for which the coupling satisfies both.
         progress: Called during long searches with (task, steps done, number of steps).
-        **options: Options of the kind (design.api.DesignOptions). A spring-damper covers limited forces if such a
-            coupling exists; `limiter` True requires it. `switching` replaces loop.varying_delay.
+        **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
+            forces if LIMITER has designs for the loop and one is found; `limiter` True requires it. `switching`
+            replaces loop.varying_delay.
 
     Raises:
         ValueError: The kind or condition does not exist, or does not suit the loop.
@@ -130,8 +131,8 @@ def design_by_kind(
     chosen = KINDS[kind]
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
-        why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json can be judged by it"
-        raise ValueError(f"condition is {own.name}, {why}")
+        why = f"{kind} couplings are not designed for a condition of your own, allowed are {able} and FILE.py:NAME"
+        raise ValueError(f"condition is {own.name}: {why}; a coupling in a FILE.json is only judged")
     condition_name = usual_condition(loop, kind) if own or not name else name
     able = {c.name: c for c in chosen.conditions}
     if condition_name not in able:
@@ -167,7 +168,8 @@ def design_by_kind(
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
-    switched = loop.varying_delay and made_for is KNOWN_DEVICE  # The search for gains allows constant delays only.
+    # The search for gains by known-device allows constant delays only.
+    switched = loop.varying_delay and made_for is KNOWN_DEVICE
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls or loop.ranges or switched):
         return make(loop)
     return _with_less_damping(loop, make, made_for)

@@ -1,9 +1,10 @@
-"""The paper's matrix inequalities, one function per equation, with remedies for two that cannot be satisfied.
+"""The matrices of the paper's lemmas, one function per lemma, its loop-shaping objective, and scalings for solvers.
 
 `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
-numbers or cvxpy expressions. The remedies below are in units in which T = 1 and Delta_D = I (`unit_environment`).
+numbers or cvxpy expressions.
 
-Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
+Two transfer matrices of the paper can never satisfy the strict inequalities printed for them. The remedies are in
+design.conditions; the formulas here have T = 1:
   E-hat = z/(z-1) Psi E has a pole at z = 1 if E has static stiffness, and A'PA - P < 0 excludes such a pole (15), (17).
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so E-hat without its pole plus
       E(1)/2 satisfies the same condition and is stable (`design.conditions.delayed_environment_demand`).
@@ -52,7 +53,7 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     z = on_circle(np.array([0.1, 1.0, 3.0]))
     response = W2.at(z)
     if np.abs(response - response * np.eye(channels)).max() > 1e-9 * np.abs(response).max():
-        raise ValueError("W2 must be diagonal: the convex-concave step exchanges it with the diagonal gains")
+        raise ValueError("W2 must be diagonal, so that it commutes with the diagonal gains in the convex-concave step")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -177,7 +178,7 @@ _Matrix = Any  # Array or cvxpy expression, (rows, columns)
 
 
 class Ports(NamedTuple):
-    """x+ = A x + B u with a port output y2 = C2 x + D2 u and a dissipated output y1 = C1 x + D1 u.
+    """x+ = A x + B u with the port output y2 = C2 x + D2 u and the output y1 = C1 x + D1 u, whose square is dissipated.
 
     The supply is y2'u - y1' Delta y1 - u' Phi u. Output strict passivity has y1 = y2.
     """
@@ -223,7 +224,10 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
 
 
 def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
-    """Return the matrix of Lemma 3 and (24). With X = U^-1 the matrix is positive iff ||G||_inf < mu; mu2 = mu^2."""
+    """Return the matrix of Lemma 3 and (24), with mu2 = mu^2.
+
+    For some U > 0 and X = U^-1 it is positive iff G is stable and ||G||_inf < mu.
+    """
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
         [X, np.zeros((n, m)), A.T, C.T],

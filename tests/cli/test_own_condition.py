@@ -105,7 +105,7 @@ def test_a_file_without_its_condition_is_explained(folder, monkeypatch):
     [
         (
             ["--coupling", "optimal"],
-            "for which spring-damper, moving-average and functions of your own can be designed",
+            "allowed are spring-damper, moving-average and FILE.py:NAME",
         ),
         (["--scenario", "one-wall"], "the loop has walls, which the condition joined-devices does not name in covers"),
     ],

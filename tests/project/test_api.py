@@ -230,6 +230,10 @@ LOOP = SHORT.loop("I")
             "objectiv is no option of kind 'optimal' (did you mean",
         ),
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
+        (
+            lambda: design_coupling(LOOP, "moving-average", order=3),
+            "order is no option of kind 'moving-average', which has none",
+        ),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
         (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 to 10"),
         (lambda: certify(SHORT, SOFT), "loop is a Scenario, expected a Loop"),
