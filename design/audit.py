@@ -377,7 +377,7 @@ class Audit:
     switching: SwitchingFigures | None
     helps: list[Help]
     not_covered: str = CAVEATS
-    left_over: LeftOver | None = off_table("if given", None)  # the necessary damping of known devices (Theorem A)
+    left_over: LeftOver | None = off_table("if given", None)  # the damping of Theorem A for known devices
 
 
 def audit(

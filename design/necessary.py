@@ -22,7 +22,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.design.frequency import frequencies, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.result import Requirement
+from haptic_loop.design.result import Requirement, listed
 
 
 def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
@@ -104,34 +104,35 @@ def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
 
 @dataclass(frozen=True)
 class LeftOver:
-    """The damping that Theorem A requires and the proved one; better proofs can gain at most the difference.
+    """The damping at which Theorem A holds and the one that known-device requires.
 
     Attributes:
-        required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less.
+        required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less, and
+            better proofs than known-device can gain at most the difference. Otherwise less may be enough.
         frequency_hz: The binding frequency.
         attained: Whether a lossless hand destabilises the loop at every smaller damping (one channel, equal devices).
-        proved_damping: (m,) [N s/m] by known-device; None if it is infinite.
+        known_device_damping: (m,) [N s/m] that known-device requires, by a sweep; None if it is infinite.
     """
 
     required_damping: tuple[float, ...]
     frequency_hz: float
     attained: bool
-    proved_damping: tuple[float, ...] | None
+    known_device_damping: tuple[float, ...] | None
 
     @property
     def words(self) -> str:
         """The comparison as a sentence without its full stop."""
-        need = ", ".join(f"{d:.5g}" for d in self.required_damping)
-        exact = "no proof for every passive hand can require less" if self.attained else "this is enough, by a sweep"
-        if self.proved_damping is None:
-            return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
-        excess = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
-        necessary = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
-        return f"{necessary}; the proof requires {excess} N s/m more"
+        devices, damping = "known devices with linear motors", listed(self.required_damping, 5)
+        words = f"{devices} need {damping} N s/m (Theorem A): no proof for every passive hand can require less"
+        if not self.attained:
+            words = f"{devices} satisfy Theorem A at {damping} N s/m, by a sweep, and perhaps at less"
+        if self.known_device_damping is None:
+            return words
+        return f"{words}; known-device requires {listed(self.known_device_damping, 5)} N s/m"
 
 
 def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
-    """Return the necessary damping of this loop; None if Theorem A does not apply or no damping is enough.
+    """Return the damping at which Theorem A holds; None if it does not apply to this loop, or holds at no damping.
 
     `proved` is the requirement of known-device, if the caller has it.
     """

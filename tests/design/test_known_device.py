@@ -42,7 +42,7 @@ from haptic_loop.design.known_device import (
     period_cost,
     positive,
 )
-from haptic_loop.design.necessary import _alias_sums, _necessary_share, left_over
+from haptic_loop.design.necessary import LeftOver, _alias_sums, _necessary_share, left_over
 from haptic_loop.design.result import NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
@@ -768,10 +768,17 @@ def test_necessary_and_proved_damping_nearly_agree():
     left = left_over(KNOWN, PUBLISHED["I"], required_damping(KNOWN, PUBLISHED["I"], "known-device"))
     assert left.attained
     assert left.required_damping[0] == pytest.approx(0.96269, rel=1e-4)
-    assert left.proved_damping[0] == pytest.approx(0.96294, rel=1e-4)
+    assert left.known_device_damping[0] == pytest.approx(0.96294, rel=1e-4)
     other = change(KNOWN, known_devices=(DEVICE, change(DEVICE, motor_mass_min=0.1)))
     assert not left_over(other, PUBLISHED["I"]).attained
     assert left_over(PAIR, PUBLISHED["I"]) is None
+
+
+def test_sufficient_damping_is_not_called_necessary():
+    words = {attained: LeftOver((1.5,), 80.0, attained, (1.25,)).words for attained in (True, False)}
+    assert "need 1.5 N s/m" in words[True]
+    assert "need" not in words[False]
+    assert all("known-device requires 1.25 N s/m" in each for each in words.values())
 
 
 def random_walls(rng, T):
@@ -967,7 +974,7 @@ def test_the_audit_says_what_is_left_before_walls():
     left = audit(loop, NoCoupling()).left_over
     assert left.attained
     assert left.required_damping[0] == pytest.approx(1.37 * _necessary_share(F, one(1e-3, 1.37, 1)).share, rel=1e-4)
-    assert left.required_damping[0] < left.proved_damping[0]
+    assert left.required_damping[0] < left.known_device_damping[0]
     drawn = ladders(np.random.default_rng(2), 400, 1, 1e-3)
     assert radii(F, loop, 0.9 * left.required_damping[0], drawn).max() > 1
     unlike = change(DEVICE, motor_mass_min=0.1)
