@@ -84,7 +84,7 @@ class Law(ReadOnly):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        """The pairs (row of [f; z+], limit [N]) of the forces that are limited before they are sent."""
+        """The pairs (row of [f; z+], bound [N]) of limited forces; within all bounds no force is changed."""
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
@@ -225,7 +225,8 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
 # The limiter acts before Theta, so that delayed forces are limited, too. While no force reaches its limit, e = 0.
-# Let f_free be the forces without slip, and D_G the feedthrough of G. The limiter solves
+# Let f_free be f_e for e = 0 at this tick (e_- and earlier slips included), and D_G the feedthrough of G. The limiter
+# solves
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
@@ -304,7 +305,7 @@ class Limiter(Law):
         return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self.sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Return whether the contact slipped at the tick that sent each force."""
+        """Return whether the limiter slipped at each tick but the last; the limited force acts theta ticks later."""
         return self.slips(z) != 0
 
     @cached_property

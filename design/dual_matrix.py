@@ -1,7 +1,7 @@
 """The matrix of a dual point, with a lower bound of its eigenvalues on the whole circle, not only at samples.
 
 D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 (see `bound`), scaled by root(delta) from both sides. H is
-piecewise linear with bends c_i at x_i (changes of slope, over 2 pi), so that with H_0 = mean and a = 1/z - 1
+piecewise linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and a = 1/z - 1 this gives
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
@@ -36,8 +36,8 @@ _MOST = 40_000_000  # bends times frequencies of one matrix: about two seconds
 _CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache
 _FAR = 2.0  # distance beyond which a bend counts as far, in lengths of the interval
 _COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, rounded up
-# An interval is halved until its error is below 1/_SHARE of the tolerance, or of the size of a negative eigenvalue at
-# its ends.
+# An interval is halved only while its bound is below minus the tolerance and its error exceeds 1/_SHARE of the larger
+# of two numbers: the tolerance, and the size of a negative eigenvalue at its ends.
 _SHARE = 8
 
 

@@ -34,14 +34,15 @@ OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
 _BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
-_FASTER = 0.25  # With many channels, modes of smaller radius are only in the filter of the sum of all forces.
+_FASTER = 0.25  # With many channels, real modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
 _RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
 _EDGED = {1: 20, 2: 20}  # number of channels: least number of taps for these sections
 _EDGED_OF_MANY = 6  # least number of taps for these sections with more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; small, because the error may jump at the band's end
-# Up to FULL channels every force has a filter to every device. With further constraints the limit is FULL_BESIDE.
+# Up to FULL channels every force has a filter to every device. With further constraints,
+# a latency or ranges, the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the relative mismatch, up to _RICH channels and above
 HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.
@@ -50,7 +51,9 @@ _EVEN = 0.002  # weight of the error relative to each motion's own force (`_even
 _LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10
-_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or, if less, its gain over zero force
+# Duality gaps before the first and before each later sweep, relative to the objective or, if less, its gain over zero
+# force.
+_GAPS = (0.05, 0.01)
 _FORGIVEN = 5e-4  # allowed violation of an inequality between the frequencies of its grid; scaling removes it
 _STEEPER = 3.0  # factor between successive weights of the barrier method
 _POINT = 5e-6  # counted work for one constraint at one frequency
@@ -59,7 +62,7 @@ _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]; the matrices 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the design of an optimal coupling. Raises ValueError with the name of a wrong field."""
+    """Options of the design of an optimal coupling. Raises TypeError or ValueError with the name of a wrong field."""
 
     objective: Literal["rms", "sup"] = "rms"  # norm of the mismatch relative to the environment, over the band
     band_hz: tuple[float, float] = BAND_HZ
@@ -127,7 +130,8 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
-    moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))  # channels; each has an input for its error
+    # Each channel whose delay varies has a further input, the error of its force.
+    moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
     (multiplier,) = SWITCHING.unknowns(switched)
     units = np.array(multiplier.units)  # (devices,), 0 where the delay is constant
     count = np.count_nonzero(units)
@@ -146,7 +150,7 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
 class Slip:
     """Lag and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
 
-    beta: float  # rho = beta delta/T
+    beta: float  # rho of a device is beta/T times its least damping (LimitedForces.rho)
     c: tuple[tuple[float, ...], ...]  # (devices, lags)
 
     @property
@@ -196,7 +200,7 @@ def most_gain(loop: Loop, cap: float) -> _Constraint:
 
 
 def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Constraint:
-    """Return the constraint |F - Lambda E| < tau |E| over the band; its own unknown tau is added to the objective."""
+    """Return the constraint |F - Lambda E| < r |E| over the band; its own unknown r is added to the objective."""
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -235,7 +239,7 @@ class Span:
         return basis(self.poles, z, self.pairs)[:, 1:] - 1
 
     def sources(self) -> Array:
-        """Return the filtered signals as rows over the forces, (m or m + 1, m): each force; row m + 1 is their sum."""
+        """Return the filters' inputs as rows over the forces, (m or m + 1, m): each force; row m + 1 is their sum."""
         m, columns = self.used.shape[1:]
         return np.vstack([np.eye(m), np.ones((columns - m, m))])
 
@@ -265,10 +269,10 @@ class Span:
 def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int = FULL) -> Span:
     """Return a basis of taps, real poles, and the modes of E and of its inverse.
 
-    The real poles are evenly spaced in the logarithm of the time constant. All poles are rounded to decimals. Large
-    bases for at most _RICH channels also have slower poles, and sections at the band's end. With more than `full`
-    channels every device has a filter of its own force and a filter of the sum of all forces. Only the latter has the
-    fast modes.
+    The real poles are evenly spaced in the logarithm of their distance to 1; those near a real mode are dropped. All
+    poles are rounded to decimals. Large bases for at most _RICH channels also have slower poles, and sections at the
+    band's end. With more than `full` channels every device has a filter of its own force and a filter of the sum of all
+    forces. Only the latter has the fast real modes.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
@@ -290,7 +294,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
-    # The fast modes come last, because the filters of the devices' own forces end before them.
+    # The fast real modes come last, because the filters of the devices' own forces end before them.
     pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
@@ -560,7 +564,10 @@ class Problem:
         return missing, worst
 
     def solve(self, start: Array) -> Array:
-        """Find the optimum from a strictly feasible start, with violations below _FORGIVEN on a dense sweep."""
+        """Return the optimum from a strictly feasible start.
+
+        If PROGRAM_SWEEPS rounds are not enough, violations above _FORGIVEN are left to `_kept` or to the caller.
+        """
         pairs = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in pairs]
         A, b, c = self.objective()
@@ -569,8 +576,8 @@ class Problem:
         A, b = R[:, :-1], R[:, -1]
         x, t, gaps = start, None, list(_GAPS)
         inner = start
-        nothing = float(b @ b) + float(c.any())  # objective of zero force, for which tau is 1
-        # With this-environment alone, scaling the forces ensures feasibility.
+        nothing = float(b @ b) + float(c.any())  # objective of zero force, whose relative mismatch is 1
+        # With one constraint per environment, the caller scales the forces down.
         demanding = any(len(case.constraints) > 1 for case in self.cases)
         lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(budgets.PROGRAM_SWEEPS):
@@ -607,9 +614,10 @@ class Problem:
 def _evened(E: Complex, size: Array) -> Complex:
     """Return L, which adds to the mismatch M the errors in motions with small forces: |M L|^2 = |M|^2 + addition.
 
-    Relative to |E|^2 the addition is _EVEN mean over motions x of |M x|^2/(|E x|^2 + _LEAST_FORCE^2 |E|^2 |x|^2).
-    The mismatch is relative to the largest force, and many couplings with nearly the same mismatch differ only in
-    motions with small forces. The addition selects one whose error is small relative to these forces, too.
+    Divided by |E|^2, the addition is _EVEN times the mean of |M v|^2/(|E v|^2 + _LEAST_FORCE^2 |E|^2) over the m right
+    singular vectors v of E. The mismatch is relative to the largest force, and many couplings with nearly the same
+    mismatch differ only in motions with small forces. The addition selects one whose error is small relative to these
+    forces, too.
     """
     unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
     faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)

@@ -4,7 +4,7 @@
 
 load("omega-pair"), parse(text)     Return a Scenario, from a TOML file, a packaged name, or a text.
 Scenario.loop("I")                  Return the Loop of a scenario: all data that a design may use.
-design_coupling(loop, kind)         Return a Design: the best coupling of a kind. DesignOptions lists the options.
+design_coupling(loop, kind)         Return a Design: the best coupling of a kind that was found. See DesignOptions.
 certify(loop, coupling)             Return a Requirement per condition: the damping that the coupling needs.
 assess(loop, coupling)              Return an Assessment: requirements, force limits, and the guarantee or a reason.
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
@@ -85,7 +85,7 @@ if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "controller").is_dir():
 
 
 def _command_starts() -> bool:
-    """Return whether this process runs a command of this package; Python may not have resolved its module yet."""
+    """Return whether this process runs a command of this package; argv[0] is "-m" until Python finds the module."""
     words, started = sys.orig_argv, sys.argv[0] if sys.argv else ""
     module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
     files = (os.path.join(*module.split("."), "__main__.py"), os.path.join(*module.split(".")) + ".py")

@@ -135,9 +135,9 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating. The loop starts in the mode of that human, with an amplitude that
-# overcomes Coulomb friction. The hand presses with a force that starts smoothly and then stays constant. The second
-# half of the trace gives the verdict.
+# whose exact linear loop is nearest to oscillating. The plant starts in the mode of that human, with the motor or
+# handle that moves most at _START. A process with walls or a limiter starts at rest, any other in the mode. The hand
+# presses with a force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have

@@ -211,6 +211,20 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
             np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-9, atol=1e-9)
 
 
+def test_a_slip_bends_the_tick_that_computes_the_force():
+    """Growth is measured on linear ticks: a slip ends them, not the force, which acts theta ticks later."""
+    limiter = loop_of(FIGURE_4, (2, 3), (0, 0)).law(STIFF, (3.0, 1.5), (5.0, 2.0))
+    buffer = drive(closed(limiter), wander(60, 2, 11))
+    slipped = limiter.limited(buffer.z, buffer.f[:60], LIMITS)
+    assert 0 < slipped.any(axis=1).mean() < 1
+    seen = np.concatenate([buffer.z[:60], buffer.x[:60]], axis=1)
+    bent = np.abs(buffer.z[1:61] - np.einsum("ij,kjn->kin", limiter.linear[2:], seen)).max(axis=1) > 1e-9
+    np.testing.assert_array_equal(bent, slipped.any(axis=1))
+    for i, theta in enumerate(limiter.theta):
+        late = np.abs(buffer.f[theta:60, i])[slipped[: 60 - theta, i]]
+        np.testing.assert_allclose(late, limiter.limit[i])
+
+
 @pytest.mark.parametrize("i", [0, 1])
 def test_a_wall_and_every_limit_at_once(i):
     """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
