@@ -414,7 +414,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
         raise InputError("radius is missing: give the distance in metres from the axis to the hand, for its limits")
     limits, balls = scenario.limiter_limits
     r, vectors = scenario.lever, tuple((ball.start, ball.stop) for ball in balls)
-    scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": 1.0 / r, "lever": r} | more
+    scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": SafetyLimits.speed / r, "lever": r} | more
     caps = tuple(min(cap * r, limit) for limit in limits)
     try:
         safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
