@@ -130,9 +130,9 @@ def made(x, meta):
     [
         ({"steady_ticks": [[0, 5000]]}, "it has 500 ticks"),
         ({"steady_ticks": [[30, 20]]}, r"run.steady_ticks are \[\[30, 20\]\]"),
-        ({"steady_ticks": "all"}, "are no numbers"),
-        ({"steady_ticks": 3}, "are no numbers"),
-        ({"encoder_step_m": [1e-6]}, "are no numbers"),
+        ({"steady_ticks": "all"}, "are no pairs of ticks"),
+        ({"steady_ticks": 3}, "are no pairs of ticks"),
+        ({"encoder_step_m": [1e-6]}, "are no pairs of ticks"),
         ({"encoder_step_m": [1e-6, float("nan")]}, "not finite"),
     ],
 )
