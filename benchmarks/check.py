@@ -44,7 +44,7 @@ def reference_this_environment(loop):
 
 
 def reference_any_environment(loop):
-    """Return the largest T (1 - cos n w)/(2 delta He[(1 - 1/z) V]) of all channels, n = theta + 1; needs psi = 0."""
+    """Return the largest T (1 - cos (theta + 1) w)/(2 delta Re[(1 - 1/z) V]) of all channels; None unless psi = 0."""
     if BEYOND & set(loop) or any(loop.get("psi", [])):
         return None
     w = np.angle(Z)

@@ -14,11 +14,11 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # largest number of steps for a row; that many take a minute or two
+_MOST_STEPS = 3_000_000  # largest number of steps of RK4 at its default substeps; they take a minute or two
 _LEGEND = (
     "position: relative rms error; growth: the larger error [1/s] of those with and without the coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
-    "real: simulated seconds per second; *: no other setting of this engine is both faster and more accurate",
+    "real: simulated seconds per second; *: right verdict, and no setting of this engine is faster and more accurate",
 )
 
 
