@@ -252,7 +252,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """Return the range of --varying-delay or of the scenario. Raises InputError unless it contains theta."""
+    """Return the range of the scenario, or that of --varying-delay. Raises InputError if the latter omits theta."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:
@@ -347,7 +347,7 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
     """Yield the changes that certify the coupling, the least required damping first, or that there are none."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
-        yield "What helps: no single change of delay, damper or period was found to help; a design finds other gains."
+        yield "What helps: no change of delay, damper or period alone was found to certify; a design finds other gains."
     for each in enough:
         needs = f"{each.condition} then needs {listed(each.required_damping)} N s/m, certified"
         yield f"What helps: {each.change} ({needs})."

@@ -252,7 +252,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return the damping that the worst stiffness or mass within ten percent requires."""
+    """Return the damping, or with scale 1 its share, that the worst stiffness or mass within ten percent requires."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"

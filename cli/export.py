@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
     test = trial(block)
     write(path, comments_in_unit(c_source(block, test, path.name)))
 
-    forces = "not limited in this file: the proof holds below the motors' limits (--force-limit adds the limiter)"
+    forces = "not limited in this file: a proof covers forces below the motors' limits (--force-limit adds the limiter)"
     if block.limiter:
         limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
         forces = (
@@ -157,7 +157,7 @@ def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ..
 
 
 def _error(block: ExportedBlock) -> str:
-    """Return one line on the error of single precision."""
+    """Return one line on the error of single precision in 4096 random ticks."""
     error, largest = single_precision_error(block)
     unit = "N" if block.output.letter == "f" else "m"
-    return f"differs from double precision by at most {error:.2g} {unit}; the largest value is {largest:.3g} {unit}"
+    return f"differs from double precision by at most {error:.2g} {unit} in 4096 ticks (largest value: {largest:.3g} {unit})"
