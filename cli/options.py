@@ -89,7 +89,7 @@ class Parser(argparse.ArgumentParser):
         return text.format_help()
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # argparse's parse_args calls this
-        """Parse as argparse does; refuse empty values, and a --json file that cannot be written."""
+        """Parse; refuse unknown or excluded options, empty values, and a --json file that cannot be written."""
         self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
@@ -149,7 +149,9 @@ class Parser(argparse.ArgumentParser):
         damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m], or one for all"
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
-        longest = "longest period [s], if periods vary from tick to tick: certificates then cover all up to this one"
+        longest = (
+            "longest period [s], if periods vary: certificates then cover all up to this one (known-device: from T_min)"
+        )
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
         known = (
             "guaranteed motor mass [kg], largest stiffness [N/m], least and largest damping [N s/m] of the transmission"
@@ -339,7 +341,7 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
     for i, (lo, hi) in enumerate(parts, start=1):
         if not 0 <= lo <= hi:
-            channel = f" for channel {i}" if len(parts) > 1 else ""
+            channel = f" in range {i}" if len(parts) > 1 else ""
             raise argparse.ArgumentTypeError(f"is {text!r}, expected 0 <= LO <= HI{channel}")
     return tuple((lo, hi) for lo, hi in parts)
 
@@ -388,9 +390,10 @@ def given(value: Any) -> bool:
 
 @contextmanager
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
-    """Turn a ValueError raised within into InputError, with `name` in front of its message.
+    """Turn a ValueError or ArithmeticError into InputError, with `name` in front of its message.
 
-    If the message begins with the name of an argument that is an option in `args`, the option's name replaces it.
+    Errors raised in a user's own class pass. If the message begins with an argument that `args` holds, the option's
+    name replaces it.
     """
     try:
         yield
@@ -460,7 +463,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device), each=each)
         for name, value in values.items()
     }
-    if args.environment is not None:  # in the same step as T, for which E(T) of a user's own class is computed
+    if args.environment is not None:  # E(T) of a user's own class is computed for the T of the same `replace`.
         changes["environment"] = own_environment(args.environment)
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)

@@ -188,7 +188,7 @@ def test_recorded_delays_and_total_loss(tmp_path):
     ("options", "message"),
     [
         (["--varying-delay", "2,1"], "--varying-delay is '2,1', expected 0 <= LO <= HI"),
-        (["--varying-delay", "1-2,3-2"], "--varying-delay is '1-2,3-2', expected 0 <= LO <= HI for channel 2"),
+        (["--varying-delay", "1-2,3-2"], "--varying-delay is '1-2,3-2', expected 0 <= LO <= HI in range 2"),
         (["--varying-delay", "1-2,1-2,1-2"], "--varying-delay has 3 ranges, expected 2"),
         (["--varying-delay", "a"], "--varying-delay is 'a', expected LO,HI"),
         (["--varying-delay", "3,4"], "theta #1 is 1, outside of its varying_delay, 3 to 4"),
