@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
     if args.decay is not None and (is_world(scenario) or scenario.switches or args.varying_delay):
-        raise InputError("--decay: only a linear loop with constant delays has damping ratios; leave it out")
+        raise InputError("--decay: a world, or a loop with varying delays, has no damping ratios; leave it out")
     if is_world(scenario):
         from haptic_loop.cli import world
 
@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
         render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
     verdict = verdicts.lost(assessment, report.robustness) if slow else verdicts.verdict(assessment, report.robustness)
-    lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
+    lines = ["Interrupted: the robustness is missing, and perhaps the bound."] if report.interrupted else []
     render.publish(args, report, _tables(scenario, report), lines, verdict=verdict)
     return options.exit_code(assessment.holds, report.interrupted)
 

@@ -688,7 +688,7 @@ def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch,
     monkeypatch.setattr(BoundBeside, "of", interrupted)
     assert main(["--coupling", "optimal", "--scenario", str(next(LOOPS.glob("n3*.toml"))), "--out", str(file)]) == 130
     assert printed[0].startswith("Stable for every passive hand")
-    assert "Interrupted: the bound and the robustness are not complete" in capsys.readouterr().out
+    assert "Interrupted: the robustness is missing" in capsys.readouterr().out
     assert verify(load_file(file)).proved
 
 

@@ -127,7 +127,7 @@ def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys):
     ("options", "message"),
     [
         (["--coupling", "optimal"], "--decay is for --coupling spring-damper or moving-average, not optimal"),
-        (["--scenario", "world-cube"], "--decay: only a linear loop with constant delays"),
+        (["--scenario", "world-cube"], "--decay: a world, or a loop with varying delays"),
     ],
 )
 def test_unreachable_damping_ratios_are_refused(options, message, tmp_path):
