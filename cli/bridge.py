@@ -192,7 +192,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """Bound the power [W] that a hand may receive during a tick longer than T_max: sum f^2/(4 delta)."""
+    """Bound the power [W] that a hand may receive in a tick longer than certified: sum f^2/(4 delta)."""
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 

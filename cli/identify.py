@@ -1,10 +1,10 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
-Two sittings are recorded with the handles at different places, and nobody may hold them. If a hand damps a handle in
-one sitting, the other sitting reveals it. The excitation is played in a bridge session with limits of force and speed;
-the force cap is the excitation's largest force. With --transmission two sittings with clamped handles follow. They
-bound the mass of the motor and the transmission (hw/transmission.py), because the known-device conditions use these
-bounds.
+By default two sittings are recorded, with --port at different places of the handles. Nobody may hold them; if a hand
+damps a handle in one sitting, the other sitting reveals it. The excitation is played in a bridge session with limits of
+force and speed; the force cap is the excitation's largest force. With --transmission two sittings with clamped handles
+follow. They bound the mass of the motor and the transmission (hw/transmission.py), because the known-device conditions
+use these bounds.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class _Sitting:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """The last session, one estimate per axis from all sittings, and whether their bounds hold."""
+    """The last session with free handles, one estimate per axis, and whether the bounds hold."""
 
     session: SessionReport = off_table("inlined")
     axes: list[Estimate] = off_table()
@@ -256,9 +256,9 @@ def _with_transmissions(
 
 
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Return a device's [[device]] table for a scenario, with the declared transmission if none was identified.
+    """Return a device's [[device]] table for a scenario, with declared stiffness unless all axes identified it.
 
-    `axes` and `bounds` have one entry per free axis. Masses and transmission of several axes are their means.
+    `axes` and `bounds` have one entry per free axis. Masses and transmission are means over the axes, bounds the worst.
     """
 
     def listed(figures: Sequence[str]) -> str:
@@ -293,7 +293,7 @@ def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[Transmissi
         motor, handle = mean(each.motor_mass for each in known), mean(each.handle_mass for each in known)
         stiffness = mean(each.stiffness for each in known)
     else:
-        lines.insert(0, "# no transmission explained the record: the stiffness and the mass ratio are declared values")
+        lines.insert(0, "# not every axis shows a transmission: the stiffness and the mass ratio are declared values")
         motor = mass * device.motor_mass / (device.motor_mass + device.handle_mass)
         handle, stiffness = mass - motor, device.transmission_stiffness
     masses = [f"motor_mass = {motor:.6g}", f"handle_mass = {handle:.6g}"]

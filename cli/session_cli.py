@@ -61,11 +61,11 @@ def add_link_options(parser: options.Parser) -> None:
     # Tests use --pace to drive an emulator behind a pseudo-terminal in slow motion.
     add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
-    baud = "baud rate of a UART, checked against T; none: no UART (default 921600; none for a pseudo-terminal)"
+    baud = "baud rate of a UART, checked against T, or none (default 921600; none for a pseudo-terminal or --rehearse)"
     add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
     count = "answers that are timed (default 800)"
     add("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
-    share = "share of the measured ages that theta covers (default 0.99)"
+    share = "share of the measured ages that theta or the latency covers (default 0.99)"
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to the measured age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
@@ -108,7 +108,7 @@ def add_safety_options(parser: options.Parser) -> None:
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
-    """Return the scenario. It may have no Coulomb friction, uneven ticks or varying delays. Raises InputError."""
+    """Return the scenario. Raises InputError if it has Coulomb friction, uneven ticks or varying delays."""
     scenario = options.scenario_from(args)
     require_linear(scenario, command, walls=True)
     for require in (require_constant_delay, require_even_ticks):
