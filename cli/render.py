@@ -297,7 +297,7 @@ def robustness_rows(there: Robustness | None) -> Rows:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
         if there.required_over_available > _MUCH:
-            yield "", f"--ranges {there.percent:g}% designs for all of these environments"
+            yield "", f"python -m design --ranges {there.percent:g}% designs for all of these environments"
 
 
 def verdict(word: str | None) -> str:

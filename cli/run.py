@@ -85,7 +85,7 @@ def _parser() -> options.Parser:
     add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
     steppers = "integrator of MuJoCo (default exponential, RK4 with friction)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
-    steps = "MuJoCo steps per period (default: as many as the plant's fastest motion needs)"
+    steps = "MuJoCo steps per period (default: 1 with exponential, else as many as the plant's fastest motion needs)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
     error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
@@ -179,7 +179,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
-    """Return the walls between a contact and ground, (channel, place, name), and the ticks with contact, (N,)."""
+    """Return the walls between a contact and ground, (channel, place, name), and the ticks (N,) that touch any wall."""
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None
@@ -237,7 +237,12 @@ def _rows(report: RunReport) -> render.Rows:
     yield "transparency error", felt and render.transparency_error(felt)
     yield from render.robustness_rows(report.robustness)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
-    yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
+    yield (
+        "force error",
+        f"{apart}, before clipping (after it with a limiter or switching delays)"
+        if apart
+        else f"- ({report.ideal_force.reason})",
+    )
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
     yield from _net_rows(report.energy_budget)
     yield "growth, eigenvalues", _growth(stability)

@@ -60,7 +60,7 @@ def _verdict(growths: list[Growth]) -> str:
 def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.trace",
-        "Measure how oscillations grow in a stored trace, from its displacements alone, or draw the trace.",
+        "Measure how oscillations grow in a stored trace, from its displacements alone; with --plot draw it, too.",
         "python -m sim.trace out/bridge-I/trace.npz",
         "python -m sim.trace out/bridge-I/trace.npz --plot figure.png",
     )
