@@ -111,7 +111,7 @@ def _parser() -> options.Parser:
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
-    """Return the scenario of the options. Raises InputError unless it is linear."""
+    """Return the scenario of the options. Raises InputError for friction, or an impossible duration."""
     scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
     require_linear(scenario, "sim.validate", walls=True)
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
@@ -165,7 +165,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search for the worst humans; with ranges, where the most damping is required. Ctrl-C ends the search."""
+    """Search for the worst humans; with --environments ranges at the worst point. Ctrl-C ends the search."""
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name

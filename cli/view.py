@@ -43,7 +43,7 @@ _LONGEST = 3600  # [s] longest video
 
 
 def main(argv: list[str]) -> int:
-    """Show the loop until the window is closed or the film is complete. Return 0, or 130 if interrupted."""
+    """Show the loop until the window is closed, --duration or the film ends. Return 0, or 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.sim.view.stage import check_film
 
@@ -173,7 +173,7 @@ def _parser() -> options.Parser:
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events with their times [s] (default of a video without world and --coupling: '{_SCRIPT}')",
+        help=f"events with their times [s] (default of a video without world, --coupling or --case none: '{_SCRIPT}')",
     )
     until = "length (default: in a world the scenario's; else a window until closed, a video until after its script)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)

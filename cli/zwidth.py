@@ -85,7 +85,7 @@ def _parser() -> options.Parser:
     parser.add_rigid()
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
     fixed = "keep this coupling and vary K and B of the environment's contact springs"
-    names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
+    names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
     parser.add_condition("the condition of the fixed coupling's design; your own is drawn in every map", to=of_map)
     rows = "rows and columns (default 60; 24 with --coupling, and before walls)"
@@ -104,7 +104,7 @@ def _parser() -> options.Parser:
         "--duration", type=options.number(), metavar="SECONDS", default=3.0, help="length of each run (default 3)"
     )
     parser.add_output(picture=True)
-    parser.set_defaults(limiter=None)  # the simulated motors never clip
+    parser.set_defaults(limiter=None)  # There is no --no-limiter, because the simulated motors never clip.
     parser.only("about simulated points: --points 0 has none", lambda args: args.points, "duration")
     designed = "with --coupling, or for a condition of your own"
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
