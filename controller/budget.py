@@ -288,7 +288,7 @@ class EnergyBudget(_Net):
         """Return the largest s (nsim,) for which the energy is at least the reserve including the packet s f.
 
         Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is its present reserve,
-        r the channel's loss, and b = 2 q |f|. The sum of the reserves is within the energy if and only if
+        r = T f^2/(4 delta'), and b = 2 q |f|. The sum of the reserves is within the energy if and only if
         sum (s^2 r + s b) <= room + sum M for every set of these pairs. It is enough to check the first n pairs, for
         every n, in the order of the s at which s^2 r + s b exceeds M.
         """

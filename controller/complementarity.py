@@ -17,7 +17,7 @@ from haptic_loop.controller.lti import Array, ReadOnly, frozen
 
 _LEAST_MINOR = 1e-12  # a smaller principal minor of a matrix with unit diagonal counts as zero
 _MOST_CANDIDATES = 27  # largest number of active sets to enumerate (three channels, or two with a wall)
-GROUNDED = 1e-10  # regularisation of a singular matrix for pivoting, relative to its largest diagonal entry
+GROUNDED = 1e-10  # regularisation of a singular matrix, and of a block of force vectors, relative to its diagonal
 PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of its difference
 
 
@@ -79,11 +79,11 @@ class Complementarity(_Problem):
 class BoxProblem(_Problem):
     """f = q - M v with lower <= f <= upper; v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
 
-    If M is a P-matrix, there is exactly one solution for every q. Active sets on which M is singular, as for an
-    environment without a connection to ground, are skipped. f is still unique then.
+    If M is a P-matrix, there is exactly one solution for every q. If M is only singular, as for an environment
+    without a connection to ground, f is still unique. Enumeration skips singular active sets, pivoting regularises M.
 
     Raises:
-        SingularLoop: A principal minor of M is negative.
+        SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.
     """
 
     lower: Array  # (n,) -inf without a limit
@@ -367,7 +367,7 @@ class _BallBlock:
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
-        """Solve by the Douglas-Rachford iteration, which converges for every monotone M, with final Newton steps."""
+        """Solve by the Douglas-Rachford iteration, which converges for monotone M, and try Newton steps in between."""
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):

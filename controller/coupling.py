@@ -1,9 +1,9 @@
 """Virtual couplings, the controllers between the devices and the environment.
 
-V maps force to displacement (a compliance). In negative feedback around the delayed environment Psi E it turns the
-devices' displacements x into u = x - V f, which Psi E turns into the forces f. `around` returns this loop,
-G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems, Fractions, or sampled responses
-(controller.lti). A coupling is stored in a file as a `Form`.
+V maps force to displacement (a compliance); a `ForceFilter` filters forces instead. In negative feedback around the
+delayed environment Psi E, V turns the devices' displacements x into u = x - V f, which Psi E turns into the forces f.
+`around` returns this loop, G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems,
+Fractions, or sampled responses (controller.lti). A coupling is stored in a file as a `Form`.
 """
 
 from __future__ import annotations
