@@ -160,4 +160,7 @@ def _error(block: ExportedBlock) -> str:
     """Return one line on the error of single precision in 4096 random ticks."""
     error, largest = single_precision_error(block)
     unit = "N" if block.output.letter == "f" else "m"
-    return f"differs from double precision by at most {error:.2g} {unit} in 4096 ticks (largest value: {largest:.3g} {unit})"
+    return (
+        f"differs from double precision by at most {error:.2g} {unit} in 4096 random ticks; "
+        f"the largest value is {largest:.3g} {unit}"
+    )
