@@ -3,7 +3,8 @@
 The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
 stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or a
 face, which uniformly drawn points never hit. For every set of contacts that may be present, the search therefore tries
-points on edges, on faces and inside. A compass search then continues from the worst points.
+vertices, points on edges, on faces (only for up to _MANY parameters) and inside. A compass search then continues from
+the worst points.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
 
 _SEED = 0xFACE
-_MANY = 7  # With more parameters than this, points at vertices and on edges are drawn at random.
+_MANY = 7  # With more parameters, vertices and points on edges are drawn at random, and none on faces.
 _APART, _SAME = 0.2, 0.05  # least distances between two starts of the compass search and between two maxima
-_FIRST, _LAST = 1 / 16, 1 / 128  # first and last step of the compass search, in widths of the ranges
+_FIRST, _LAST = 1 / 16, 1 / 128  # first (up to _MANY parameters) and last step of the compass search, in range widths
 
 SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
 
@@ -97,7 +98,10 @@ def _member(region: Region, point: Array) -> Member:
 
 
 def _points(region: Region) -> Iterator[Array]:
-    """Yield points of the unit cube: its vertices, points along every edge, and points on faces and inside."""
+    """Yield points of the unit cube: at vertices, on edges, on faces and inside.
+
+    Up to _MANY dimensions include all vertices and edges; more include a random part of them, and no faces.
+    """
     n = region.low.size
     rng = np.random.default_rng(_SEED)
     if n > _MANY:

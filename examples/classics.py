@@ -1,6 +1,7 @@
 """The classics of passivity (PO/PC, energy bounding) and our couplings with the same hands. Half a minute.
 
-Columns: the rms error of the applied force; its rms above 40 Hz and peak; the share of ticks in which the layer acted;
+Columns: the rms error of the applied force; the force's rms above 40 Hz and its peak; the share of ticks in which the
+layer acted;
 of 100 pairs of lossless hands, started at 0.1 m/s, how many are faster in the tenth second, and the largest speed then.
 """
 

@@ -6,8 +6,9 @@
     environment.world            scene and coupling solved in one step, with the same shell
 
 A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. It grows if hand and device receive,
-beyond what the device's damping dissipates, more energy than gravity and springs of the scene released and the 2 mJ of
-the shell. It shakes if, in the last fifth of the run, a force changes by more than a tenth of the limit in a tick.
+beyond what the device's damping dissipates, more energy than the 2 mJ of the shell and, with environment.world, what
+gravity and springs of the scene released. It shakes if, in the last fifth of the run, a force changes by more than a
+tenth of the limit in a tick.
 """
 
 import sys
@@ -50,7 +51,10 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], the share of limited or scaled ticks, and how many hands grow and how many shake."""
+    """Return the peak force [N], a share of ticks, and how many hands grow and how many shake.
+
+    The share is that of ticks with a clipped contact force, or with forces that the shell scaled.
+    """
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):
