@@ -244,7 +244,7 @@ class Boards:
         return max(answers)
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
-        """Send every board its part of a force, and wait for the samples of the next step."""
+        """Send every board its part of a force, and return the STATE of the next step, or None until it is complete."""
         if not self._configured:
             self._wait(_LONGEST)
             return None
@@ -309,7 +309,10 @@ class Boards:
         )
 
     def _margin(self, samples: Sequence[wire.State]) -> int:
-        """Return the least margin of the boards' answers. Until forces act, it excludes the wait for other boards."""
+        """Return the least margin of the boards' answers, or NO_MARGIN if a board reports none.
+
+        Until forces act, the margin excludes the wait for other boards.
+        """
         margins = []
         for board, state in zip(self._boards, samples, strict=True):
             if state.margin_us == wire.NO_MARGIN:

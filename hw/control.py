@@ -384,7 +384,7 @@ class Drive:
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
-        """Raise SafetyStop where no hand can have moved the handles to x (m,) [m] within `ticks` ticks."""
+        """Raise SafetyStop where the handles came to x (m,) [m] by a jump or a jolt, or faster than the speed limit."""
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
             if ticks == 1 and self._before is not None:
@@ -494,7 +494,7 @@ class CertifiedCoupling:
         return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
 
     def remarks(self) -> list[str]:
-        """Return remarks on the coupling's file, on the user's own condition and on the clock."""
+        """Return remarks on the coupling's file, own conditions, torques, walls, and forces that latch on arrival."""
         said = [*self.chosen.remarks(self.assessment.requirements)]
         if torques := self.assessment.held_torques:
             said.append(f"held torques: {torques}")

@@ -41,7 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at full cap after which the person starts to move; by then the gain is 1
+_SETTLED = 203  # ticks at full cap after which the person starts to move; the gain may still rise after encoder tests
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
@@ -64,7 +64,7 @@ _DEVICE = {
     "reset": ("no value: the device restarts", 0.0, 0.0, 0.0),
     "leap": ("ticks by which the device's tick number leaps", 1.0, 32000.0, 300.0),
     "stuck": (
-        "no value: the device ignores its watchdog, IDLE and every STOP except ESTOP",
+        "no value: the device ignores its watchdog, its own faults, IDLE and every STOP except ESTOP",
         0.0,
         0.0,
         0.0,

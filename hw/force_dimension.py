@@ -1,8 +1,7 @@
 """Drive Force Dimension devices, which have no clock, through the maker's library and its Python package.
 
 The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
-after the sample (theta = 0). The certificate covers periods up to T_max and latencies within [t1, t2], which the
-host measures at zero force.
+after the sample (theta = 0). The certificate covers the periods and latencies that the host measures at zero force.
 """
 
 from __future__ import annotations

@@ -4,13 +4,13 @@ Both sides of the balance are filtered by a Gaussian window h (modulating functi
 
     m x'' + b x' + p x''' + r x'''' + k x + f0 + f1 t + (1 + a D^2)(g + q x'|x'|) + periodic(x) = (1 + l D + a D^2) f
 
-with the displacement x, the motor's force f and D = d/dt. The fit estimates m and b. The term k x stands for a cable, a
-spring or gravity that changes with position, f0 + f1 t for a constant force and its drift. A motor (m1) that drives the
-handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12, p = a b + l m, r = a m1. The balance has no
-fractions, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier changes l to l - tau and a to
-a + tau^2/2, so the fit does not mistake this lag for negative damping. The fit differentiates h, never the encoder, and
-integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
-takes milliseconds. A fit needs no initial state.
+with the displacement x, the motor's force f and D = d/dt. The fit estimates the mass m and the viscous damping b. The
+term k x stands for a cable, a spring or gravity that changes with position, f0 + f1 t for a constant force and its
+drift. A motor (m1) that drives the handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12, p = a b + l m,
+r = a m1. The balance has no fractions, since both sides were multiplied by 1 + l D + a D^2. A lag tau of
+the amplifier changes l to l - tau and a to a + tau^2/2, so the fit does not mistake this lag for negative damping. The
+fit differentiates h, never the encoder, and integrates a force held for a tick exactly. The balance is linear in all
+parameters except the a before g, so a fit takes milliseconds. A fit needs no initial state.
 
 Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
 vanishes at high speed (Stribeck). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits
@@ -23,7 +23,7 @@ the damping that noise as strong as the residual could imitate. The final bound 
 less the share SCALE.
 
 The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
-b is a lower bound at every speed.
+with such friction, b is a lower bound at every speed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _HIDDEN = 0.03  # the bound is reduced by this share of the damping that the res
 #: relative error of the encoder's scale, which no record shows; eccentricity of 20 um in a turn of 40 mm gives 3e-3
 SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
-_FEW = 200  # least number of ticks with motion in a record
+_FEW = 200  # least number of ticks of a record at which the balance holds
 _ALMOST = 4.0  # twice the largest log likelihood ratio of the best law to a law that counts in the bound
 _ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
@@ -155,7 +155,7 @@ class _Balance:
         spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
-            raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
+            raise ValueError(f"the axis moves in {len(rows)} usable samples, at least {_FEW} are needed")
         self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # independent filtered samples
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)

@@ -171,7 +171,7 @@ class Estimate:
 
     @property
     def delta(self) -> float:
-        """Lower bound of the damping [N s/m] at every speed and frequency."""
+        """Lower bound of the damping [N s/m] at the recorded speeds and frequencies."""
         return min(self.friction.delta, self.viscosity.lasting)
 
 

@@ -83,9 +83,8 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    speed: float = (
-        0.7  # [m/s] fastest motion while forces act: no drifting encoder brings a free handle to 1 m/s at 2 N
-    )
+    #: [m/s] fastest motion while forces act; at 2 N a single drifting encoder brings no free handle to 1 m/s
+    speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole

@@ -36,7 +36,7 @@ _REMEMBERED = 64  # most forces or latches that are stored; at most the last the
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
 _PATIENCE = 5  # wrong ticks in a row at which a session stops
 _CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle that is not at a stop
-_IMPULSE = 0.1  # [N s] largest time integral of such changes without a motion: 1 N for 100 ms, 5 N for 20 ms
+_IMPULSE = 0.1  # [s] times the unit of _CHANGE: largest integral of such changes without a motion; 1 N for 100 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
@@ -46,7 +46,7 @@ _FIT = 0.8  # least share of power with the expected shape: loosely moved handle
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short one, but no certificate covers a whole tick
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
-_PUSHED = 0.5  # least share of the strongest test force that must act for a valid test
+_PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
 _STRONG = 2  # first block of the test at the end of a session
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
@@ -344,7 +344,7 @@ class LinkMonitor:
             raise SafetyStop(f"no STATE in {part}: the device's forces are unknown")
         if self._untold / window > _UNTOLD:
             raise SafetyStop(
-                f"{100 * _UNTOLD:g} % or more of the last {window} STATEs had no margin: their lateness is unknown"
+                f"{100 * _UNTOLD:g} % of the last {window} STATEs may lack a margin, more do: their lateness is unknown"
             )
         if late > self.settings.late:
             return f"{100 * late:.0f} % of the last {window} answers were late"
@@ -457,7 +457,9 @@ class CommandMonitor:
         self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
         if self._unlike > _FORGETTING * (_PATIENCE - 1):
             what = f"told {told}" if phase == Phase.ARMED else f"to hold {last.applied}"
-            raise SafetyStop(f"the device applies {state.applied} steps, it was {what}, and so for {_PATIENCE} ticks")
+            raise SafetyStop(
+                f"the device applies {state.applied} steps, it was {what}; {_PATIENCE} ticks or more were wrong"
+            )
         return wrong
 
     def _could(self, state: State, last: tuple[int, ...], told: tuple[int, ...] | None) -> bool:
@@ -483,7 +485,7 @@ class CommandMonitor:
 class EncoderNoise:
     """The noise of every encoder at rest, while no force acts.
 
-    It is the least range of counts over windows of 100 ms. So a person may move a handle that rests for one window.
+    It is the least range of counts over windows of 100 ms. So a person may move the handle if it rests for one window.
     """
 
     def __init__(self, axes: int, T: float) -> None:
@@ -549,10 +551,10 @@ class EncoderTest:
     wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
     comes later than expected shows a hidden delay, because friction and hands advance its phase.
 
-    At the end of a session (`alive`) unknown hands may hold the handles and move them. Then it suffices that the axis
-    swings at the frequency of the force, at any phase. An axis with a dead motor does not swing. Too small a motion is
-    refused only where it has the shape of a free handle and not that of a handle in a hand as heavy as the device. The
-    mode of a transmission makes these shapes differ; for a rigid device they are equal.
+    At the end of a session (`alive`) unknown hands may hold the handles and move them, except in rehearsals (`held`).
+    Then it suffices that the axis swings at the frequency of the force, at any phase. An axis with a dead motor does
+    not swing. Too small a motion is refused only where it has the shape of a free handle and not that of a handle in a
+    hand as heavy as the device. The mode of a transmission makes these shapes differ; a rigid device has equal shapes.
     """
 
     def __init__(
@@ -680,7 +682,7 @@ class EncoderMonitor:
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
     of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
-    of more than 0.3 N, no hand holds still for half a second, because it has a tremor.
+    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:

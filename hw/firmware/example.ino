@@ -7,7 +7,7 @@
  *   3. It returns at least 100 on an idle line. Two axes send an INFO of 68 bytes and STATEs of 32 bytes. With less room they
  *      wait in `queue`, which delays a STATE. The host measures this delay as part of the round trip.
  *
- * Adapt the pins, the numbers of INFO (measure them; docs/protocol.md has their units) and the functions marked below. The
+ * Adapt the pins, the numbers of INFO in setup() (measure them; docs/protocol.md has their units) and the functions below. The
  * safety states are in haptic_link.h: do not change that file. */
 #include <Arduino.h>
 
@@ -88,7 +88,7 @@ static void serialWrite(const uint8_t *data, size_t n)
 
 static uint32_t timeUs() { return (uint32_t)micros(); }
 
-/* ---- the loop: do not change it --------------------------------------------------------------------------------- */
+/* ---- setup and loop: change only the numbers of INFO -------------------------------------------------------------- */
 
 void setup()
 {
