@@ -83,8 +83,9 @@ from haptic_loop.design.result import (
 
 # ----------------------------------------------------------------------------------------------------
 # The search for the best multiplier. s is required over available damping, and the block is affine in (s, multiplier).
-# At finitely many frequencies a semidefinite program (design.cone) gives the least s over all multipliers: a lower
-# bound. Frequencies at which a sweep with this multiplier needs a larger s are added until the sweep attains the bound.
+# At finitely many frequencies a semidefinite program (design.cone) gives the least s over the multipliers between their
+# bounds (`Unknowns`): a lower bound. Frequencies at which a sweep with this multiplier needs a larger s are added until
+# the sweep attains the bound, or a budget is spent.
 
 
 class Multiplied(Condition):
@@ -96,7 +97,7 @@ class Multiplied(Condition):
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the map G of `block`. Raises SingularLoop, and TooLong if it is too large to be proved."""
+        """Return the map G of `block`. Raises SingularLoop, and if `exact` TooLong for a map too large to be proved."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -114,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block` if the values for `hands` have been multiplied by s; it is affine in s and all values."""
+        """Return `block` for multipliers of which those of `hands` are times s; it is affine in s and all values."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -135,7 +136,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier; for None, at the best one found, with the search's `bound`."""
+        """Return the requirement at this multiplier; for None, at the best one found, with the `bound` of a search."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -194,10 +195,11 @@ def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequenc
     return [values[a:b] for a, b in pairwise(ends)]
 
 
-_MOST_PEAKS = 3  # largest number of frequencies that are added in a round
+_MOST_PEAKS = 3  # largest number of local maxima (`peaks`) whose frequencies are added in a round
 _NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
-_SETTLED = 5e-7  # relative gap between the sweep and the bound at which the search ends
-_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; values below 1e-6 units count as 0
+# A search ends when a refined sweep exceeds the bound by less than twice _SETTLED, relative to max(bound, 1).
+_SETTLED = 5e-7
+_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; below 1e-6 units it is 0 if `least` is 0
 
 
 class _Search:
@@ -227,7 +229,7 @@ class _Search:
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio over all multipliers, best multiplier found), starting with these values."""
+        """Return (lower bound of the ratio over multipliers in their bounds, best one found), starting at `values`."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
@@ -269,7 +271,10 @@ class _Search:
         return [Inequality.of(partial(room, j), range(count + 1)) for j in range(rooms)]
 
     def _values(self, x: Array) -> tuple[float, ...]:
-        """Return the multiplier of the unknowns x, rounded to _DIGITS digits; the last entry of x is s."""
+        """Return the multiplier for the unknowns x, of which the last is s.
+
+        The values are rounded to _DIGITS digits. Those of the hands' side are then divided by s and made `allowed`.
+        """
         values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
@@ -337,8 +342,8 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the first values of each multiplier in a search.
 
-        alpha is half the width of the range of delays times the largest gain from the device's displacement to its
-        force. With many devices there is no search, and alpha is the best of several shares of this value.
+        For a map G, alpha is half the width of a device's range of delays times the largest gain from its displacement
+        to its force. With more than MULTIPLIER_ROWS/2 channels alpha is the best of several shares of this value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -413,7 +418,8 @@ class ThisEnvironment(Multiplied):
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         """Return the reason why a static map is asymmetric or negative, or None.
 
-        Rounding is compared with the size of each channel and wall, because their units differ.
+        With walls, channels and walls differ in units. So asymmetry is compared with the sizes of both its channels or
+        walls, and a negative eigenvalue with the largest size of all channels, or of all walls.
         """
         if not loop.environment.walls:
             return super().unsound_static(G, loop, demand)
@@ -444,7 +450,7 @@ class ThisEnvironment(Multiplied):
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
-_ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map
+_ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map with walls
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
@@ -483,7 +489,7 @@ class SwitchingDelays(ThisEnvironment):
 
 
 SWITCHING = SwitchingDelays()
-_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # shares of alpha that are tried
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # tried shares of the alpha of `ThisEnvironment.usual`
 
 
 def _half_widths(loop: Loop) -> Array:
@@ -515,7 +521,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device, to six digits, from the available damping (s = 1)."""
+        """Return rho [N/m] per device: `held`, or to six digits that of beta and the available damping (s = 1)."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -535,7 +541,10 @@ class LimitedForces(ThisEnvironment):
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
 
     def not_designed(self, loop: Loop) -> str | None:
-        """Return the reason why this loop has no design for limited forces, or None; couplings can still be judged."""
+        """Return the reason why this loop has no design for limited forces, or None.
+
+        Couplings can still be judged, unless the reason is that of `beyond`.
+        """
         if loop.varying_delay:
             return "limiter: designs for limited forces are made for constant delays, not for delays that switch"
         if loop.environment.walls or loop.latency:
@@ -582,14 +591,15 @@ def least_phi(loop: Loop) -> Array | None:
     return phi
 
 
-_MOST_STATES = 30  # A storage matrix is found up to so many states of E-hat: 42 take ten seconds, 400 take 20 GB.
+_MOST_STATES = 30  # most states of E-hat for which a storage matrix is searched: 42 take ten seconds, 400 take 20 GB
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, both within rounding.
+    """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    With few states the sum of Phi_i/delta_i is least. Raises Infeasible, with the damping that would be needed, if even
-    a full Phi is not below Delta_D, and DesignFailed if no diagonal one is found.
+    Delta_D and delta are times T/T_max. Up to _MOST_STATES states the sum of Phi_i/delta_i is least among the Phi below
+    `most`. Raises Infeasible, with the damping that would be needed, if not even a Phi that need not be diagonal is
+    below Delta_D, and DesignFailed if no diagonal one is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
@@ -661,7 +671,7 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
     required = ", ".join(f"{least * d:.4g}" for d in delta)
     return (
         f"Theorem 4 admits no coupling: with psi = {psi} the environment alone uses up {required} N s/m of device "
-        f"damping and delta is {tuple(delta.tolist())}"
+        f"damping and delta T/T_max is {tuple(delta.tolist())}"
     )
 
 
@@ -703,7 +713,7 @@ class _AnyEnvironment(Multiplied):
         return compose_any(V, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the least Phi or None if none is needed, the reason why the loop is not covered)."""
+        """Return (the Phi of `least_phi`, None) or, if none is needed or found, (None, the reason if not covered)."""
         if (reason := self.beyond(loop)) or not any(loop.psi):
             return None, reason
         try:

@@ -2,8 +2,9 @@
 
 Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
 them. The **hands' side** is a lower bound of the energy that every passive hand and the devices dissipate, whatever
-forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. A **fact**
-of the environment's side describes the forces; it adds inputs, one row for each, and multipliers. The quadratic form is
+forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches; for a known
+motor (Theorem B) also its speed v. A **fact** of the environment's side describes the forces; it adds inputs, one row
+for each, and multipliers. The quadratic form is
 
     sum over ticks of f'(displacement that f multiplies) + energy of the damping + terms of the multipliers,
 
@@ -197,7 +198,7 @@ class Collected(Generic[Block]):
         self._into.append((self.channels + wall, i, weights))
 
     def force(self, i: int, channel: int, weights: Weights) -> None:
-        """Let input i add to the steps of a device's force, besides the environment's response."""
+        """Let input i add to the steps of a channel's sent force f_e, besides the environment's response."""
         self._force.append((channel, i, weights))
 
     # -- terms of rows
@@ -271,7 +272,8 @@ class Collected(Generic[Block]):
     def build(self, G: Block | None) -> tuple[Array, Block, Any]:
         """Return (residue at z = 1 (n, n), block without its pole and the damping, matrix of the damping).
 
-        G maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
+        For a Sampled G the residue is 0 and the block keeps its pole; its Hermitian part on the circle is the same. G
+        maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
         the steps of the forces are inputs instead (`force`).
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
@@ -360,7 +362,10 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The numbers of one multiplier. A search keeps each number between `least` and `most` times its unit."""
+    """The numbers of one multiplier.
+
+    A search keeps each number, for the hands' side s times it, between `least` and `most` times its unit.
+    """
 
     name: str  # name of the multiplier in files
     units: tuple[float, ...]  # (n,); 0 for a number that is always 0
@@ -518,7 +523,7 @@ _LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4  # relative reductions of Q that are 
 
 
 def _varies(loop: Loop) -> list[int]:
-    """Return the devices whose latency lies in a range."""
+    """Return the devices whose latency varies."""
     return [d for d, (first, last) in enumerate(_ranges(loop)) if first < last]
 
 
@@ -709,7 +714,7 @@ def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
     return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
 
 
-_SPARE = 0.02  # margin, relative to rho, that is subtracted from the block's diagonal, so that c may be rounded
+_SPARE = 0.02  # margin, relative to rho, that a search subtracts from the block's diagonal, so that c may be rounded
 
 
 class Limited(Fact):
