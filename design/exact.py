@@ -76,7 +76,7 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # counted work of a product of two integers, and of each of their bits
+_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and for each of their bits
 
 
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
@@ -169,7 +169,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 _BITS = 192  # binary places of the rounded matrix whose definiteness is tested
-_FACTOR_BITS = 46  # bits of the largest entry of R; the others are rounded to the same unit
+_FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; the others have the same unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
@@ -296,7 +296,7 @@ _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; 
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
-_LEFT = 0.02  # largest residual of the Riccati equation, relative to its drive
+_LEFT = 0.02  # residual of the Riccati equation, relative to its drive, below which Newton's steps end
 _UNIT = 2.0**-53  # unit roundoff of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
 _MOST_UNITS = 2.0**50
@@ -415,9 +415,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation is
     driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first solved in coordinates in
-    which white noise at the inputs moves all states equally and independently. There the condition number of P is 1e9
-    in place of 1e15. The original states are tried next. The result is transformed back exactly, and rounded to
-    _STORED_BITS if the rounded P is still a proof.
+    which white noise at the inputs moves all states equally and independently, where P is much better conditioned. The
+    original states are tried next, and then the first coordinates with a larger share of mu. The result is transformed
+    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -446,9 +446,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (a change of coordinates, P in the new coordinates). With `white` the new states are independent.
+    """Return (a change of coordinates, P in the new coordinates), without a change unless `white`.
 
-    Raises LinAlgError.
+    With `white`, white noise at the inputs makes the new states independent. Raises LinAlgError.
     """
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
@@ -515,8 +515,8 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    Newton's steps reduce the residual, which rounding has left, below _LEFT times the drive. They need extended
-    precision, because lightly damped modes have a small margin. Raises LinAlgError if there is no solution.
+    Newton's steps, RICCATI_STEPS at most, reduce the residual that rounding has left below _LEFT times the drive. They
+    need extended precision, because lightly damped modes have a small margin. Raises LinAlgError without a solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)

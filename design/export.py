@@ -47,7 +47,7 @@ _TICKS = 64  # length of a test vector, longer than the fast modes and the usual
 _MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, if rounding allows it
-_BALL_ROUNDING = 16  # allowed rounding of a residual, in units in the last place of its largest terms
+_BALL_ROUNDING = 16  # allowed rounding of a block's residual, in units in the last place of its largest row of terms
 _MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
@@ -145,7 +145,7 @@ def _limited_block(
     limited = "Lengths of a device's force vector" if balls else "Forces"
     about = (
         f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
-        f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
+        f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead.",
         delays,
     )
     return ExportedBlock("process", limiter.open, _DISPLACEMENT, _FORCE, about, limiter)
@@ -160,7 +160,10 @@ def _with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: ExportedBlock) -> _Trial:
-    """Return normal random inputs and their outputs; unlimited forces would exceed a limit on a third of the ticks."""
+    """Return normal random inputs and their outputs.
+
+    For a limiter, inputs are scaled so that forces without it would exceed a limit on a third of the ticks.
+    """
     rng = np.random.default_rng(0)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
@@ -222,7 +225,10 @@ def _sequential(
 
 
 def _box_matrix(limiter: Limiter) -> Array:
-    """Return M of the box problem (m, m). If the environment floats, M is singular and GROUNDED is added."""
+    """Return M of the box problem (m, m).
+
+    For a free environment M is singular, and GROUNDED times the largest diagonal entry is added to the diagonal.
+    """
     problem = limiter.problem
     assert isinstance(problem, BoxProblem)
     M = problem.M
@@ -418,7 +424,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
 
 
 def _ball_rounding(single: bool) -> float:
-    """Return the rounding error of a vector's residual, relative to its largest terms."""
+    """Return the allowed rounding error of a block's residual, relative to the largest sum of a row's terms' sizes."""
     return _BALL_ROUNDING * float(np.finfo(np.float32 if single else np.float64).eps)
 
 
@@ -438,9 +444,10 @@ _SOURCE_C = Template("""\
 /*
 $about
  *
- * One tick:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that starts at 0.0 and adds the
- * states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s (FLT_EVAL_METHOD 0),
- * without contraction of a*b + c and without -ffast-math, the code repeats Python's test vector to the last bit:
+ * One tick, if no force is limited:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that starts at 0.0
+ * and adds the states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s
+ * (FLT_EVAL_METHOD 0), without contraction of a*b + c and without -ffast-math, the code repeats Python's test vector to
+ * the last bit:
  *
  *     cc -std=c99 -O2 -ffp-contract=off -DHAPTIC_LOOP_TEST $file -o test$libm && ./test
  *
@@ -779,7 +786,7 @@ $reached        }
 
 
 def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
-    """Return the text of the C file. Its numbers are hexadecimal, so that compilers do not round decimals."""
+    """Return the text of the C file. The numbers of its tables are hexadecimal, so that compilers round no decimals."""
     system, name, dtype = block.system, block.name, block.dtype
     words = {
         "name": name,
