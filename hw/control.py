@@ -420,7 +420,7 @@ def timed(
     T_max becomes the length that a fraction `quantile` of the device's ticks does not exceed, where that is longer than
     the scenario's T_max or T. With `at_once`, forces latch on arrival and the link takes 0 ticks. The latency then
     ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both sides. Raises SafetyStop
-    where the latency reaches a period.
+    where too few answers arrived, or the latency reaches a period.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
