@@ -2,9 +2,9 @@
 
     traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-A net is such a layer. With a net, the linear block of a tick does not contain the delays Theta. The forces of
-G = (I + Psi E V)^-1 Psi E go through the net, then through a delay line, for constant and for varying delays. The
-budget acts before the delay line, on forces within the actuators' limits.
+A net is such a layer. With a net, the linear block of a tick does not contain the delays Theta. The budget scales the
+forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces them by forces of the user's
+environment. Both send their forces through a delay line, for constant and for varying delays.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class EnergyNet:
 
     start: float  # W0 [J]
     cap: float = np.inf  # largest stored energy [J]
-    guarantee: str | None = None  # the guarantee of this run, in words
+    guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a fresh budget for `nsim` runs. Raises InputError for impossible numbers."""
@@ -74,7 +74,7 @@ class Plugged:
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh shell for `nsim` runs. Raises ValueError if no shell is known for the loop."""
+        """Return a fresh shell for `nsim` runs. Raises ValueError if the loop has none, or for a wrong `start`."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("an environment of your own needs a coupling with a compliance V before it")
@@ -113,7 +113,7 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
         process = replace(process, delays=constant)
     make = partial(wanted.net, simulation, process)
-    make(1)  # Impossible numbers raise InputError here, before the simulation begins.
+    make(1)  # Impossible settings raise their error here, before the simulation begins.
     return replace(simulation, process=replace(process, net=make))
 
 

@@ -92,13 +92,13 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 
 
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Write the figure atomically in the format of the suffix; its texts are not parsed as formulas.
+    """Write the figure atomically in the format of the suffix; only tick labels are parsed as formulas.
 
     A .png is for the screen. A .pdf or .svg is for a paper: at most as wide as a page of two columns, with letters that
     are readable at that width.
 
     Raises:
-        InputError: The suffix is none of .png, .pdf and .svg.
+        InputError: The suffix is none of .png, .pdf and .svg, or the file cannot be written.
     """
     kind = Path(path).suffix.lower()
     if kind not in _FORMATS:
@@ -135,7 +135,7 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Show texts literally: a dollar sign starts no formula, and a character that the font lacks is replaced."""
+    """Show all texts but tick labels literally: no formulas, and a replacement for characters that the font lacks."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
     texts = list(figure.texts)  # findobj would create all ticks, which the layout creates again
     for axis in figure.axes:
@@ -158,7 +158,7 @@ def _plain_numbers(axes: Any) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Runs, as in the paper's Figures 5 and 6.
 
-_SAME = 1e-6  # [%] smaller force errors are rounding: the two forces are equal
+_SAME = 1e-6  # [%] a smaller force error is rounding: the commanded force equals that of the object itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +197,8 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The zoom shows at least six periods of this frequency. There is no zoom if forces turn as sharply
-            in the rest of the run.
+        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or the run.
+            If nothing grows and no part stands out (`_stands_out`), there is no zoom.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -276,11 +276,11 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
     return ends
 
 
-_SHARPER = 4.0  # a zoom shows a part whose forces turn this many times more sharply than the mean of the run
+_SHARPER = 4.0  # least mean square of the forces' second differences in a zoom, relative to that of the run
 
 
 def _stands_out(result: Run, near: slice, ticks: int) -> bool:
-    """Return whether the forces turn more sharply in the part `near` than in the first `ticks` on average."""
+    """Return whether the part `near` is short, and forces turn far more sharply in it than in the first `ticks`."""
     if 10 * (near.stop - near.start) > result.t.size:
         return False  # The part is too long for a zoom.
     bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
@@ -359,7 +359,8 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     for i, column in enumerate(1e3 * sizes.T):
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
-    # The predicted line is fitted to the last third of the amplitudes, where only the dominant mode is left.
+    # The prediction is fitted to the last third of the amplitudes, where only the dominant mode is left.
+    # It is drawn 25 % higher, so that it does not hide them.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
@@ -372,7 +373,10 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
 
 
 def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
-    """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, windowed over 12 periods."""
+    """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, in windows of 12 periods.
+
+    There are no amplitudes in less than two windows.
+    """
     T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
     width = max(8, round(12 / (max(hertz, 1.0) * T)))
     if ticks < 2 * width:
@@ -402,9 +406,9 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Return the six periods within the first `ticks` in which the forces turn most sharply.
+    """Return the part of the first `ticks` in which the forces turn most sharply: six periods, or 60 ticks if longer.
 
-    The part is longer if no force has six turning points in six periods.
+    It is up to half of the ticks if no force has six turning points in a shorter part.
     """
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
@@ -438,7 +442,8 @@ class Panel:
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
     """Plot the forces of several couplings on equal axes, one panel each; pale curves are the object's own forces.
 
-    The axes cover 1.5 times the ideal forces of the credible runs, so that oscillating forces may leave the panels.
+    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is credible), so that
+    oscillating forces may leave the panels.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)

@@ -80,7 +80,7 @@ class EncoderSteps:
 
 
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
-    """Compare the devices' friction with that needed for their encoder steps; None without steps."""
+    """Compare the devices' friction with that needed for their encoder steps; None without steps or a solvable loop."""
     fields = ("encoder_step", "friction", "friction_max")
     steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
@@ -209,7 +209,7 @@ class _PeriodGrowth:
 class _DelaysMet:
     """The delays that occurred in a run, and the growth of its linear loop under them."""
 
-    age: _Age | None  # None where no force arrives
+    age: _Age | None  # None if some channel receives no force
     lost_packets: list[int]
     held_ticks: list[int]
     growth_rate_per_s: float

@@ -50,7 +50,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
-AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, an engine of the user's own, or its class
+AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, an engine, or a class or function that makes one
 
 _Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
@@ -59,7 +59,7 @@ Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 _COPIES = 4  # largest number of copies of a trace that a run and its report keep in memory
 _SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
 _COLUMNS = 50  # numbers per tick that a report needs in memory even if the trace is on disk
-_BLOCK = 2048  # ticks between two checks of the clock, the keyboard and the numbers
+_BLOCK = 2048  # ticks between two calls of `progress`, each with a check of the numbers and of the engine
 _AHEAD = 8  # number of blocks for which outside forces are sampled together
 
 
@@ -173,7 +173,7 @@ def run(
 
     Args:
         simulation: The loop.
-        engine: An engine, its class, or the name of an engine, which then takes its default step.
+        engine: An engine, a class or function that makes one, or a name; a named engine takes its default step.
         outside: External forces on the hands; default: those of the scenario.
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
@@ -361,7 +361,7 @@ def make_engine(
 
     The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
     as it is; a user's class or function is called with the simulation. Raises ValueError for an unknown name, an object
-    that is no engine, the exact engine with Coulomb friction, or a user's own engine with uneven ticks.
+    that is no engine, the exact engine with Coulomb friction, or a user's own engine with uneven ticks or a latency.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)

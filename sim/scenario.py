@@ -64,14 +64,18 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i: 0.3 kg that swings 15 mm at 0.6 Hz, a quarter period ahead of hand i - 1."""
+    """Return the default hand of device i, from 0: 0.3 kg on a spring whose other end swings 15 mm at 0.6 Hz.
+
+    It swings a quarter period ahead of that of hand i - 1.
+    """
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Devices, humans, environment, delays and timing of one loop, with one human per device.
 
-    A channel is an axis of a device. Delays and latencies are given per device and stored per channel.
+    A channel is a free axis of a device. Delays and latencies are given per device or per channel, and stored per
+    channel.
     """
 
     name: str
@@ -164,7 +168,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"human has {len(self.human)} entries, expected {devices}, one for each device")
 
     def _per_channel(self) -> None:
-        """Convert values per device to values per channel. Raises ValueError if axes of one device differ."""
+        """Convert values per device to values per channel, if devices have several axes.
+
+        Raises ValueError for a list of wrong length, or if axes of one device differ.
+        """
         counts = [len(device.free) for device in self.device]
         if max(counts, default=1) == 1:
             return
@@ -400,7 +407,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
-        """Return the scenario with some fields changed; `delta` is another guaranteed damping [N s/m].
+        """Return the scenario with some fields changed; `delta` is another guaranteed damping per device [N s/m].
 
         Values are checked and normalised like those of a file: lists become tuples. Three fields may also be objects of
         a user's own class: humans (models.human.Hand), a population with `draw(rng, n)`, which returns n humans, and an
@@ -497,7 +504,7 @@ def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raise InputError if delays vary, for commands that cannot simulate varying delays."""
+    """Raise InputError if there is a table varying_delay, for commands that cannot simulate it."""
     if scenario.varying_delay is not None:
         instead = "or use sim.run"
         raise InputError(f"varying_delay: {what} does not simulate varying delays; remove the table, {instead}")
@@ -563,7 +570,7 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 
 
 def _humans_of(text: str, source: str) -> _HumanFile:
-    """Return the humans of a file: measured transfer functions (A, B, C, D) and chains."""
+    """Return the humans of a file: measured hands (A, B, C, D) and chains."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     if people.population is not None:
         raise InputError(
@@ -665,7 +672,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 def _require_keys(raw: dict[str, Any]) -> None:
     """Raise ValueError if a key is missing that every scenario or every rotary device needs.
 
-    Files with unknown keys pass this check, because `msgspec.convert` reports those keys.
+    A file with unknown keys may lack keys of every scenario here, because `msgspec.convert` reports unknown keys.
     """
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
@@ -907,7 +914,7 @@ _TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's ow
 
 
 def _is_own(name: str, value: Any) -> bool:
-    """Return whether humans or a population are of a user's own class, which no file can hold."""
+    """Return whether humans or a population are of a class that no scenario can hold: a user's own, or MeasuredHand."""
     if name == "population":
         return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
     parts = value if isinstance(value, list | tuple) else ()
@@ -915,7 +922,7 @@ def _is_own(name: str, value: Any) -> bool:
 
 
 def _checked_own(value: Any) -> Any:
-    """Return a user's own population as it is, or a user's own humans after a check. Raises ValueError."""
+    """Return a user's own population as it is, or humans of any class after a check. Raises ValueError."""
     if not isinstance(value, list | tuple):
         return value
     for i, human in enumerate(value, start=1):
