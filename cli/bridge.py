@@ -116,9 +116,15 @@ def _parser() -> argparse.ArgumentParser:
     session_cli.add_link_options(parser)
     session_cli.add_safety_options(parser)
     names = ", ".join(NAMES)
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
+    parser.add_argument(
+        "--coupling",
+        metavar="NAME|FILE",
+        help=f"{names} or FILE.json (default spring-damper; moving-average in a world)",
+    )
     parser.add_condition()
-    latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the measured latency"
+    latch = (
+        "when forces act: at whole ticks (default), or on arrival (force-dimension: always), by the measured latency"
+    )
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     parser.add_energy_budget()
     parser.add_limiter()

@@ -82,7 +82,10 @@ def _parser() -> options.Parser:
     varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
     varying += "this-environment or known-device"
     parser.add_varying_delay(varying)
-    limiter = "with this-environment: fail unless the proof covers limited forces (default: a spring-damper tries)"
+    limiter = (
+        "fail unless this-environment (optimal: or known-device) is proved for limited forces, too "
+        "(default: a spring-damper tries)"
+    )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)

@@ -168,7 +168,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_coupling(self, names: str) -> None:
         """Add --coupling and --condition."""
-        what = f"{names}, FILE.json or FILE.py:NAME of a function of the loop (default spring-damper)"
+        what = f"{names}, FILE.json or FILE.py:NAME of a function (default spring-damper; moving-average in a world)"
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
 
