@@ -21,7 +21,7 @@ class _Compared:
     filled_in: int = render.figure("ticks without an answer")
     asked_differ: int = render.figure("requested forces that differ")
     sent_differ: int = render.figure("sent forces that differ")
-    largest_difference_n: float = render.figure("largest difference [N]")
+    largest_difference_n: float = render.figure("largest difference of requested forces [N]")
     first_difference_s: float | None = render.figure("first difference [s]")
     identical: bool = render.figure("identical", lambda same: "yes, bit by bit" if same else "no")
 

@@ -118,7 +118,7 @@ class _Net(_Acting):
         np.minimum(self.least, scale, out=self.least)
 
     def figures(self, guarantee: str | None = None) -> ShellFigures:
-        """Return the least energy and scale, and the largest number of limited ticks."""
+        """Return the present W, the least scale so far, and the limited ticks, of many simulations the worst."""
         return ShellFigures(
             **vars(super().figures(guarantee)),
             start_J=self._start,
