@@ -80,8 +80,8 @@ def ages(delays: Ticks) -> Ticks:
 def realising(wanted: Ticks) -> Ticks:
     """Return packet delays (ticks, ..) with which the device uses forces of the `wanted` ages (ticks, ..).
 
-    A packet that the device never uses arrives together with the next packet that it uses, so no delay exceeds the
-    largest wanted age. Raises ValueError if an age grows by more than one in a tick.
+    A packet that the device never uses arrives together with the next packet that it uses, or after the last tick. No
+    delay exceeds the largest wanted age. Raises ValueError if an age grows by more than one in a tick.
     """
     ticks = wanted.shape[0]
     packet = np.arange(ticks).reshape(-1, *(1,) * (wanted.ndim - 1)) - wanted
@@ -216,8 +216,8 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Periods may vary, and forces may latch late. Tick k measures x[k] at its beginning and lasts T_k. The force f_i[k] is
-# computed from x[k] and acts from the time tau_i[k] after this beginning. Until then f_i[k-1] acts.
+# Periods may vary, and forces may latch late. Tick k measures x[k] at its beginning and lasts T_k. The force f_i[k]
+# acts from the latch time late[k, i] after this beginning. Until then f_i[k-1] acts.
 
 _PERIODS, _LATENCIES = 9, 3  # few distinct values of a range, so that matrix exponentials can be cached
 
@@ -273,7 +273,7 @@ class Timing:
         late = frozen(self.late, 2, "late")
         object.__setattr__(self, "late", late)
         if len(late) != len(self.period) or not ((late >= 0) & (late < self.period[:, None])).all():
-            raise ValueError("late: forces must latch within the period of their tick")
+            raise ValueError("late: expected one row per period, with latch times from 0 to below the period")
 
     @cached_property
     def _table(self) -> tuple[Array, NDArray[np.intp]]:
@@ -311,7 +311,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """Draw a timing of `ticks` ticks; return None if every period is T and forces latch at the beginning of their tick.
+    """Draw a timing of `ticks` ticks; return None if neither `periods` nor `latency` is given.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -49,9 +49,9 @@ _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice ch
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the direction scaled to length 1. Raises ValueError unless one is above 1e-9 and all are below 1e9."""
+    """Return the direction scaled to length 1. Raises ValueError unless sizes are below 1e9 and one exceeds 1e-9."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
-        raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9 that are not all 0")
+        raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9, not all 0 within 1e-9")
     length = float(np.linalg.norm(direction))
     return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
 
@@ -130,9 +130,10 @@ def _parts_of(element: Any) -> list[Spring | Wall]:
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
-    A block is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and positive
-    semidefinite. If passivity holds within rounding only, a spring of at most 1e-6 of the block's mean gain is added to
-    D. Raises ValueError for a block that produces energy, or whose passivity cannot be decided.
+    A block must be stable, and passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1)
+    symmetric and positive semidefinite. If passivity holds within rounding only, `at` makes E(1) symmetric and adds a
+    spring of at most 1e-6 of the block's mean gain to D. Raises ValueError for other blocks, or if passivity cannot be
+    decided.
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -155,7 +156,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"block: {name} is {list(map(list, part))}, expected {rows} rows of {columns} numbers")
         poles = np.linalg.eigvals(np.array(self.A)) if n else np.zeros(0)
         if not np.abs(poles).max(initial=0.0) < 1:
-            raise ValueError("block: not passive, A has an eigenvalue on or outside the unit circle")
+            raise ValueError("block: not stable, A has an eigenvalue on or outside the unit circle")
         _correction(self)
 
     def at(self, T: Number) -> Lti:
@@ -176,7 +177,8 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # correcting spring that needs no finer search, and the largest, over the mean gain
+#: correcting spring that needs no finer search, and the largest one, relative to the mean gain
+_ENOUGH, _MOST_LIFT = 1e-8, 1e-6
 
 
 @functools.lru_cache(maxsize=64)
@@ -256,7 +258,7 @@ class Environment:
         raise TypeError(f"{type(self).__name__} has no E(T): define this method")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """Return G = (I + Psi E V)^-1 Psi E, the map from displacements to the sent forces. Raises SingularLoop."""
+        """Return G: displacements to sent forces, (I + Psi E V)^-1 Psi E with a compliance V. Raises SingularLoop."""
         return coupling.around(delay(psi, T) @ self.E(T))
 
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
@@ -316,7 +318,7 @@ class _NoModel(SingularLoop):
 
 
 class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A MuJoCo scene instead of a network. It has no known E(z), so only any-environment can be certified."""
+    """A MuJoCo scene instead of a network. It has no known E(z), which this-environment and known-device need."""
 
     file: str  # MJCF
     digest: str  # SHA-256 over the contents of the scene's files
@@ -380,10 +382,10 @@ class Network(
         if sum(map(len, world.along)) != len(self.contacts) or len(world.along) != len(self.bodies):
             count = sum(map(len, world.along))
             raise ValueError(
-                f"along has {count} directions for {len(self.contacts)} contacts, expected one group per body"
+                f"along has {count} directions for {len(self.contacts)} contacts, expected one each, grouped by body"
             )
         if len(set(self.contacts)) < len(self.contacts):
-            raise ValueError(f"contacts must be different bodies, got {list(self.contacts)}")
+            raise ValueError(f"contacts must have different names, got {list(self.contacts)}")
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -448,7 +450,7 @@ class Network(
         return list(dict.fromkeys((*self.contacts, *inner)))
 
     def matrices(self, number: Callable[[float], Any] = float) -> tuple[Array, Array, Array]:
-        """Return mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes).
+        """Return mass, damping and stiffness matrices over `nodes()` without walls and block, (nodes, nodes), SI units.
 
         `number` makes the entries: float, or an exact type such as Fraction.
         """
@@ -525,13 +527,13 @@ class Networks(Environment):
 
 
 def environment(network: Network, T: Number) -> Lti:
-    """Return E(z) from contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz), without walls.
+    """Return E(z) from contact displacements [m] to forces [N], without walls, by backward Euler s -> (z-1)/(Tz).
 
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
-    dampers and masses. The arithmetic is that of T. Raises ValueError if an internal node has no mass and
-    nothing holds it, or if the rounding of directions alone holds it.
+    dampers and masses. The block is added. The arithmetic is that of T. Raises ValueError if an internal node has no
+    mass and nothing holds it, or if the rounding of directions alone holds it.
     """
     free = _free_directions(network, network.springs, T)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
@@ -626,7 +628,7 @@ def _solvable(network: Network, T: Number) -> _Matrices:
     free = network.nodes()[len(network.contacts) :]
     inner = slice(len(network.contacts), None)
     if free and np.linalg.cond((M / T + D + T * K)[inner, inner]) > 1e14:
-        raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
+        raise ValueError(f"an internal node among {', '.join(free)} has (almost) no mass and nothing that holds it")
     return M, D, K
 
 
