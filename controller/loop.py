@@ -72,7 +72,7 @@ class DeviceBounds(Strict, frozen=True):
         for name, low, high, unit in (
             ("motor_mass_min", 1e-6, 1e3, "kg"),
             ("transmission_stiffness_max", 1.0, 1e9, "N/m"),
-            ("transmission_damping_min", 1e-6, 1e5, "N s/m: a lossless transmission guarantees nothing"),
+            ("transmission_damping_min", 1e-6, 1e5, "N s/m (a lossless transmission guarantees nothing)"),
             ("transmission_damping_max", self.transmission_damping_min, 1e5, "N s/m"),
         ):
             if not low <= getattr(self, name) <= high:
@@ -137,7 +137,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         """Raise ValueError unless axes, levels and values per device fit the channels; replace defaults by None."""
         m, axes = self.channels, (1,) * self.channels if self.axes is None else self.axes
         if sum(axes) != m or min(axes) < 1:
-            raise ValueError(f"axes is {list(axes)}, expected numbers of axes >= 1 with the sum {m}, one per contact")
+            raise ValueError(f"axes is {list(axes)}, expected numbers >= 1 that add up to the {m} contacts")
         for name in ("theta", "psi", "latency", "known_devices"):
             each = getattr(self, name) or ()
             if any(len(set(each[own])) > 1 for own in self.devices):
@@ -228,7 +228,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.environment.E(self.period(exact))
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return G = (I + Psi E V)^-1 Psi E, from displacements to the sent forces. Raises SingularLoop."""
+        """Return G: displacements to sent forces, (I + Psi E V)^-1 Psi E with a compliance V. Raises SingularLoop."""
         if not exact:
             return self.environment.sent(coupling, self.psi, self.T)
         key = (self.environment, coupling, self.psi, self.T)
@@ -287,7 +287,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
-        """Return the environment and the vertices of its ranges."""
+        """Return the environment and the vertices of its ranges, or 128 of them (controller.ranges)."""
         if self.ranges:
             return members(self.network, self.ranges)
         return (Member("the nominal environment", self.environment),)

@@ -5,7 +5,7 @@ systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
     G.feedback(H)           (I + G H)^-1 G
-    G.over_z_minus_one()    G(1), and a block whose Hermitian part on the circle is that of G/(z - 1)
+    G.over_z_minus_one()    G(1) (0 for Sampled), and a block whose Hermitian part on the circle is that of G/(z - 1)
 
 The type of the period decides the arithmetic. A block with a float T has floating-point matrices. A block with a
 Fraction T is exact, and a float then stands for its shortest decimal: 0.0012 is 12/10000.
@@ -72,7 +72,7 @@ _ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # largest numbers of rows, points and 
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
-_UNSEEN = 1e-18  # weights below this size, relative to the response, are omitted
+_UNSEEN = 1e-18  # trailing weights below this size, relative to the response, are omitted
 _ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] a response's size is evaluated here and at the angles of its poles
 _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
@@ -151,7 +151,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """Number of core states, without delay lines at the outputs, because these take no time in a response."""
+        """Number of core states, without delay lines at the outputs, because these take little time in a response."""
         return self._lines[0].size
 
     @property
@@ -184,8 +184,8 @@ class Lti(ReadOnly):
     def at(self, z: ArrayLike) -> Complex:
         """Return G(z), shape z.shape + (p, m). A stack takes z (n, k) or (1, k) and returns (n, k, p, m).
 
-        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`). At other points, or if poles
-        are nearly equal, it is evaluated by back substitution in the complex Schur form of A.
+        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`). At other points, for a lower
+        triangular A, or if the sum is inaccurate, it is evaluated by back substitution in the complex Schur form of A.
         """
         z = np.asarray(z, dtype=np.complex128)
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
@@ -252,8 +252,8 @@ class Lti(ReadOnly):
         states. It is compared with the response at a few points, because terms may cancel.
 
         Returns:
-            (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None if the error may exceed
-            _ERROR.
+            (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None if A is lower
+            triangular or the error may exceed _ERROR.
         """
         core, lines = self._lines
         A, B = self.A[np.ix_(core, core)], self.B[core]
@@ -354,8 +354,8 @@ class Lti(ReadOnly):
     def _rest(self) -> tuple[Array, Array]:
         """G(1), shape (..., p, m), and R = C (I - A)^-1, shape (..., p, n).
 
-        An exact block that was composed of others computes both from these parts, because closing a loop at z = 1 takes
-        far less work than eliminating all states of the closed loop. Raises SingularLoop if A has the eigenvalue one.
+        An exact block from a product, `feedback`, `diag`, `rows` or `hstack` computes both from its parts, because this
+        takes far less work than eliminating all states. Raises SingularLoop if A has the eigenvalue one.
         """
         if from_parts := self.__dict__.get("_parts"):
             try:
@@ -369,7 +369,7 @@ class Lti(ReadOnly):
         return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
-        """Return the eigenvalues of A, shape (..., n). Delay lines at the outputs have exact zeros."""
+        """Return the eigenvalues of A, shape (..., n). Delay lines at outputs have exact zeros, except in a stack."""
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]

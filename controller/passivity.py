@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # number of intervals of [0, pi] at the start
-#: twice the largest number of intervals for up to 8 states, which take about half a second; fewer for more states
+#: about twice the number of intervals at which the search ends, for up to 8 states (half a second); less for more
 _EVALUATIONS = 1 << 15
 _REACH = 0.5  # largest half-width for which a bound is computed, in units of 1/|R|
 _UNIT = 2.0**-53  # largest relative error of one rounding
@@ -80,7 +80,7 @@ def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
 
     He G is zero in these directions, such as the difference of two contacts with the same motion, and no finite number
     of intervals could decide the sign of zero. The second result contains the norms of the omitted parts of B, C and D,
-    or is None if Q omits no direction.
+    or is None if G is returned unchanged.
     """
     rows = [part / max(float(np.linalg.norm(part)), 1e-300) for part in (G.B, G.C.T, G.D, G.D.T)]
     _, sizes, V = np.linalg.svd(np.vstack(rows))
