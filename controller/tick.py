@@ -107,7 +107,7 @@ class Process(ReadOnly):
 
     @property
     def unlimited(self) -> Process:
-        """Return the process without force limits and encoder steps."""
+        """Return the process without limiter, force limits and encoder steps."""
         endless, ideal = np.full(self.channels, np.inf), np.zeros(self.channels)
         return replace(self, law=self.law.unlimited, force_limit=endless, encoder_step=ideal)
 
@@ -120,7 +120,7 @@ class Process(ReadOnly):
         return np.where(coarse, np.round(x / step) * step, x)
 
     def applied(self, force: Array, out: Array | None = None) -> Array:
-        """Return the forces (.., m, nsim) [N] clipped at the actuators' limits."""
+        """Return the forces (.., m, nsim) [N] clipped at the limits of actuators and balls."""
         high = self.force_limit[:, None]
         for ball in self.balls:  # A clipped vector keeps its direction.
             force = force if out is not None else force.copy()
@@ -177,7 +177,7 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether no force is near its limit, so that the linear law alone is tried for the next ticks
+        #: whether the linear law alone is tried next: ticks are `_straight`, and no force is known to be near its limit
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
         for ball in process.balls:  # No vector within this box is longer than the limit.
