@@ -56,7 +56,7 @@ class _Exported:
     file: Path = render.figure("file")
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
     certificate: _Proof = render.figure("certificate")
-    multiplications: int = render.figure("one tick", "{} multiplications")
+    multiplications: int = render.figure("one tick", "{} multiplications, without a limiter")
     force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")

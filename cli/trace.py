@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     traced = _Traced(args.trace, result.t.size, float(result.t[-1]), rates)
     T = traced.duration_s / max(1, traced.ticks - 1)
     lines = [f"growth, {one.words(T)}" for one in rates]
-    none = "No loop was closed at full gain: there is no growth to report."
+    none = "No part of the trace is linear and at full gain: there is no growth to report."
     render.publish(args, traced, (), lines, verdict=_verdict(rates) if rates else none)
     return options.DONE
 
