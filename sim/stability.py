@@ -188,7 +188,7 @@ class Ringing:
         decay_per_s: Decay rate of the slowest mode [1/s]; negative if it grows.
         frequency_hz: Frequency of the slowest mode [Hz].
         damping_ratio: Damping ratio of the slowest mode.
-        least_damping_ratio: Least damping ratio of all modes.
+        least_damping_ratio: Least damping ratio of all modes but free drifts.
         least_frequency_hz: Frequency of the mode with the least damping ratio [Hz].
     """
 
@@ -232,7 +232,7 @@ def exact_growth(simulation: Simulation) -> float:
     return float(worst_mode(simulation).growth)
 
 
-_NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
+_NOT_EXCITED = "not excited: the motion does not follow the dominant mode; the verdict is that of the eigenvalues"
 _VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest
 _UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
 _AT_ONCE = 1 << 16  # ticks that are projected at a time, because a long trace may exceed the memory
@@ -389,8 +389,8 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 
 # ---- the impulse test: short traces of many humans at once
 #
-# Every handle is pushed once, from rest at x = 0, and then left alone. Sums are accumulated while the simulation runs,
-# so that no trace is kept.
+# Every axis of every handle is pushed once, from rest at x = 0, and then left alone. Sums are accumulated while the
+# simulation runs, so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
 _TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls; a hand of 0.3 kg then swings over a few centimetres
@@ -401,9 +401,9 @@ _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the eng
 class ImpulseTest:
     """The results of an impulse test, with one entry per simulation."""
 
-    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, until a force clips; nan: too short, or noise
+    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, until a force clips; nan: short, noise, or walls
     error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
-    clipped: NDArray[np.int64]  # (nsim,) ticks with a force at its limit
+    clipped: NDArray[np.int64]  # (nsim,) ticks in which a force is at its limit or, with a limiter, the limiter acts
     least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick
     audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W(N): the scale of its rounding
     settling: Array  # (nsim,) rms speed of the handles in the last quarter over that in the second quarter
@@ -457,7 +457,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return the forces [N], (ticks, outside), of 10 ms: `size` on handle 1, -1/2 of it on 2, 1/3 on 3, ..."""
+    """Return forces [N], (ticks, outside), of 10 ms or one tick: `size` on channel 1, -1/2 of it on 2, 1/3 on 3, .."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

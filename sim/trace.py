@@ -7,9 +7,9 @@ oscillation   Does an oscillation last in the second half of a trace? The half i
               lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
               times that in the first. Octaves are judged separately, so that a slow mode that decays does not hide a
               fast one that grows.
-growth        How fast does an oscillation grow? If it grows like exp(g t), the amplitude grows by exp(g hop) from one
-              window to the next, and g is the slope of a line through the logarithms. The slope describes a motion and
-              is no verdict on a loop: the motion of a person who shakes the handle harder and harder grows, too.
+growth        How fast does an oscillation grow? If it grows like exp(g t), the logarithm of the amplitude over the
+              windows is a line of slope g. The slope describes a motion and is no verdict on a loop: the motion of a
+              person who shakes the handle harder and harder grows, too.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest frequency above 10 Hz in the last quarter of the forces; None for a short trace."""
+        """Return the strongest frequency from 10 Hz up in the last quarter of the forces; None if short or calm."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -130,7 +130,7 @@ class Trace(ReadOnly):
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
     def to_frame(self) -> Any:
-        """Return a pandas data frame with the index "t [s]" and the columns "x1 [m]", "f1 [N]", "x_handle1 [m]", ..
+        """Return a pandas data frame with the index "t [s]" and columns as "x1 [m]", "f1 [N]", or "x left.y [m]".
 
         Raises:
             ImportError: pandas is not installed.
@@ -224,7 +224,7 @@ class Trace(ReadOnly):
 # ---- octaves, and lasting oscillations
 
 _PERIODS = 4  # least periods of an octave in a window; with fewer the window function mixes neighbouring octaves
-_TREND = 7  # degree of the subtracted polynomial, which leaves less than 1 um of a motion of 15 mm at 0.6 Hz
+_TREND = 7  # degree of the subtracted polynomial, which leaves about 1 um of 1 s of a motion of 15 mm at 0.6 Hz
 SUSTAINED = 0.95  # least ratio of a lasting oscillation's amplitude in the last window to that in the first
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
@@ -305,7 +305,7 @@ _FINEST = 1e-9  # [m] step assumed for an ideal encoder, above floating-point no
 
 @dataclass(frozen=True)
 class Growth:
-    """The strongest oscillation in a part of a trace, or the reason why it has no rate."""
+    """The strongest growing oscillation in a part of a trace, else the strongest one, or why there is no rate."""
 
     first: int  # the part has the ticks [first, stop)
     stop: int
@@ -362,9 +362,9 @@ class _Lines(NamedTuple):
     """The oscillations in a part of a trace."""
 
     octaves: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m] of each
-    brief: bool  # an oscillation is seen, but in too few windows
+    brief: bool  # an oscillation is seen in some window; in too few windows for a rate if `octaves` is empty
     gone: bool  # no oscillation is seen in the last window
-    floor: float  # [m] least amplitude that the encoders' rounding does not explain
+    floor: float  # [m] least amplitude that the encoders' rounding explains in no octave
     slowest: float  # [Hz]
 
 
@@ -404,7 +404,8 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 def growths(trace: Trace) -> list[Growth]:
     """Measure the growth in each part of a trace in which the loop was linear (`run.steady_ticks` of its metadata).
 
-    Without this entry the trace is one part. Raises InputError if the parts are not ticks of the trace.
+    Without this entry the trace is one part. Raises InputError if the parts are not ticks of the trace, or if its
+    samples are not finite and evenly spaced.
     """
     n, m = trace.x.shape
     run = trace.meta.get("run") if isinstance(trace.meta, dict) else None

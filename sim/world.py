@@ -1,6 +1,6 @@
 """A MuJoCo scene as the environment of a scenario: the scene behind a coupling, its energy account and its guarantee.
 
-    trace = simulate(scenario, design).meta["world"]
+    figures = simulate(scenario, design).meta["world"]
 
 The scene is solved together with the coupling (models.world). The energy shell (controller.budget) limits the energy
 that leaves the port to a budget W0 plus the energy that gravity and springs released, whatever the scene does.
@@ -78,7 +78,7 @@ class SceneRecord:
     file: str
     settings: str  # options that this program sets in the scene
     parts: list[dict[str, object]]  # kinds of parts, their number, and the bound on the energy that they generate
-    active: list[str]  # actuators, plugins and callbacks, which that lemma does not cover
+    active: list[str]  # actuators, plugins and callbacks, which the lemma in docs/theory.md does not cover
 
     @classmethod
     def of(cls, scene: World) -> SceneRecord:
@@ -124,7 +124,8 @@ def _energy(joules: float) -> str:
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError for a coupling whose direct part D_V is not positive definite or couples devices.
+    Raises InputError for a coupling whose direct part D_V is not symmetric and positive definite or couples devices,
+    and for a scene that is invalid or has changed since the scenario was loaded.
     """
     world = scenario.environment.world
     assert world is not None
@@ -285,7 +286,7 @@ class InWorld:
 # Hands and adversaries
 
 RANDOM, LOSSLESS = "random hands", "lossless hands"
-_THROWN = 0.3  # [m/s] rms of the hands' initial speeds
+_THROWN = 0.3  # [m/s] rms of the initial speeds of all bodies of devices and hands
 _NEVER = 1e3  # [J] W0 so large that the shell never acts
 _ADVERSARIES = 20  # sets of hands that are thrown with a shell that never acts
 _STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
@@ -316,7 +317,8 @@ def thrown(
 ) -> list[HandsInWorld]:
     """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
 
-    Every second set is lossless, without dampers. `start` is W0 [J].
+    In every second set all chains are lossless, without dampers; persons and measured hands keep theirs. `start` is W0
+    [J].
     """
     from haptic_loop.sim.crowds import Validation
 

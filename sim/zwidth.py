@@ -2,8 +2,9 @@
 
 With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
 against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact.
-For each cell a map evaluates the conditions and the eigenvalues of the exact loop with every human of a population. For
-a few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
+For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with the humans of a population: a
+few first, and the others if none of these is unstable. For a few cells it runs MuJoCo with the encoder steps, friction
+and walls of the scenario.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """The multiplier (m,) of each condition for every coupling, or the reason why the loop is not covered."""
+        """Per condition: a multiplier (m,) that serves every coupling or None; why the loop is not covered or None."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
@@ -136,7 +137,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), with walls touched and left; inf if no damping is enough."""
+        """Return required over available damping (n,), with walls touched and left; inf if refused or without bound."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -221,7 +222,7 @@ class EnvironmentSweep(_Sweep):
         return [Process(Law(sent[i], self.loop.theta), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,); inf if no damping is enough."""
+        """Return required over available damping (n,); inf if refused or no damping is enough."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
         shares = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
@@ -326,8 +327,8 @@ class _Grid:
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> _Grid:
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
-    The scale of K is the loop's stiffness_scale; the scale of B is delta, a bound for any linear coupling. A linear
-    map goes up to 2.5 times these scales, a logarithmic one from far below to far above. Raises InputError.
+    The scale of K is the sweep's stiffness_scale, that of B the largest delta. A linear map goes up to 2.5 times these
+    scales, a logarithmic one from far below to far above. Raises InputError.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":
@@ -483,7 +484,7 @@ def _in_slices(
 
 
 _COLUMNS = 4  # columns at which the map's edge is compared with a bisection on single sweeps
-_STEPS = 48  # stiffnesses between the softest and the stiffest of the map that are tried to find the edge
+_STEPS = 48  # stiffnesses between the softest and the stiffest of map and mark that are tried to find the edge
 _HALVINGS = 20  # bisections, which give an edge of the population to a relative 1e-6
 
 
@@ -527,7 +528,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
 
 
 def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
-    """Compare evenly chosen columns that cross the edge with single sweeps; None if there are none."""
+    """Compare up to _COLUMNS columns in which K crosses the edge with single sweeps; None if there are none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = suffices(ratio)
     crossing = inside[:-1] & ~inside[1:] & np.isfinite(ratio[1:])

@@ -166,7 +166,7 @@ class _Simulated:
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The report of a map. Rows are stiffnesses; null means infinite, or not reached before an interruption."""
+    """The report of a map. Rows are stiffnesses; null: infinite, not applicable, or not reached (interrupted)."""
 
     rigid: bool
     scenario: str | None
@@ -273,7 +273,7 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
 
 
 def save_csv(drawn: Map, path: Path) -> Path:
-    """Write one line per cell, SI units in the header; unknown figures are empty."""
+    """Write one line per cell, SI units in the header; unknown figures are empty, infinite ones inf."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     figures = [f"{name} required/available" for name in drawn.ratio]

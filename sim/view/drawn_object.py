@@ -152,7 +152,7 @@ class _Motion:
         self._nodes, self._next = self._after[self._m : ports, 0], self._after[ports:]
 
     def rest(self, x: Array) -> Array:
-        """Start from the equilibrium for devices at x (m,) [m], and return the displacements (nodes,) [m]."""
+        """Start from the equilibrium without contact for devices at x (m,) [m]; return displacements (nodes,) [m]."""
         self._z[:, 0] = self._law.at_rest(np.concatenate([x, np.zeros(self._nodes.size)]))
         self._x[:] = x
         self._tick(self._before, self._after)
@@ -178,7 +178,7 @@ def object_of(simulation: Simulation) -> DrawnObject | None:
 
 
 def scene_xml(simulation: Simulation) -> str:
-    """Return the MJCF of the devices with the object at rest beside them; the object collides with nothing."""
+    """Return the MJCF of the devices with the object or world at rest beside them, which collides with nothing."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(simulation.scene.xml)

@@ -1,13 +1,14 @@
 """The running loop of the window, without a display: keys, scripts, mouse and clock determine its frames.
 
-When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities. The new process
-starts at the equilibrium for these positions, z = A z + B x: its delay lines hold the force F(1) x, as if the positions
-had never changed. The force changes to that of the new coupling, and the motion of the environment's masses is lost.
+When the coupling or a delay changes while the loop runs, the plant keeps its positions and velocities (in a world it
+restarts from rest). The new process starts at the equilibrium for these positions without contact, z = A z + B x: its
+delay lines hold the static force, F(1) x if no limiter acts. The force changes to that of the new coupling, and the
+motion of the environment's masses is lost.
 
-The mouse is a hand: a spring and a damper between the handle and the dragged point. It is part of the exact plant and
-passive, so a certificate for every passive human covers it. Only the end of the spring moves with the mouse, as in a
-voluntary motion. A force that is computed once per picture would not be passive, because it comes too late, and could
-destabilise a certified loop.
+The mouse is a hand: a spring from the handle to the dragged point, and a damper from the handle to the ground. It is
+part of the exact plant and passive, so a certificate for every passive human covers it. Only the end of the spring
+moves with the mouse, as in a voluntary motion. A force that is computed once per picture would not be passive, because
+it comes too late, and could destabilise a certified loop.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class _Delay:
 
 @dataclass(frozen=True)
 class _Push:
-    """A constant force on a handle until the next push."""
+    """A constant force on a handle until the next push of the same channel."""
 
     channel: int  # counted from 1
     force: float  # [N]
@@ -313,7 +314,7 @@ class Frame:
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks in `history` in which some force is at its limit (controller.tick.at_limit)
     prepared: PreparedLoop
-    note: str  # the last event, or the reason why it was refused
+    note: str  # the last event, that it is being prepared, why it was refused, or that the loop diverged
     overruns: int
     lost: float  # [s]
     factor: float  # simulated over real time

@@ -1,9 +1,9 @@
 """Pictures of the window and of films: positions, colours, text, arrows and plots.
 
 The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and mouse to the session. The
-window shows a copy of the scene with added shapes. The shapes have no mass and collide with nothing, so that both
-models have the same matrices. Pillow draws the pictures of a film; the scene of a world in them is rendered by MuJoCo.
-Pillow writes a GIF, and ffmpeg an MP4.
+window shows a copy of a world's scene, or of the devices' scene with other shapes. These shapes have no mass and
+collide with nothing, so that both models have the same matrices. Pillow draws the pictures of a film; MuJoCo renders
+the scene of a world in them. Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ _PALETTE: tuple[_Colour, ...] = (
 _GREY: _Colour = (0.55, 0.55, 0.58)
 _ALARM: _Colour = (1.0, 0.15, 0.15)  # a force at its limit
 
-_LONGEST = 0.12  # [m] length of the arrow of a force at its limit
+_LONGEST = 0.12  # [m] length of the arrow of a force at its limit, except in a world
 _SIZE = (640, 640)  # pixels of a video
-_WORDS = 0.40  # share of a video's height for the text at the top
+_WORDS = 0.40  # least share of a video's height for the text at the top
 _PLOT = 0.25  # share of the picture's height for the forces at the bottom
-_WIDTH = 60  # characters in a line of text
+_WIDTH = 60  # characters in a line of the note on the last event
 _COLUMNS = 250  # time spans in a plot of forces, each drawn from its least to its largest force
 
 _BOX, _SPHERE, _ARROW, _BAR = (
@@ -612,7 +612,7 @@ class _FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw range and mean of the felt force -f since the last frame; with several axes draw the mean only."""
+        """Draw range and mean of the felt force -f since the last frame, and the push; for several axes the mean."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
