@@ -85,7 +85,7 @@ def _parser() -> options.Parser:
     add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
     steppers = "integrator of MuJoCo (default exponential, RK4 with friction)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
-    steps = "MuJoCo steps per period (default: 1 with exponential, else as many as the plant's fastest motion needs)"
+    steps = "MuJoCo steps per period (default: 1 with exponential without friction, else enough for the fastest motion)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
     error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
