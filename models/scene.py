@@ -49,9 +49,9 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 # actuators: first the external forces (voluntary motion and taps), then one motor per channel with gear -1, because
 # the device feels -f.
 #
-# A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper between one point and ground
-# becomes a property of the joint; every other spring-damper becomes a fixed tendon. An impedance (A, B, C, D) has no
-# body: it is stored in the model's custom numbers, where `plant` reads it, and the engines integrate its state.
+# A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper that stretches with one joint
+# alone becomes a property of this joint; every other spring-damper becomes a fixed tendon. An impedance (A, B, C, D)
+# has no body: it is stored in the model's custom numbers, where `plant` reads it, and the engines integrate its state.
 
 
 _Array = NDArray[np.floating[Any]]
@@ -94,15 +94,15 @@ class Scene:
 
     @cached_property
     def plant(self) -> Plant:
-        """The linear plant that the model simulates."""
+        """The linear plant of the model (see `plant`)."""
         return plant(self.model)
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The linear plant x' = A x + B u, y = C x, with u = [external forces; f] and the encoder positions y.
+    """The linear plant s' = A s + B u, x = C s, with u = [external forces; f] and the encoder positions x.
 
-    x holds n positions, n velocities, and the states of the humans' impedances.
+    s holds n positions, n velocities, and the states of the humans' impedances.
     """
 
     A: _Array  # (2n + states, 2n + states)
@@ -128,7 +128,7 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
     """Build one scene of devices, each held by its human. `persons` hold several devices.
 
     Raises:
-        ValueError: The numbers of devices and humans differ, or a device is held twice.
+        ValueError: The numbers of devices and humans differ, their axes do not match, or a device is held twice.
     """
     held = tuple((person.holds, person.port()) for person in persons)
     return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
@@ -397,7 +397,7 @@ def _mechanics(device: Device, drawn: Sequence[Mechanics]) -> tuple[dict[str, An
 
 
 def _amounts(devices: Sequence[Device], placed: Sequence[_Placed], drawn: _Drawn = ()) -> _Amounts:
-    """Sum the masses, dampings and stiffnesses of devices and humans per joint and tendon."""
+    """Sum masses, dampings and stiffnesses per joint and tendon, without the dampers between a device's axes."""
     mass: dict[str, Any] = {}
     damping: dict[str, Any] = {}
     stiffness: dict[str, Any] = {}
@@ -731,8 +731,8 @@ def crowds(
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` lists the devices of each person with several, and `axes` their numbers of axes, as in Crowd. `known` are
-    the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
+    `holds` lists the devices of each person with several, and `axes` each device's number of axes, as in Crowd.
+    `known` are the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
     """
     drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):

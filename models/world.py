@@ -29,7 +29,7 @@ from haptic_loop.models.scene import quiet_warnings
 
 Array = NDArray[np.floating[Any]]
 
-_CONTACT_MASS = 0.03  # [kg] of a contact that has no mass in the scene
+_CONTACT_MASS = 0.03  # [kg] of a contact for which the scene states no mass; a density does not count
 ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
 _MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
@@ -70,8 +70,8 @@ class _Part:
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
-    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read or is no
-    XML.
+    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read, is no
+    XML, or is included twice.
     """
     files: dict[Path, None] = {}
     folders: list[Path] = []
@@ -135,7 +135,10 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of bodies that may be contacts, in file order. Raises ValueError if a file cannot be read."""
+    """Return the names of the world's bodies without a joint, in file order: those that are not welded may be contacts.
+
+    Raises ValueError for a file that cannot be read or that MuJoCo refuses.
+    """
     return _without_joints(_spec(path))
 
 
@@ -169,7 +172,7 @@ class World:
             gravity: False switches the scene's gravity off.
 
         Raises:
-            ValueError: MuJoCo refuses the file, or a body cannot be a contact.
+            ValueError: MuJoCo refuses the file, a body cannot be a contact, or a stiffness or `every` is impossible.
         """
         self.path, self.contacts, self.T, self.every = Path(path), tuple(contacts), T, every
         if every < 1:
@@ -385,7 +388,7 @@ def _name(contact: Contact, axis: int) -> str:
 
 
 def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
-    """Add slides and springs to a contact, give it a mass if it has none, and compensate its weight.
+    """Add slides and springs to a contact, give it a mass if the scene states none, and compensate its weight.
 
     All settings are explicit, so that the scene's defaults do not apply.
     """
@@ -553,7 +556,7 @@ class WorldPort:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Repeat the step until the same contacts are limited before and after it.
+        """Repeat the step, up to _MOST_REPETITIONS times, until the same contacts are limited by the same forces.
 
         On a limited contact the limited force acts instead of the spring.
         """

@@ -35,7 +35,7 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class PositionError:
-    """Error of device positions against the exact engine; None and the reason if there is no comparison."""
+    """Error of device positions against the exact engine; None if nothing moves, or with a reason."""
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
@@ -381,7 +381,8 @@ def compare_engines(
     without a net. With friction, the reference is refined until its error is at most `error`. Every run calls
     `progress`.
 
-    Raises InputError if 60 million evaluations of the dynamics do not suffice, or if nothing moves.
+    Raises InputError if `error` is not positive, if 256 substeps or 60 million evaluations of the dynamics do not
+    suffice, or if nothing moves.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -413,7 +414,10 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     if right:
         return min(right, key=lambda choice: choice.cost)
     best = min(choices, key=lambda choice: choice.position_relative_rms)
-    raise InputError(f"--error {error:g}: the nearest setting, {best.name}, has error {best.position_relative_rms:.1g}")
+    raise InputError(
+        f"--error {error:g}: the nearest setting, {best.name}, has a wrong verdict or "
+        f"error {best.position_relative_rms:.1g}"
+    )
 
 
 @dataclass(frozen=True)
@@ -557,7 +561,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     """Return 1 for the exponential integrator on a smooth scene, else a number of steps that resolve the plant.
 
     The number is at least 4, and is doubled until the simulated loop has the verdict of the exact loop. Raises
-    InputError if no number up to 10000 suffices.
+    InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return 1

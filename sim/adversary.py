@@ -1,4 +1,4 @@
-"""Search for the worst passive human: a seeded global search over lossless chains for the largest growth of the loop.
+"""Seeded searches for the passive humans with the largest growth: lossless chains, or hands of the population.
 
 A lossless chain of masses and springs takes no energy out, and can present any reactance at the frequency where the
 loop is weakest. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above 3 kHz, errors of the matrix

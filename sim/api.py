@@ -54,7 +54,7 @@ class ScenarioRun:
     period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # with defaults filled in
-    remarks: list[str]  # remarks on the number of substeps that the user requested
+    remarks: list[str]  # remarks on integrator and substeps
     trace: Trace
     wall_s: float
     seed: int

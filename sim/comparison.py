@@ -67,7 +67,7 @@ class Alternative:
         return self.coupling
 
     def needs(self, condition: str) -> float | None:
-        """Return required over available damping of the worst device; None if no damping is enough."""
+        """Return required over available damping of the worst channel; None without a figure, or if it is infinite."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None
@@ -83,7 +83,7 @@ def alternatives(
 ) -> list[Alternative]:
     """Judge each coupling of `_ROWS` that is possible in the loop; run it if there are no walls and no friction.
 
-    Scenarios with ranges get couplings for any environment only. Scenarios with walls get no optimal coupling, because
+    Scenarios with ranges get designs for any environment only. Scenarios with walls get no optimal coupling, because
     it contains a linear model. `also` is a user's own condition, by which every coupling is judged in addition.
 
     Raises:

@@ -47,7 +47,7 @@ def choose(
         case: The reference delays, "I" or "II"; "none" for the loop without a coupling.
         name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
         condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
-        limiter: True to require that limited forces are covered, False to ignore them; None to cover them if possible.
+        limiter: For a spring-damper: True to cover limited forces, False to ignore them, None to cover them if it can.
         progress: Called during long searches with (task, steps done, number of steps).
 
     Raises:
@@ -225,8 +225,8 @@ def assessed(
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. With lost packets only an energy budget gives a guarantee, because forces may become older
-        than any certificate covers.
+        The assessment. A shell gives no guarantee with encoder steps. With lost packets only an energy budget gives
+        one, because forces may become older than any certificate covers.
     """
     assessment = assess(
         scenario.loop(case),

@@ -3,7 +3,7 @@
 Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result
 equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4 integrator, which
 shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost.
-The exact engine simulates all humans, MuJoCo a sample (`_witnessed`). Workers end when their parent process ends.
+The exact engine simulates all humans, MuJoCo all or a sample (`_witnessed`). Workers end when their parent ends.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
 
 @dataclass(frozen=True)
 class Validation:
-    """A loop, the number of random humans that hold it, and the settings of the validation."""
+    """A loop, the number of sets of random humans that hold it, and the settings of the validation."""
 
     scenario: Scenario
     coupling: Coupling
@@ -132,7 +132,7 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """The results for every set of humans, sorted by index; nan where an engine or a trace was not requested.
+    """The results for every set of humans, sorted by index; nan (counts: 0) without the engine or the trace.
 
     The energy W(N) is the work of the forces plus the least dissipation of the devices, up to tick N.
 
@@ -186,7 +186,7 @@ class Findings:
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
-        """(n,) whether MuJoCo, on its map or on a trace that decides, contradicts the exact loop."""
+        """(n,) whether the other engine, on its map, a deciding trace or `switching`, contradicts the exact one."""
         switching = disagree(self.switching, self.switching_mujoco)
         trace = np.where(self.trace_decides, self.trace, np.nan)
         return disagree(self.exact, self.mujoco) | disagree(self.exact, trace) | switching
@@ -329,8 +329,9 @@ def _witnessed(
 ) -> NDArray[np.intp]:
     """Return the positions in a group of the humans that the other engine simulates, too.
 
-    These are all lossless humans, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of the random
-    sample of all humans. They depend on the validation and the group alone, not on the number of processes.
+    These are all sets with a lossless hand, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of
+    the random sample; with `all_traces`, all sets. They depend on the validation and the group alone, not on the number
+    of processes.
     """
     if validation.all_traces:
         return np.arange(len(index))

@@ -188,7 +188,7 @@ _RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad] and largest decay per ste
 
 
 def least_substeps(integrator: str) -> int:
-    """Return the default number of steps per period: 1 for the exponential integrator, 4 for MuJoCo's own."""
+    """Return the least default number of steps per period: 1 for the exponential integrator, 4 for MuJoCo's own."""
     return 1 if integrator == EXPONENTIAL else 4
 
 
@@ -577,7 +577,7 @@ class _PlantSpeed:
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """Return the least number of RK4 steps in T seconds that resolves these motions."""
+        """Return the least number of RK4 steps in T seconds, at least 4, that resolves these motions."""
         return max(
             least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
         )
