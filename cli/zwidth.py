@@ -182,7 +182,7 @@ def _share(count: int, report: MapReport) -> str:
 
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
-    """Yield the rows of the fixed coupling in the environment of its design."""
+    """Yield the rows of the fixed coupling in the environment of the scenario."""
     requirements, guarantee = fixed.assessment.requirements, fixed.assessment.guarantee
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})"
@@ -191,7 +191,7 @@ def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     )
     yield "coupling", f"{fixed.kind}, fixed"
     yield (
-        "designed for",
+        "scenario's springs",
         ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in fixed.contact_springs),
     )
     yield (

@@ -91,13 +91,13 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
 
 
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
-    """Draw the contact springs of the coupling's own environment that lie on the map, and return the legend's entry."""
+    """Draw the contact springs of the scenario's environment that lie on the map, and return the legend's entry."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
     shown = [(s.B, s.K) for s in report.fixed.contact_springs] if report.fixed else []
     for b, k in shown:
         if drawn.grid.B[0] <= b <= drawn.grid.B[-1] and drawn.grid.K[0] <= k <= drawn.grid.K[-1]:
             axes.plot(b, k, zorder=5, markeredgecolor="white", **style)
-    return [Line2D([], [], label="the springs that the coupling was designed for", **style)]
+    return [Line2D([], [], label="the contact springs of the scenario", **style)]
 
 
 def _points(axes: Axes, report: MapReport) -> list[Line2D]:

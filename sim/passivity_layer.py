@@ -92,7 +92,7 @@ def claim(assessment: Assessment) -> str:
 
 
 class Wanted(Protocol):
-    """The settings of a net: EnergyNet, Plugged, or a class of your own."""
+    """The settings of a net: EnergyNet, Plugged, sim.world.Touched, or a class of your own."""
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a new net for `nsim` runs that are simulated together."""
@@ -137,7 +137,7 @@ def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: Bu
 
 
 class _InLoop:
-    """Base class of nets; limits forces as the actuators do, and measures how far the devices moved in a tick."""
+    """Base class of the nets below; limits forces as the actuators do, and measures how far devices moved in a tick."""
 
     def __init__(self, process: Process) -> None:
         self._within = process.applied

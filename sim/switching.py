@@ -7,8 +7,8 @@ that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
 [lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
 because a device holds its newest force. Candidates for the worst period are windows of this sequence that may be
-repeated, and constant delays; the product of mode matrices over the worst one grows fastest per tick. A spectral radius
-above 1 proves instability.
+repeated, and constant delays at the ends of their ranges; the product of mode matrices over the worst one grows fastest
+per tick. A spectral radius above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
 
 
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
-    """Return the fastest growing repetition of a window of `ages` (ticks, m), or of a constant delay."""
+    """Return the fastest growing repetition of a window of `ages` (ticks, m), or of constant delays lo or hi."""
     ticks = ages.shape[0]
     matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]

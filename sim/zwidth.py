@@ -171,7 +171,7 @@ class CouplingSweep(_Sweep):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentSweep(_Sweep):
-    """A sweep over K and B of every spring at a contact, for a fixed coupling that was designed for the loop.
+    """A sweep over K and B of every spring at a contact, for a fixed coupling.
 
     An optimal coupling is a fixed Q and a model of the environment. In another environment there are two cases:
 

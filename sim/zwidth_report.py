@@ -91,7 +91,7 @@ class _Marked:
 
 @dataclass(frozen=True)
 class _ContactSpring:
-    """One spring at a contact of the environment that a coupling was designed for."""
+    """One spring at a contact of the scenario's environment."""
 
     between: tuple[str, str]
     K: float
@@ -103,13 +103,13 @@ class FixedCoupling:
     """The coupling of a map over environments."""
 
     kind: str
-    contact_springs: list[_ContactSpring]  # of the environment that it was designed for
+    contact_springs: list[_ContactSpring]  # of the scenario's environment
     assessment: Assessment  # in that environment
     remarks: tuple[str, ...]
 
     @classmethod
     def of(cls, chosen: Chosen, assessment: Assessment, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
-        """Describe a coupling with its assessment in the environment that it was designed for."""
+        """Describe a coupling with its assessment in the scenario's environment, a network."""
         springs = [_ContactSpring(s.between, s.stiffness, s.damping) for s in contact_springs(network)]
         return cls(chosen.kind, springs, assessment, remarks)
 
