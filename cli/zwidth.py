@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
         from haptic_loop.sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
-    title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
+    title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} cells"
     unseen = friction_left_out(sweep.devices) if report.simulation.points else ()
     table = render.facts(f"K {title}", _rows(report), left=True)
     lines = [*_marked(report), *_remarks(report), *unseen]
