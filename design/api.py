@@ -77,7 +77,7 @@ def design_coupling(
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
-    named(condition or usual_condition(loop, kind))  # Raises ValueError if a user's own condition has a taken name.
+    named(condition or usual_condition(loop, kind))  # raises ValueError for an unknown or taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
     design = design_by_kind(loop, kind, condition, **options)
     return replace(design, certified_for=certified_for(loop, design.requirement.certified))
@@ -106,7 +106,7 @@ def instead(
 ) -> str:
     """Return certified alternatives to a failed design in words, least rms mismatch first, or "".
 
-    Each alternative is designed and certified here. No alternative is tried for varying delays.
+    Each candidate is designed and judged here. None is tried for varying delays.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for i, (other, target, options) in enumerate(_QUICK):
@@ -135,8 +135,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
-    every vertex is proved and the search finds no violation, the requirement is the largest of the vertices. Otherwise
-    it is the largest of vertices and search, and it is not proved.
+    every vertex is proved and the search finds no violation, the requirement is the largest of these environments.
+    Otherwise the search counts, too, and the requirement is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -224,9 +224,9 @@ def store(
 ) -> Filed:
     """Save the coupling with its proof; `assessment` may contain proofs for ranges and for limited forces.
 
-    If the ranges are not proved, the stored loop has the nominal environment only, unless the condition holds in any
-    environment. If switching delays are not proved, the stored loop has constant delays. Raises InputError if the file
-    cannot be written.
+    If the ranges are not proved by the design's condition, the stored loop has the nominal environment only, unless the
+    condition holds in any environment. If switching delays are not proved, the stored loop has constant delays. Raises
+    InputError if the file cannot be written.
     """
     ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate

@@ -76,7 +76,7 @@ _SAMPLES = 64  # default number of environments that are drawn at random from in
 
 @dataclass(frozen=True, eq=False)
 class RangesResult:
-    """The results of a condition at every vertex of ranges, at the worst point of a search, and at random samples.
+    """The results of a condition at members of ranges, at the worst point of a search, and at random samples.
 
     Attributes:
         members: The nominal environment and the vertices.
@@ -237,7 +237,7 @@ def _proved_ranges(
 
 
 def violated_between(where: str, place: Member, ratio: float) -> str:
-    """Return why ranges are not guaranteed that are proved at the vertices `where`: a violation between them."""
+    """Return why ranges that are proved at the vertices `where` are not guaranteed: a violation between them."""
     needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
@@ -261,7 +261,7 @@ class ForceLimits:
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
         less: Whether the limiter is proved in one environment only, while the guarantee covers more.
-        energy_budget: The energy W0 [J] that forces may give in total; None without a budget.
+        energy_budget: The start W0 [J] of an energy account of the forces; None without one.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
         proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
     """
@@ -291,7 +291,7 @@ class ForceLimits:
             scaled = "" if self.energy_budget is None else " and scaled by an energy account"
             return f"{how} to {limit}{scaled}, without a guarantee"
         if self.energy_budget is not None:
-            return f"{how} to {limit}, and scaled so that they give at most {self.energy_budget:g} J"
+            return f"{how} to {limit}, and scaled by an energy account of {self.energy_budget:g} J"
         if self.rho is None:
             why = self.reason.removeprefix("limiter: ")
             return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
@@ -351,7 +351,7 @@ def _by_its_own_block(
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
             c = _rows(condition, loop, requirement)
             return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof, proof=requirement.proof)
-        except NotProved:  # The proof belongs to another loop.
+        except NotProved:  # The proof does not hold in this loop, or would take long.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
     limiter = LimitedKnownDevice(plain) if base == KNOWN_DEVICE.name else plain
@@ -740,7 +740,7 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     """Return (the shell's guarantee or None, the reason why there is none).
 
-    The shell needs a coupling that is certified for any environment, and psi = 0.
+    The shell needs a coupling that is certified for any environment, psi = 0 and constant delays.
     """
     loop, needs = assessment.loop, assessment.requirements[ANY_ENVIRONMENT.name]
     if any(loop.psi):

@@ -101,7 +101,7 @@ _NOT_CERTIFIED = "not certified, so there are no margins"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest certified stiffness [N/m] of each channel with its B, all together; None and the reason if none."""
+    """The largest stiffnesses [N/m] that are certified together, one for each channel; None and the reason if none."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)
@@ -144,12 +144,12 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
         return _Stiffest(unknown, f"certified at the stiffest K tried, {_STIFFEST:g} N/m")
     largest = _largest(ratio, scale, _SOFTEST / K.max())
     if largest is None:
-        return _Stiffest(unknown, f"with this B, no multiple of K down to {_SOFTEST:g} N/m is certified")
+        return _Stiffest(unknown, f"with this B, no multiple of K tried down to {_SOFTEST:g} N/m is certified")
     return _Stiffest(tuple((largest * K).tolist()))
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound at frequencies with z^-n = -1.
+    """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound where z^(theta + 1) = -1.
 
     Without a latency the set of certified gains is convex and contains K -> 0, so there is only one edge.
     """
@@ -170,7 +170,7 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
         largest = edge(ratio, softest, bound) if suffices(ratio(softest)) else _largest(ratio, bound, _SOFTEST)
         stiffest.append(largest)
         if largest is None:
-            reasons.append(f"with B = {B:g} N s/m, no K down to {_SOFTEST:g} N/m is certified")
+            reasons.append(f"with B = {B:g} N s/m, no K tried down to {_SOFTEST:g} N/m is certified")
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
@@ -196,7 +196,7 @@ def sensitivity(loop: Loop, coupling: Coupling, condition: _Condition) -> _Sensi
     largest = None if fixed else _largest_period(loop, coupling, resolved)
     extra = _extra_samples(loop, coupling, resolved)
     tried = (
-        "environment.block is given for one T only"
+        "the environment is given for one T only"
         if fixed
         else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     )
@@ -255,7 +255,7 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
 
 
 def _crossing(f: Callable[[float], float], inside: float, outside: float) -> float:
-    """Return the root of `f`, to an error of _EDGE (|root| + |inside|).
+    """Return the root of `f`, to an error of 2 _EDGE (|root| + |inside|).
 
     The steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software
     28, 1997). About ten values of `f` take less time than importing scipy.optimize.brentq.
