@@ -71,7 +71,7 @@ _LARGEST_CHARGE = 0.005  # The search ends if the bound is below the barrier's v
 
 @dataclass(frozen=True)
 class _Bound:
-    """A lower bound of the rms mismatch of every linear coupling for this environment; an estimate unless `proved`."""
+    """A lower bound of the rms mismatch of couplings that this-environment certifies; an estimate unless `proved`."""
 
     rms: float  # relative to the environment
     proved: bool  # whether D >= 0 is proved on the whole circle; True for a bound of 0, which needs no proof
@@ -84,7 +84,7 @@ class _Bound:
 
 
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
-    """Return a lower bound of the rms mismatch of the couplings that this-environment certifies.
+    """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
     The loop has up to MOST channels. Periods up to T_max are replaced by even periods with less damping, as in the
     condition.
@@ -364,10 +364,10 @@ def _triangle(m: int) -> list[tuple[int, int]]:
 def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]:
     """Return the sums that are zero because of delays, and whether they are exactly zero.
 
-    A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E. Row i of s_k is zero for
-    1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels' psi differ,
-    these products lie in a subspace; v is orthogonal to it and is computed as a null space, up to rounding. Only the
-    first steps of long delays are used, because any subset of the sums gives a bound.
+    A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E with a causal R. Row i of
+    s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels'
+    psi differ, these products lie in a subspace; v is orthogonal to it and is computed as a null space, up to rounding.
+    Only the first steps of long delays are used, because any subset of the sums gives a bound.
     """
     import scipy
 
@@ -428,9 +428,9 @@ def _worst(lacking: Array, w: Array) -> Array:
 
 @dataclass(frozen=True)
 class BoundBeside:
-    """A bound on every linear coupling, and the gap from it to a design; or the reason why there is no bound.
+    """A bound on couplings of this-environment, and the gap from it to a design; or the reason why there is no bound.
 
-    The gap is None if the design has further requirements, because the bound is for this-environment alone.
+    The gap is None if the design has further requirements, which the bound neglects, or minimised the supremum.
     """
 
     rms_mismatch_db: float | None = None

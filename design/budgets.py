@@ -30,10 +30,10 @@ RANGES = 60.0
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
-#: Largest number of unknowns of a basis for this-environment alone. The largest program takes ten seconds.
+#: Largest number of unknowns of a basis with filters between all channels, for this-environment alone. The largest
+#: program takes ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Largest number of unknowns of a basis times channels where a loop has further requirements than this-environment. The
-#: largest program takes ten seconds.
+#: Largest product of a basis's unknowns and the channels in all other cases. The largest program takes ten seconds.
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried.
 UNPROVED_BASES = 2

@@ -1,8 +1,8 @@
 """Minimise c'x under linear matrix inequalities: each block constant + sum_a x_a slope_a is positive semidefinite.
 
 The status "solved" of a solver is not enough: a result is used only if it is also finite, if its blocks are
-semidefinite when they are evaluated again, and if the caller's `accept` agrees. Otherwise the next of the solver
-settings is tried.
+semidefinite to rounding when they are evaluated again, and if the caller's `accept` agrees. Otherwise the next of the
+solver settings is tried.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 # second-order term dZ dS (Mehrotra). The start may be infeasible.
 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
-_ENOUGH = 1e-6  # if rounding stops the iteration, its best point counts as solved below this error
+_ENOUGH = 1e-6  # the best point counts as solved below this error; growth of the error by 1/_ENOUGH ends the iteration
 _KEPT = 0.98  # largest step, relative to the distance to the boundary
 _SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by one towards S Z = _CENTRING mu I.
 
