@@ -214,7 +214,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     except SingularLoop:
         return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
-    states += sum(loop.theta) if members else 0  # The block of any-environment has the states of V only.
+    states += sum(loop.theta) if members else 0  # Blocks without members (any-environment) leave out E.
     budgets.require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
@@ -236,7 +236,8 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
     On the circle the difference of the responses, plus the rounding errors, may be at most _MOST_LOST of the largest
-    response or of Delta_D/T. Terms that cancel and are far larger than the forces increase the rounding errors.
+    response or, except in a world, of the least delta/T. Terms that cancel and are far larger than the forces increase
+    the rounding errors.
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
@@ -290,7 +291,7 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
     if not certificate.limiter:
         return base
     if not (base.extensible or base is KNOWN_DEVICE):
-        raise ValueError(f"facts: {certificate.condition} needs no multiplier for limited forces, and one is on file")
+        raise ValueError(f"facts: {certificate.condition} has no multipliers for limited forces, but the file has")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each device")
@@ -442,8 +443,8 @@ def required_damping(
 ) -> Requirement:
     """Return the damping that the condition requires, as one share of all devices' damping, from a refined sweep.
 
-    With ranges, this-environment returns the largest requirement of all members. The requirement of a singular loop is
-    infinite.
+    With ranges, a condition on the environment returns the largest requirement of all members. The requirement of a
+    singular loop is infinite.
     """
     requirement = named(condition).judge(loop, coupling, multiplier)
     if requirement.reason:

@@ -443,8 +443,9 @@ def this_environment(F: Lti, loop: Loop) -> Requirement:
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """Return required over available damping of this-environment for a stable coupling, by a refined sweep.
 
-    With `thin` the sweep uses every `thin`-th frequency of its grid. For a force filter the responses of environment
-    and filter are multiplied, because the poles of their series are defective and cost digits and time.
+    With `thin` > 1 the sweep is not refined and uses every `thin`-th frequency of its grid. For a force filter the
+    responses of environment and filter are multiplied, because the poles of their series are defective and cost digits
+    and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
         return _by_force_map(loop, coupling, thin)
@@ -553,7 +554,7 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
 
 
 def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
-    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count or a negative one."""
+    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong count or damping."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
@@ -607,7 +608,7 @@ def _l1_gain(F: Lti) -> Array:
 
 
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
-    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], for every condition.
+    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], whatever the condition.
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound does not hold behind
     a limiter or walls. Friction of a device with several `axes` opposes its velocity in space. It must be at least

@@ -173,5 +173,5 @@ def save(stored: Stored, path: str | Path) -> None:
     if _read_back(stored) is stored:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
         own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")
-        raise InputError(f"{path}: files cannot store classes of your own, and the environment has one ({own})")
+        raise InputError(f"{path}: the loop cannot be stored: a class of your own ({own}), or a field out of range")
     write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
