@@ -44,7 +44,7 @@ class Demands:
 
     F: Lti
     requirements: dict[str, Requirement]
-    demands: dict[str, Response | None]  # w -> required over available damping; None if no damping is enough
+    demands: dict[str, Response | None]  # w -> required over available damping; None without a curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,10 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Evaluate every condition with all walls touching: its requirement, and its demand over frequency.
+    """Evaluate F with all walls touching, and the plain conditions: requirement, and demand over frequency.
 
-    `own` are a user's own conditions; `known` are requirements from an assessment of this loop and coupling. Raises
-    SingularLoop if the algebraic loop has no solution.
+    `own` are further conditions of a user; `known` are requirements from an assessment of this loop and coupling.
+    Raises SingularLoop if the algebraic loop has no solution.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)

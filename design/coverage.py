@@ -108,7 +108,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures over the ranges, first of a design that `nominal` makes without ranges, then of `design`."""
+    """Return the figures over the ranges of the design that `nominal` makes without ranges, if any, and of `design`."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}
