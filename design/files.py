@@ -50,7 +50,7 @@ class InputError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Return the text with control characters and marks of writing direction escaped."""
+    """Return the text with unprintable characters escaped, except line ends and tabs."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -205,7 +205,7 @@ def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
 
 
 def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
-    """Return one array. Raises ValueError if its declared size is not the size of its data."""
+    """Return one array. Raises ValueError for objects, or if its declared size is not the size of its data."""
     with archive.open(entry) as member:
         version = npy.read_magic(member)
         header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]

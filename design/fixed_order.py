@@ -57,14 +57,15 @@ class _Units:
 # State-space couplings of fixed order, in a realisation where Theorem 4 and the loop (22) are affine.
 #
 # V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`) has the static compliance V1, and Theorem 4 uses the quotient
-# (V - V1)/(z - 1) = -F (zI - A)^-1 B. If F is fixed, the state matrices of V, of this quotient and of the loop (22) are
-# affine in (A, B, V1). To fix an F of full row rank loses no generality: a change of state leads to any such F.
+# (V - V1)/(z - 1) = -F (zI - A)^-1 B. Here F is a matrix, not the map (6). If F is fixed, the state matrices of V, of
+# this quotient and of the loop (22) are affine in (A, B, V1). To fix an F of full row rank loses no generality: a
+# change of state leads to any such F.
 
 
 class _FixedOrder:
     """The couplings with `order` states per channel; the unknowns p are the free entries of A, B and V1.
 
-    phi (N,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay.
+    phi (m,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay.
     """
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
@@ -96,8 +97,8 @@ class _FixedOrder:
     def start(self, gains: SpringDamper) -> Array:
         """Return p of a spring-damper. Each further state is driven by the one before, and no output reads it.
 
-        All states are reachable, so the storage of the weighted loop is well conditioned. A state that is read but not
-        driven would make the storage singular, and rounding would decide whether the first step succeeds.
+        With B > 0 all states are reachable, and the storage of the weighted loop is well conditioned. A state that is
+        read but not driven would make the storage singular, and rounding would decide whether the first step succeeds.
         """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)
@@ -158,7 +159,7 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
 
 
 class _Lemmas:
-    """Lemmas 2 and 3 for couplings near `at`, in coordinates in which Q and U of `at` are I and its norm is 1."""
+    """Lemmas 2 and 3 for couplings near `at`, in coordinates with Q = U = I at `at`; mu is in units of `norm`."""
 
     def __init__(self, family: _FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
         self.at, self.LQ, self.LU, self.norm = at, np.linalg.cholesky(Q), np.linalg.cholesky(U), norm
@@ -166,7 +167,10 @@ class _Lemmas:
         self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
 
     def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
-        """Return the inequalities in the unknowns, which `parts` splits into p - at, Q, Q^-1, U, U^-1 and mu^2."""
+        """Return the inequalities in the unknowns.
+
+        `parts` splits them into p - at, Q, a lower bound of Q^-1, U, a lower bound of U^-1, and mu^2/norm^2.
+        """
 
         def passivity(v: Array) -> Array:
             p, Q, Y, *_ = parts(v)

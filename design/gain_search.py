@@ -2,10 +2,11 @@
 
 The feasible set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by
 sequential quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a
-violation are added, until the gains pass the sweep.
+violation are added, until the gains pass the sweep or a budget is spent.
 
 For each channel the block of a condition is affine in G = (I + Psi E V)^-1 Psi E and affine in the multiplier. So its
-responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes.
+responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes. Only the block of
+known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew at each x.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class _Around:
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
 
-    The first 2m entries are the gains; the rest are the unknowns of the condition's multiplier.
+    delta is that of `even_damping`. The first 2m entries are the gains; the rest are the unknowns of the condition's
+    multiplier.
     """
 
     #: channels with a second row in the block and an unknown multiplier; in KnownDeviceLoop all devices
@@ -187,7 +189,7 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`, in Delta_D/T.
+        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`, in delta/T.
 
         With delay in the environment `stability` follows as a last entry, because the loop can then be unstable
         although the sampled condition holds.
@@ -239,7 +241,8 @@ class SampledLoop:
     def _least(self, x: Array) -> tuple[Array, Complex]:
         """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
 
-        The Schur complement is that of the lower right part, which is diagonal and positive.
+        The Schur complement is that of the lower right part, which is diagonal and positive. v is the eigenvector,
+        continued by the entries of the lower rows with which the block's form takes the least value.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -308,7 +311,7 @@ class SwitchingLoop(SampledLoop):
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
-    _first = 0.5  # first value of alpha T/delta
+    _first = 0.5  # first value of alpha T/delta, if the search of SWITCHING finds no alpha
 
     def __init__(self, loop: Loop) -> None:
         if loop.environment.walls or loop.latency:
@@ -374,8 +377,8 @@ class LimiterLoop(SampledLoop):
 class KnownDeviceLoop(SampledLoop):
     """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each device).
 
-    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 and l11, l21, l22 of `device_rows`.
-    It is the Schur complement of the speeds' rows in the block of known-device.
+    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch) and the values
+    l11, l21 and l22 of `device_rows`. It is the Schur complement of the speeds' rows in the block of known-device.
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
@@ -466,7 +469,7 @@ def least_rms(
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
     `sampled` makes the loop, and each search from a start has a copy. For more than FEW channels the first optimum is
-    returned, because steps are expensive and the start hardly matters. `likeliest_first` sorts the starts.
+    returned, because steps are expensive and the start hardly matters; sort the starts with `likeliest_first` before.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None
