@@ -189,7 +189,7 @@ _MOST_ULPS = 8  # largest distance between q and its bounds, in units in the las
 def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return decimals [s] below q(shortest period) and decimals above q(longest period), (m,) each.
 
-    q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the loop's damping. Raises NotProved if beta is too large.
+    q(T) = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the loop's damping. Raises NotProved if beta is not allowed.
     """
     import flint
 
@@ -214,7 +214,7 @@ def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> fl
 
 
 def _check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
-    """Raise NotProved unless interval arithmetic shows below < q(T1) and q(T2) < above on every channel."""
+    """Raise NotProved unless interval arithmetic shows below < q(shortest period) and q(longest period) < above."""
     import flint
 
     m = loop.channels
@@ -244,13 +244,13 @@ def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
 
 
 def _checked_rates(loop: Loop, beta: Sequence[Fraction]) -> tuple[Any, Any]:
-    """Return c0 and c2 over Fractions. Raises NotProved unless they are positive."""
+    """Return c0 and c2 over Fractions. Raises NotProved unless they and beta are positive, with one beta per device."""
     exact = loop.period(True)
     c0, c2 = _rates(_known(loop, exact), numbers(loop.delta, exact), _row(beta))
     if any(len(set(beta[own])) > 1 for own in loop.devices):
         raise NotProved(f"beta is {[float(b) for b in beta]}, expected one value for all axes of a device")
     if not ((c0 > 0).all() and (c2 > 0).all() and all(b > 0 for b in beta)):
-        raise NotProved(f"beta is {[float(b) for b in beta]}, too large for the bounds of the devices")
+        raise NotProved(f"beta is {[float(b) for b in beta]}, not positive or too large for the devices' bounds")
     return c0, c2
 
 
@@ -281,7 +281,8 @@ def _exact_cost(
 # bounds of mass and transmission do not scale with s.
 #
 # L is the least value of an integral that is linear in c0 and c2. Since c0 and c2 are concave in (s, beta), so is L.
-# The other entries are affine in beta and in the multipliers if the multiplier of switching delays is taken as 1/alpha.
+# The other entries are affine in beta and in the multipliers. Only those of switching delays are concave, in beta and
+# 1/alpha, if the rows of the errors w are divided by alpha.
 # A tangent of a concave block bounds the block from above. The tangents at the binding frequencies form a linear matrix
 # inequality, whose least s bounds the required s from below.
 
@@ -290,7 +291,7 @@ _LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of this-envi
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # matrices in a stack, which take hardly longer than one: a step tries several shares at once
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
-_VIOLATED = 3  # number of frequencies at which a round adds tangents
+_VIOLATED = 3  # largest number of local minima at which `_Search.cut` adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
 _GAP = 3e-6  # relative gap between the best share and the bound at which the search ends
 _WEIGHTS = 1e4  # 1/alpha is searched from 1/_WEIGHTS to _WEIGHTS of its unit
@@ -413,7 +414,7 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,) and blocks (.., k, n, n): one for zero beta and multipliers, then its slope in each unknown."""
+        """Return z (k,) and blocks (.., k, n, n): for zero beta and multipliers, then slopes in each of these."""
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(self.device.size)
         each = [(no_beta, none), *((beta, none) for beta in np.eye(m)[:, self.device])]
@@ -587,7 +588,8 @@ class _Search:
         for sign, ends in ((1, low / unit[:last]), (-1, -top / unit[:last])):
             rows = sign * np.eye(last, unit.size)[:, :, None, None].swapaxes(0, 1)
             blocks.append(Inequality(-ends[:, None, None], rows, range(unit.size)))
-        # c0 >= 0, with s in units of `least` and beta in units of the largest beta for that share.
+        # c0 >= 0, with s in units of `least` and beta in units of the largest beta for that share, if c0 is 0 there. If
+        # c2 is 0 there, the inequality is tighter than c0 >= 0.
         root = np.array([[0.0, 1.0], [1.0, 0.0]]) / _LARGEST_ETA
         blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
@@ -653,7 +655,7 @@ class KnownDevice(Condition):
 
     The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number each per channel, and of
     the facts' multipliers. The first three are 0 if the condition `plain`, which ignores the device bounds, requires
-    less damping.
+    less damping. The bounds of q are also 0 where the damping does not suffice, and no proof needs them.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
@@ -784,7 +786,8 @@ class KnownDevice(Condition):
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
         beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map needs thousands of
-        couplings. Returns None where the plain condition has no such figures, and inf where this condition has none.
+        couplings. Returns None for matrix levels or where the plain condition has no such figures, and inf where this
+        condition has none.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):

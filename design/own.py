@@ -28,7 +28,7 @@ def named(option: str, text: str) -> Any:
 
     Raises:
         InputError: The text is not FILE.py:NAME, the file or the object in it does not exist, the file is not valid
-            Python, or another module of its name is loaded.
+            Python or exits, or a module of its name is loaded that is no user's file.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)
@@ -83,8 +83,8 @@ def reach(folder: str) -> None:
 def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:
     """Call a user's own class or function.
 
-    Raises InputError, beginning with `what`, for an error that the user's code did not raise itself (such as wrong
-    arguments).
+    Raises InputError, beginning with `what`, for an error whose traceback has no line of the user's code (such as wrong
+    arguments). Other errors pass.
     """
     try:
         return make(*args, **options)

@@ -38,7 +38,7 @@ CAVEATS = (
     "friction dissipates, velocity filters or friction compensation."
 )
 
-C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
+C = TypeVar("C", bound=str)  # a ConditionName, "switching", "limiter" or the name of a user's own condition
 
 
 #: Share of the available damping that must be left over. Figures of a sweep differ by up to 1e-10 between
@@ -67,7 +67,7 @@ class Requirement(Generic[C]):
         reason: Why `required` is infinite.
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
         multiplier: The multiplier with which `required` was computed, or None.
-        bound: Lower bound of `ratio` over all multipliers, at the frequencies of the search, or None.
+        bound: Lower bound of `ratio` over the multipliers that the search allows, at its frequencies, or None.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
@@ -245,7 +245,7 @@ class Design(Chosen):
         condition: The name of the condition that it was designed for.
         figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
         objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
-        requirement: The requirement of `condition`, from a refined sweep.
+        requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
         c: The multiplier of the limiter, one row per device, if it is kept because its search took long; or None.
