@@ -57,7 +57,8 @@ class _BasisResult:
     states: int  # order of the loop
     mismatch_db: float  # objective
     g: float  # rendered share of the static stiffness
-    reason: str | None  # why the sweep (with a limiter: the proof) does not certify the coupling, or None
+    # None, _SETTLED, or why the sweep (with a limiter or known devices: the proof) does not certify the coupling
+    reason: str | None
     seconds: float  # time since the design began
     rejected: str | None = None  # reason why the coupling is rejected although it is certified, or None
 
@@ -72,7 +73,7 @@ class _BasisResult:
 
 @dataclass(frozen=True, eq=False)
 class Optimal(Design):
-    """Best proved coupling, with the results of all bases that were tried."""
+    """Best coupling, with its certificate if it is proved, and the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
     g: float = field(kw_only=True)  # F(1) = g E(1); if the coupling is not a force filter, the ratio of their norms
@@ -112,8 +113,8 @@ def design(
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
-    With ranges around the environment, this-environment holds at every vertex and at every point that the search
-    between the vertices visits. With a range of delays, any switching within the range is safe.
+    If it is proved, ranges around the environment mean that this-environment holds at every vertex and at every point
+    that the search between the vertices visits, and with a range of delays any switching within the range is safe.
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
@@ -351,7 +352,7 @@ class _Search:
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
-        """Return the design without a coupling if it is exact and safe, else None."""
+        """Return the design without a coupling if it is exact and safe and has no further constraints, else None."""
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)
@@ -385,7 +386,7 @@ class _Search:
     def over_basis(
         self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
     ) -> tuple[Optimal, _BasisResult]:
-        """Return the optimum over a basis, scaled so that every sweep passes. With a limiter it is also proved.
+        """Return the optimum over a basis, scaled so that every sweep passes. With a limiter its proof is tried, too.
 
         If the optimum renders less than the share `floor` of the static stiffness, the program is solved again with a
         larger weight of the stiffness.
@@ -444,7 +445,7 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
     ) -> tuple[ForceFilter, list[float]]:
-        """Find the optimum in the nominal environment, and add those to the program that then need too much damping.
+        """Find the optimum for the nominal environment, and again with each environment that needs too much damping.
 
         `need` returns required over available damping in an environment.
         Returns (coupling, share of the damping that each environment needs).
@@ -462,7 +463,8 @@ class _Search:
     def between(self, candidate: Optimal) -> Optimal:
         """Search between the vertices of the ranges, and return the coupling with a proof at each vertex.
 
-        If the worst environment of the search needs more damping than the devices have, the forces are scaled down.
+        If the worst environment of the search leaves less than MARGIN/2 of the damping unused, the forces are scaled
+        down. If the proof fails then and after a further scaling, the coupling is returned without a proof.
         """
         unscaled = candidate.coupling
         assert isinstance(unscaled, ForceFilter)
@@ -504,7 +506,7 @@ class _Search:
         return replace(last, certificate=None, reason=last.reason or "no scaling of its forces is proved in the ranges")
 
     def scaled(self) -> Optimal:
-        """Return the coupling R = kappa I, with kappa reduced until the coupling is proved."""
+        """Return the coupling R = kappa I, with kappa reduced, to a half at most, until the coupling is proved."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)

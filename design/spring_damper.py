@@ -3,7 +3,7 @@
 The gains that any-environment certifies form a convex set, described here. design.gain_search searches gains for one
 environment.
 
-Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (`_GainSet`).
+`_GainSet` has gains in units of the usable damping d = (1 - RESERVE) delta T/T_max: k = K T/d, b = B/d.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
-# A channel has V = 1/W with W = k + b (1 - 1/z). The block of `any_environment_demand` is multiplied by W and its
-# conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat W|^2, and the row of a multiplier is
-# 2 (1 - Theta-hat W). By a Schur complement the condition is affine in (k, b), without conservatism.
+# A channel has V = 1/g with g = k + b (1 - 1/z). The block of `any_environment_demand` is multiplied by g and its
+# conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat g|^2, and the row of a multiplier is
+# 2 (1 - Theta-hat g). By a Schur complement the condition is affine in (k, b), without conservatism.
 #
 # `lemma1` turns this condition into one matrix inequality, with the entries of a symmetric storage matrix as further
 # unknowns. If these are more than _MOST_STORED, the condition is imposed at sampled frequencies instead, and
@@ -69,7 +69,7 @@ _MISSED = 2e-6  # allowed violation between frequencies, relative to the usable 
 
 @dataclass(frozen=True)
 class _Channel:
-    """The gains (k, b) of one device, in units of its usable damping."""
+    """The gains (k, b) of one channel, in units of its usable damping."""
 
     theta: int
     shortage: float  # the channel's phi over its usable damping; 0 if psi = 0
@@ -129,7 +129,7 @@ class _GainSet:
         self._stored = stored if stored.sum() <= most_stored else None
 
     def solve(self, cost: Array, what: str, more: Sequence[Inequality] = ()) -> Array:
-        """Return the unknowns of least cost. The first ones are the gains (k_1, ..., k_N, b_1, ..., b_N).
+        """Return the unknowns of least cost. The first are the gains (k_1, ..., k_N, b_1, ..., b_N) of N channels.
 
         The gains are in their sets, and all unknowns satisfy the inequalities `more`. Raises the errors of
         ConeProgram.solve, and DesignFailed if the gains violate an inequality after all rounds.
@@ -183,7 +183,7 @@ def _gain_block(
 # ----------------------------------------------------------------------------------------------------
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
 #
-# Let g = k + b (1 - 1/z) per channel. The norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
+# Let g = k + b (1 - 1/z) per channel. The norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
 # L g is affine in the gains. g* g is replaced by its tangent at the previous gains, which lies below g* g. So no step
 # increases the norm, and mu^2 enters linearly, without bisection.
 
@@ -227,13 +227,15 @@ def design(
 ) -> Design:
     """Return the spring-damper of least objective that `condition` certifies.
 
-    any-environment minimises ||W1 L W2||_inf (23) over the exact set of gains, so the result does not depend on the
-    start. this-environment takes the lowest of the local minima of the rms mismatch that are reached from the starts.
+    any-environment reduces ||W1 L W2||_inf (23) over the exact set of gains (for psi >= 1, that of one Phi) until the
+    norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is reached
+    from the starts, above FEW channels the first one. known-device-any maximises the sum of K.
 
     Args:
         loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
+            any-environment uses only the first, known-device-any none.
         limiter: Whether the proof covers limited forces, too; proofs of any-environment do if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
         W1: The output weight of (23).
@@ -241,12 +243,12 @@ def design(
 
     Raises:
         Infeasible: Theorem 4 admits no gains.
-        DesignFailed: The search for this-environment or known-device found no gains.
+        DesignFailed: No gains were found, or any-environment or known-device-any does not certify them.
         ValueError: The condition does not cover an argument.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if loop.varying_delay or limiter:
-            raise ValueError(f"{condition}: neither limited forces nor delays that vary are covered")
+            raise ValueError(f"{condition}: its spring-dampers cover neither limited forces nor delays that vary")
         return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
     if named(condition).extensible:
         if loop.varying_delay and limiter:
@@ -283,7 +285,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
         if limiter and named(condition) is KNOWN_DEVICE:
             raise ValueError("limiter: known-device designs do not cover limited forces; use this-environment")
         _require_few(
-            loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
+            loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
         )
         return design(loop, condition, **options)
     if limiter:
@@ -411,7 +413,7 @@ _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains
 
 
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
-    """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and device.
+    """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and channel.
 
     It is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
     """
@@ -563,7 +565,8 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-_SPARE_OF_SLOW_WORLDS = 0.25  # With this e ringing decays per tick by a factor of 0.5 (theta = 1) or 0.55 (theta = 2).
+# With this e of `moving_average` ringing decays per tick by a factor of 0.5 (theta = 1) or 0.55 (theta = 2).
+_SPARE_OF_SLOW_WORLDS = 0.25
 
 
 def _spare(loop: Loop) -> float:
@@ -575,10 +578,11 @@ def _spare(loop: Loop) -> float:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
-    V = T/(2 delta) (1 + ... + z^-theta) requires the damping delta at every frequency. Let n = theta + 1. With the
-    constant e n^2 T/(2 delta) added, V requires delta/(1 + e) where the sum is largest, and less elsewhere. The zeros
-    of the sum lie on the unit circle, so without e the force against an object at rest rings without decay. A world
-    that does not step at every tick is at rest between its steps, so e is larger for such a world.
+    For Theorem 4 with constant delays and without a latency, V = T/(2 delta) (1 + ... + z^-theta) requires the damping
+    delta at every frequency. Let n = theta + 1. With the constant e n^2 T/(2 delta) added, V requires delta/(1 + e)
+    where the sum is largest, and less elsewhere. The zeros of the sum lie on the unit circle, so without e the force
+    against an object at rest rings without decay. A world that does not step at every tick is at rest between its
+    steps, so e is larger for such a world.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -621,7 +625,10 @@ def _rounded_inverse(level: Array) -> Array:
 
 
 def _late_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of l (Q delta)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q."""
+    """Return chi_k of l (Q d)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q.
+
+    d is (1 - RESERVE) delta.
+    """
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
     if first < last:
@@ -633,7 +640,10 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of |v|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), where v is the mean window and h = (hi - lo)/2."""
+    """Return chi_k of |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha), where v is the mean window and h = (hi - lo)/2.
+
+    d is (1 - RESERVE) delta/T_max. A constant delay has no alpha.
+    """
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
     window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)
@@ -662,7 +672,7 @@ def _best_charge(loop: Loop, i: int, theta: int) -> Array:
 
     objective = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 1.0])
     blocks = [Inequality.of(allowed, range(6)), Inequality.of(cost, range(6))]
-    x = ConeProgram(objective, blocks).solve("the charge of a latency")
+    x = ConeProgram(objective, blocks).solve("the multiplier Q of a latency")
     admissible = hands.allowed(one, {name: (scale * v,) for name, v in zip(_Q, x[:3], strict=True)})
     return symmetric_from(np.array([admissible[name][0] for name in _Q]), 2)
 
@@ -673,7 +683,7 @@ _Q = "q11", "q12", "q22"
 def _moving_average_of_levels(loop: Loop, started: float) -> Design:
     """Return the stiffest linear coupling for matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta) with a reserve.
 
-    It attains the lower bound V(1) = T/2 blockdiag(n_i Delta_i^-1) of a matrix inequality.
+    Without the reserve V(1) attains its lower bound T/2 blockdiag(n_i Delta_i^-1), n_i = theta_i + 1.
     """
     weight = _rounded_inverse(2 * even_level(loop) / loop.T)
     terms = np.array(loop.theta) + 1
