@@ -1,7 +1,7 @@
 """Run a whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
 
-Nothing waits in real time, and all random numbers have a seed. A session of some seconds takes less than one second,
-and repeats exactly.
+Nothing waits in real time, and all random numbers have a seed. A session of some seconds takes less than one second
+beside the design of its couplings, and repeats exactly.
 """
 
 from __future__ import annotations

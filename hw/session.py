@@ -24,7 +24,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 _PATIENCE_US = 2_000_000  # longest wait for the answer to HELLO or CONFIG
 _ARMING_US = 600_000  # time per axis in which the device must arm and its encoders must pass their test
-_QUIET_US = 1_000_000  # longest silence of a device while no force acts
+_QUIET_US = 1_000_000  # longest silence of a device while no force acts; none during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
 _ELSEWHERE = 5e-3  # [m] least motion after which a handle counts as moved to another place

@@ -699,7 +699,7 @@ MIXED = 0  # value of `links`: the humans of a set all have one link or all two,
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
     """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
-    The links depend on (seed, index) and the population only. With `links` = MIXED the humans all have one, or all two.
+    The links do not depend on other indices. With `links` = MIXED the humans all have one, or all two.
     With `axes` a link has random amounts of damping and stiffness along `directions`. Their weights w make the sum of
     w d d' over all directions d the identity. So the damping and the stiffness in any direction lie within the
     population's ranges.

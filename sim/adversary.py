@@ -58,7 +58,7 @@ class Worst:
     growth: float  # [1/s]
     frequency_hz: float
     evaluated: int  # number of sets of humans
-    mechanics: Sequence[Mechanics] = ()  # worst mechanics within the devices' guaranteed bounds, if all have bounds
+    mechanics: Sequence[Mechanics] = ()  # of the devices, if all have bounds; () from search_population
 
     @property
     def destabilises(self) -> bool:

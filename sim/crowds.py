@@ -1,9 +1,10 @@
 """Validate a loop with many random passive humans, by both engines, in batches over processes.
 
-Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result
-equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4 integrator, which
-shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost.
-The exact engine simulates all humans, MuJoCo all or a sample (`_witnessed`). Workers end when their parent ends.
+Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
+the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4
+integrator, which shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a
+fifth of RK4's cost. The exact engine simulates all humans, MuJoCo all or a sample (`_witnessed`). Workers end when
+their parent ends.
 """
 
 from __future__ import annotations
@@ -142,11 +143,11 @@ class Findings:
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
         frequency: (n,) frequency of the exact loop's dominant mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
-        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's own engine; if there is none, on the exact one.
+        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's engine, else on the exact one; nan with walls.
         witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
         trace_error: (n,) error of `trace` [1/s]; a rate of smaller size gives no verdict.
-        clipped: (n,) number of ticks with a force at its limit, on that trace.
-        energy: (n,) least energy W(N) on the exact trace [J].
+        clipped: (n,) number of ticks with a force at its limit, or with an active limiter, on that trace.
+        energy: (n,) least energy W(N) on the exact trace [J]; without a limiter up to the first clipped tick.
         audited: (n,) sum of the magnitudes of the terms of W [J].
         settling: (n,) ratio of the handles' rms speeds in the last and the second quarter of the exact trace.
         contacts: (n,) number of times that a wall was touched on the exact trace.

@@ -62,7 +62,7 @@ class Engine(Protocol):
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """A function of k that holds the plant input of row k for T and writes the plant state of row k + 1."""
+        """A function of k that holds the plant input of row k for tick k and writes the plant state of row k + 1."""
         ...
 
     def troubled(self) -> bool:
