@@ -410,7 +410,7 @@ _CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the block'
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
-    """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
+    """Return (P, None) with a P that proves G strictly positive real, or (None or an empty P, reason).
 
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation is

@@ -183,8 +183,8 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
     A tick in double precision is an exact tick of a system with slightly different coefficients. Their relative errors
-    are at most (2n + 8) 2^-53 for n states. The differences between G and a system `meant` with the same states are
-    added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
+    are at most (2n + 8) 2^-53 for n states and up to n + 8 inputs. The differences between G and a system `meant` with
+    the same states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
     |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
 
     The difference of both responses would be less useful: it is large as soon as a sharp peak moves by its own width,

@@ -287,7 +287,7 @@ def _exact_cost(
 # inequality, whose least s bounds the required s from below.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of this-environment to five digits
+_LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of the plain condition to five digits
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # matrices in a stack, which take hardly longer than one: a step tries several shares at once
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
@@ -647,7 +647,7 @@ def positive(H: Complex) -> NDArray[np.bool_]:
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "T_min: a known device with periods up to T_max needs a shortest period; add T_min to the scenario"
 _LATE = "latency: Theorem B is for forces that are held for the whole period, not for forces that latch inside it"
-_MOST_SHARE = 1e3  # largest share of the damping that a sweep tries for a given beta
+_MOST_SHARE = 1e3  # largest share of the damping that `required` tries
 
 
 class KnownDevice(Condition):

@@ -41,7 +41,8 @@ def at(loop: Loop, network: Network) -> Loop:
 def vertices(network: Network, percent: float = _PERCENT) -> dict[str, Network]:
     """Return networks by name, each with one spring, all springs or one mass changed by plus or minus `percent`.
 
-    Raises InputError if a changed stiffness or mass would exceed the largest that a network may have.
+    Of several springs between the same two nodes, only the last is also changed alone. Raises InputError if a changed
+    stiffness or mass would exceed the largest that a network may have.
     """
     try:
         return _vertices(network, percent)
