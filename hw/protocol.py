@@ -158,7 +158,7 @@ class State(NamedTuple):
     status: int  # phase, cause and deadman
     tick: int
     echo: int  # the source of the last usable FORCE
-    margin_us: int  # time from that FORCE to its latch (theta = 0: to its tick's end), negative: too late; or NO_MARGIN
+    margin_us: int  # last usable FORCE to its latch (theta = 0: to its tick's end), negative: late; or NO_MARGIN
     crc_errors: int  # frames that the device rejected, modulo 256
     misses: int  # ticks without a FORCE in time, modulo 256
     t_us: int  # the device's clock at this tick, modulo 2^32
