@@ -671,7 +671,7 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
     required = ", ".join(f"{least * d:.4g}" for d in delta)
     return (
         f"Theorem 4 admits no coupling: with psi = {psi} the environment alone uses up {required} N s/m of device "
-        f"damping, available is {tuple(delta.tolist())} (delta, times T/T_max if periods vary)"
+        f"damping, and delta (times T/T_max if periods vary) is {tuple(delta.tolist())}"
     )
 
 
