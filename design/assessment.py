@@ -3,7 +3,7 @@
     assessment = assess(scenario.loop("I"), coupling)
     assessment.guarantee  # a Guarantee, or None: assessment.reason then says why there is none
 
-Every command takes its guarantee from an Assessment of exactly the loop, coupling, environment and force limits that
+Every command takes its guarantee from an Assessment of exactly the loop, coupling, environment and limiter that
 run. If one of them changes, `assess` must be called again.
 """
 
@@ -391,11 +391,11 @@ class Guarantee:
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers; of an energy account "no passive hand", the subject of `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
-        forces: "also while they are limited", or the restriction.
+        forces: "also while they are limited", the restriction, or the account that scales them.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
-        energy_J: Bound of the energy [J] that a hand receives beyond the dissipation of the devices; None for a
-            guarantee that the loop comes to rest.
+        energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
+            releases; None for a guarantee that the loop comes to rest.
         vertices: The proved vertices of "these ranges" in words: every vertex, or 128 of 625 vertices.
     """
 
@@ -545,8 +545,8 @@ def assess(
     Args:
         loop: The loop; ranges, switching delays, latency and longest period must all be covered.
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
-        environment: The environment that runs, if it is not the loop's: a network, or a function. A function is
-            connected to the coupling through a shell that makes it passive.
+        environment: The environment that runs, if it is not the loop's: a network, or a function. A function
+            or a MuJoCo world acts on the coupling through a shell that makes it passive.
         energy_budget: W0 [J]. With a shell it is the shell's (default: 0 for a function, 2 mJ for a MuJoCo world).
             Without a shell it is that of an energy budget at the devices (controller.budget; default: no budget).
         certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
@@ -563,7 +563,7 @@ def assess(
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. Its guarantee is for the environment that runs; `holds` says whether it covers the ranges.
+        The assessment. Its guarantee is for the environment that runs; `holds` also requires `condition` and ranges.
 
     Raises:
         TypeError: `loop` is no Loop, or `coupling` no coupling.

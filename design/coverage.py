@@ -45,7 +45,7 @@ class SwitchingFigures:
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
     hi: tuple[int, ...] = off_table()
-    alpha: tuple[float, ...] | None = off_table("if given", None)
+    alpha: tuple[float, ...] | None = off_table("if given", None)  # all multipliers, last alpha [N/m] (facts.Switching)
     playout: _Playout | None = off_table("if given", None)
     not_covered: str | None = off_table("if given", None)
 
