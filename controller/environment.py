@@ -333,7 +333,7 @@ class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
 class Network(
     msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True, repr_omit_defaults=True
 ):
-    """A passive mechanical network that the devices touch at its contacts, in the order of the channels."""
+    """A passive mechanical network, or a MuJoCo `world`. Devices touch its contacts, in the order of the channels."""
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()

@@ -65,8 +65,8 @@ def _in_time() -> Iterator[None]:
 # The blocks over the rationals come from the condition (design.environments, design.known_device, or the user's own).
 # The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that each block
 # at the available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
-# any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the parameters of a Network are
-# non-negative. Other multipliers are stored.
+# any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the environment is passive
+# (Environment.active). Other multipliers are stored.
 #
 # With ranges, a condition on the environment is proved for the nominal one (P) and for at most 128 vertices (P1, P2,
 # ..). There is no proof for an environment between the vertices, or for one that changes with time.

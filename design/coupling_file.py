@@ -107,7 +107,7 @@ def digest(*parts: msgspec.Struct) -> str:
 
 
 def _read_back(part: _Part) -> _Part:
-    """Return the part after writing and reading it; unchanged if it contains a user's own class."""
+    """Return the part after writing and reading it, or the part itself if this fails (a user's own class)."""
     try:
         return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
     except (TypeError, msgspec.ValidationError):
