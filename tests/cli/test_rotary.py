@@ -145,10 +145,10 @@ def test_the_live_window_is_rotary():
 
 
 def test_sessions_ask_for_the_radius():
-    """Limits are those of a hand: 2 N at 0.15 m are 0.3 N m, 1 m/s there is 6.7 rad/s."""
+    """Limits are those of a hand: 2 N at 0.15 m are 0.3 N m, 0.7 m/s there is 4.7 rad/s."""
     limits = session_for(load(WHEEL), LinkSettings(), cap=2.0).limits
     assert limits.cap == (0.3,)
-    assert limits.speed == pytest.approx(1 / 0.15)
+    assert limits.speed == pytest.approx(0.7 / 0.15)
     assert limits.jump == pytest.approx(0.02)
     with pytest.raises(InputError, match="radius is missing"):
         session_for(parse(WHEEL.read_text().replace("radius = 0.15", "")), LinkSettings())

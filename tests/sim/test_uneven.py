@@ -126,7 +126,7 @@ def test_what_cannot_be_is_refused(changes, said):
 
 
 def test_forces_latch_within_their_tick():
-    with pytest.raises(ValueError, match="within the period"):
+    with pytest.raises(ValueError, match="below the period"):
         Timing(np.array([1e-3]), np.array([[1e-3]]))
 
 
