@@ -95,7 +95,7 @@ def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
         assert most > 0.5 * W0  # the bound is no formality
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_the_budget_holds_on_stiffer_springs():
     """The optimal coupling of the default scenario on springs 2.5 times stiffer, compliant devices, lossless hands."""
     scenario, nsim = load(), 30

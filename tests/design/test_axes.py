@@ -459,7 +459,7 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
     [
         (False, "this-environment"),
         (False, "any-environment"),
-        pytest.param(True, "known-device", marks=pytest.mark.slow),
+        pytest.param(True, "known-device", marks=pytest.mark.validate),
     ],
 )
 def test_full_levels_meet_walls(known: bool, condition: str) -> None:

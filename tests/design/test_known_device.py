@@ -1101,8 +1101,8 @@ def together_needs(name):
     "name",
     [
         "switching",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:3]),
-        pytest.param("walls-limiter-ranges", marks=pytest.mark.validate),
+        pytest.param("walls-switching", marks=pytest.mark.slow),
+        *(pytest.param(n, marks=pytest.mark.validate) for n in ("limiter-switching", "walls-limiter-ranges")),
     ],
 )
 def test_facts_on_known_devices_are_proved_from_files(name):

@@ -223,7 +223,7 @@ def validated(tmp_path, *options):
     return code, json.loads((tmp_path / "v.json").read_text())["switching"]
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_random_humans_under_the_worst_switching(tmp_path):
     """The constants' design fails for most humans, the switching-proof one for none; 0 and 1 are what is claimed."""
     coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")

@@ -145,7 +145,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
     assert "0.8 to 1.4 ms long, recorded" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_hands_that_meet_uneven_ticks(tmp_path):
     """With a coupling nobody grows; without one most do, and both engines agree about whom."""
     file = tmp_path / "r.json"
