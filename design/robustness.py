@@ -41,8 +41,7 @@ def at(loop: Loop, network: Network) -> Loop:
 def vertices(network: Network, percent: float = _PERCENT) -> dict[str, Network]:
     """Return networks by name, each with one spring, all springs or one mass changed by plus or minus `percent`.
 
-    Of several springs between the same two nodes, only the last is also changed alone. Raises InputError if a changed
-    stiffness or mass would exceed the largest that a network may have.
+    Raises InputError if a changed stiffness or mass would exceed the largest that a network may have.
     """
     try:
         return _vertices(network, percent)
@@ -63,7 +62,10 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
             return msgspec.structs.replace(network, springs=tuple(springs))
 
         for i in stiff:
-            vertices[f"{sign}{percent:g} % stiffness between {' and '.join(network.springs[i].between)}"] = stiffer([i])
+            ends = network.springs[i].between
+            alike = [j for j in stiff if network.springs[j].between == ends]
+            which = f", spring {alike.index(i) + 1} of {len(alike)}" if len(alike) > 1 else ""
+            vertices[f"{sign}{percent:g} % stiffness between {' and '.join(ends)}{which}"] = stiffer([i])
         if len(stiff) > 1:
             vertices[f"{sign}{percent:g} % stiffness of all springs"] = stiffer(stiff)
         for node, mass in network.masses.items():

@@ -404,6 +404,26 @@ def test_range_couplings_are_proved_at_every_vertex():
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
+def test_each_of_parallel_springs_is_changed_alone():
+    springs = Spring(("a", "hub"), 900.0), Spring(("a", "hub"), 50.0, 0.3), Spring(("hub", "ground"), 200.0)
+    network = Network(("a",), springs, {"hub": 0.5})
+    loop = Loop(1e-3, (1,), (0,), (0,), (1.0,), network)
+    coupling = SpringDamper((4e3,), (0.5,))
+
+    def needed(i, factor):
+        changed = [
+            msgspec.structs.replace(s, stiffness=s.stiffness * (factor if i == j else 1)) for j, s in enumerate(springs)
+        ]
+        there = loop.at(msgspec.structs.replace(network, springs=tuple(changed)))
+        return this_environment(there.F(coupling), loop.delta).ratio
+
+    stiffer = vertices(network)["+10 % stiffness between a and hub, spring 1 of 2"]
+    assert [spring.stiffness for spring in stiffer.springs] == pytest.approx([990.0, 50.0, 200.0])
+    assert len(vertices(network)) == 2 * (3 + 1 + 1)  # each spring, all of them, the mass
+    most = max(needed(i, factor) for i in range(3) for factor in (0.9, 1.1))
+    assert robustness(loop, coupling).required_over_available >= most * (1 - 1e-9)
+
+
 def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
     network = Network(
         ("a", "b", "c"),
