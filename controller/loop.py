@@ -197,7 +197,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
 
     def per_device(self, values: ArrayLike) -> Array:
-        """Return, for each device, the least of the values (m,) of its channels."""
+        """Return (devices,): the least value of each device, from one value per channel (m,)."""
         return np.minimum.reduceat(np.asarray(values, dtype=float), [own.start for own in self.devices])
 
     def per_channel(self, values: Sequence[Any]) -> tuple[Any, ...]:

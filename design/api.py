@@ -207,7 +207,10 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its certificate; unchanged for ranges, for varying delays, or if no proof is found."""
+    """Return the design with a certificate where one can be proved.
+
+    With ranges, with varying delays, and where no proof is found, the design is returned as it is.
+    """
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:

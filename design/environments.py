@@ -499,8 +499,8 @@ def _half_widths(loop: Loop) -> Array:
 
 # ----------------------------------------------------------------------------------------------------
 # The condition limiter: forces are sent through the limiter of controller.law. With rho = 0 the limiter and a passive
-# environment together are passive, so any-environment covers limited forces without a further proof, except with a
-# delay in the environment.
+# environment together are passive. So any-environment covers limited forces without a further proof. This does not
+# hold if the environment has a delay.
 
 BETA = 0.01  # default lag of a limiter under this-environment, relative to Delta/T
 

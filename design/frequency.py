@@ -270,8 +270,8 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
     return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
-#: distances of trial points from the parabola's peak, in widths of the bracket. The near points serve a smooth peak,
-#: whose distance from the parabola's peak falls with the square of the width; the far points serve a kink.
+#: distances of trial points from the parabola's peak, in widths of the bracket. Near points find a smooth peak: its
+#: distance from the parabola's peak falls with the square of the width. Far points find a kink.
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
 _EIGHTHS = np.arange(1, 8)[:, None] / 8
 

@@ -1,4 +1,4 @@
-"""Load and call a user's own classes and functions, named as FILE.py:NAME on the command line."""
+"""Load and call classes and functions that a user wrote. The command line names them as FILE.py:NAME."""
 
 from __future__ import annotations
 

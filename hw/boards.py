@@ -50,7 +50,7 @@ class _Board:
         self.period = 0.0  # [us] length of a tick, from INFO
         self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
-        self.last: wire.State | None = None  # last STATE since the last CONFIG
+        self.last: wire.State | None = None  # newest STATE that came after the last CONFIG; None before
         self.misses = 0  # State.misses in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
         self._steps = self._shifted = 0  # steps since the board was first paired; their number at the last shift

@@ -352,7 +352,7 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """Return theta [ticks] for the measurement: the largest for which every margin fits into a STATE.
+    """Return the delay theta [ticks] during the measurement: the largest whose margins fit into their field of STATE.
 
     Raises ValueError where T [s] is too long for theta = 1.
     """

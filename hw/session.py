@@ -110,7 +110,7 @@ class Session:
     # Calls by a person and by the driver
 
     def start(self, now: int) -> None:
-        """Begin to wait for the device's INFO."""
+        """Start the session, which then waits for the device's INFO."""
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
 

@@ -377,7 +377,7 @@ class MujocoEngine:
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """The function that advances the plant by one tick, made at its first use after `start`."""
+        """The function that advances the plant by one tick. The first access after `start` creates it."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 

@@ -206,7 +206,7 @@ class _ShownScene:
         mujoco.mj_forward(self.model, self.data)
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """Return the grip of the mouse; a click on any body of a device grips the device's handle."""
+        """Return which handle the mouse grips: that of the device whose body was clicked, or None."""
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
