@@ -4,12 +4,15 @@ The handle is a mass with damping, Coulomb friction and a constant force such as
 """
 
 import ctypes
+import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+GCC = shutil.which("gcc")
+pytestmark = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_alone.h is not compiled here")
 FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
 T, MASS, COUNT = 1e-3, 0.08, 2e-5
 READY, RUNNING = 1, 3

@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,10 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = importlib.util.find_spec("forcedimension_core")
-pytestmark = pytest.mark.skipif(PACKAGE is None, reason="forcedimension-core is not for this Python")
+pytestmark = [
+    pytest.mark.skipif(PACKAGE is None, reason="forcedimension-core is not for this Python"),
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: the C stub is not compiled here"),
+]
 
 SESSION = """
 import ctypes, json, sys
