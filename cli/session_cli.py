@@ -257,8 +257,14 @@ def hold_session(
         if on_terminal and keyboard is not None:
             console(args).print("keys: a arm · s stop · space e-stop · q quit")
 
+        requested: set[str] = set()
+
         def watch(session: Session) -> None:
             incidents.update(session)
+            if session.request and session.request not in requested:
+                requested.add(session.request)
+                _clear()
+                console(args).print(session.request)
             if on_terminal:
                 _show(session)
 
@@ -349,6 +355,8 @@ def _show(session: Session) -> None:
         words.append(f"{len(session.measurement.result.values)} of {session.settings.measure} answers")
     elif session.stage == Stage.MEASURED:
         words.append("designing the coupling")
+    elif session.request:
+        words.append(session.request)
     elif drive and drive.x:
         words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")

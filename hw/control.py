@@ -293,7 +293,7 @@ class Drive:
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
         about = limits, T, units, still
-        tests = [monitor.EncoderTest(*about, expected, config.theta == 0, alive) for alive in (False, True)]
+        tests = [monitor.EncoderTest(*about, expected, config.theta == 0, closing) for closing in (False, True)]
         self._test, self._last_test = tests if settings.test_encoders else (None, None)
         self.encoders = monitor.EncoderMonitor(*about)
         self._heat = Heat(limits, T)
@@ -306,6 +306,11 @@ class Drive:
         self._test_plan = arming.test_plan
         self._commands = None if settings.behind else monitor.CommandMonitor(config)  # several boards have one each
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
+
+    @property
+    def request(self) -> str | None:
+        """Return what the person at the device has to do before the last motor test can go on, or None."""
+        return self._last_test.request if self._last_test else None
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
         """Return the force [steps] for `state`, which came at `now` [us], `ticks` ticks after the previous STATE.

@@ -48,6 +48,7 @@ _CROSS = 0.25  # largest motion of another axis, as a share of the expected moti
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
 _STRONG = 2  # first block of the test at the end of a session
+_LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
 _FORGETTING = 8  # right ticks that cancel one wrong tick; wrong ticks that come more often stop a session, too
@@ -551,10 +552,12 @@ class EncoderTest:
     wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
     comes later than expected shows a hidden delay, because friction and hands advance its phase.
 
-    At the end of a session (`alive`) unknown hands may hold the handles and move them, except in rehearsals (`held`).
-    Then it suffices that the axis swings at the frequency of the force, at any phase. An axis with a dead motor does
-    not swing. Too small a motion is refused only where it has the shape of a free handle and not that of a handle in a
-    hand as heavy as the device. The mode of a transmission makes these shapes differ; a rigid device has equal shapes.
+    At the end of a session (`closing`) unknown hands may hold the handles, except in rehearsals (`held`). A verdict
+    then needs two blocks in a row that agree, and blocks are repeated until the person lets go, at most for 5 s. A
+    small or late motion is a wrong one only where it has the shape of a free handle and not that of a handle in a hand
+    as heavy as the device. The mode of a transmission makes these shapes differ; a rigid device has equal shapes. If an
+    axis never moves as a free handle does, the session does not finish. Where it swings at the frequency of the force,
+    at any phase, the message blames the hand, because an axis with a dead motor does not swing.
     """
 
     def __init__(
@@ -565,22 +568,26 @@ class EncoderTest:
         still: Sequence[int],
         expected: Expected,
         at_once: bool = False,
-        alive: bool = False,
+        closing: bool = False,
     ) -> None:
         """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
         """
         self._at_once, self._strongest = at_once, [min(cap, _TEST_FORCE * limits.lever) for cap in limits.cap]
-        self._T, self._units, self._still, self._expected, self._alive = T, units, still, expected, alive
+        self._T, self._units, self._still, self._expected, self._closing = T, units, still, expected, closing
         self._axis, self._last = -1, None
+        self._unknown_hands = closing and not expected.held
+        self._blocks = _BLOCKS + round(_LETTING_GO / (4 * _TEST_HALF)) * self._unknown_hands
         self._next_axis()
 
     def _next_axis(self) -> None:
-        self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._alive else 0
+        self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._closing else 0
         self._expected.rest()
         self._rows: list[tuple[float, ...]] = []  # tick, two expected positions [m] and counts (m,) in this block
         self._pushed = 0.0  # [N] largest force on the axis in this block
+        self._finding: str | None = None  # the fault that the last block found, "" for none; None without an answer
+        self._swings = False  # whether the axis swung at the frequency of the force in a block
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.
@@ -594,11 +601,11 @@ class EncoderTest:
         self._rows.append((self._ticks, *position, *state.counts))
         before, half = max(1, round(_TEST_BEFORE / self._T)), max(2, round(_TEST_HALF / self._T))
         if self._ticks > before + 4 * half:
-            if self._answered():
+            if self._passed():
                 self._next_axis()
                 if self._axis == len(self._still):
                     return None
-            elif self._block == _BLOCKS - 1:
+            elif self._block == self._blocks - 1:
                 raise SafetyStop(self._unanswered())
             else:
                 self._ticks, self._block, self._rows = before, self._block + 1, [(before, *position, *state.counts)]
@@ -606,9 +613,14 @@ class EncoderTest:
         since = self._ticks - before
         if since <= 0:
             return (0.0,) * len(self._still)
-        size = self._strongest[self._axis] * 2.0 ** (self._block + 1 - _BLOCKS)
+        size = self._strongest[self._axis] * 2.0 ** min(0, self._block + 1 - _BLOCKS)
         sign = -1 if (since + half // 2) // half % 2 else 1
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._still)))
+
+    @property
+    def request(self) -> str | None:
+        """Return what the person has to do because a block is repeated, or None."""
+        return f"let go of the handle of axis {self._axis + 1}" if self._block >= _BLOCKS else None
 
     def _compare(self) -> tuple[Array, Array, float, float, bool]:
         """Compare all motions with the expected one.
@@ -638,28 +650,47 @@ class EncoderTest:
         """Return the range of encoder i in this block [counts]."""
         return float(np.ptp([row[3 + i] for row in self._rows]))
 
+    def _passed(self) -> bool:
+        """Return whether the axis has passed its test. Raises SafetyStop where it answered wrongly.
+
+        An unknown hand may look like a right or wrong answer in one block, so two blocks in a row must agree.
+        """
+        before = self._finding
+        try:
+            self._finding = "" if self._answered() else None
+        except SafetyStop as fault:
+            self._finding = str(fault)
+        if self._finding is None or (self._unknown_hands and (before is None or bool(before) != bool(self._finding))):
+            return False
+        if self._finding:
+            raise SafetyStop(self._finding)
+        return True
+
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
         axis, name, (size, fit, swing, late, free) = self._axis, f"axis {self._axis + 1}", self._compare()
         moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
-        loose = self._alive and not self._expected.held  # an unknown hand may hold the handle
+        held = self._unknown_hands and not free  # whether a hand can explain a smaller motion
+        self._swings = self._swings or (moves[axis] and swing > _ALIVE)
         if others and not moves[axis]:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
+        if held and follows[axis] and (abs(size[axis]) < 1 / _TEST_RATIO or late > _LATE + self._at_once):
+            return False
         if follows[axis] and size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
-        if follows[axis] and not (0 if loose and not free else 1 / _TEST_RATIO) <= size[axis] <= _TEST_RATIO:
+        if follows[axis] and not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong")
         if follows[axis] and others:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
-        if follows[axis] and not loose and late > _LATE + self._at_once:
+        if follows[axis] and late > _LATE + self._at_once:
             raise SafetyStop(
                 f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
             )
-        return follows[axis] or (loose and moves[axis] and swing > _ALIVE)
+        return follows[axis]
 
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""
@@ -668,7 +699,10 @@ class EncoderTest:
         if self._pushed < _PUSHED * most:
             tested = f"motor and encoder of axis {axis} are not tested"
             return f"the energy left allows {self._pushed:.2g} of {most:g} N: {tested}. Raise --energy-budget"
-        if self._alive:
+        if self._unknown_hands and self._swings:
+            held = f"the handle of axis {axis} was not let go at the end"
+            return f"{held}: its motor and encoder were not tested again"
+        if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
             return f"axis {axis} does not follow {at} as a free handle does: let go of it while arming"

@@ -66,6 +66,7 @@ class Session:
         self.listen: Callable[[_Event], None] = lambda event: None
         self._expected = Expected(scenario, self.settings.held)
         self.missed_while_driving = 0  # ticks
+        self.request: str | None = None  # what the person at the device has to do at the moment
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
@@ -155,8 +156,8 @@ class Session:
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
         """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
-        After the ramp the motors are tested once more, if encoders are tested. Where the user `let_go`
-        of the deadman, no test force may act, so the session ends as stopped.
+        After the ramp the motors are tested once more, if encoders are tested. Without that test a session that was
+        armed ends as stopped: where the user `let_go` of the deadman, and before forces act or after they have ended.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -169,6 +170,8 @@ class Session:
         if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
             self._ramp_out(after, cause)
             return ()
+        if self.armings and self.settings.test_encoders and not let_go:
+            after, cause = Stage.STOPPED, f"{cause}, before the motors of the last arming were tested at its end"
         return self._end(after, cause, wire.Reason.DONE)
 
     def end(self, stage: Stage, cause: str, now: int) -> Said:
@@ -315,6 +318,9 @@ class Session:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.drive.ended:
             return self._ramped_out()
+        if (request := self.drive.request) and request != self.request:
+            self._log(request)
+        self.request = request
         return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
     def _answer(
@@ -363,7 +369,7 @@ class Session:
         self.listen(self.log[-1])
 
     def _end(self, stage: Stage, cause: str, reason: wire.Reason = wire.Reason.FAULT) -> Said:
-        self.drive = None
+        self.drive = self.request = None
         self._shutdown = _Shutdown(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
         return (wire.Stop(reason),)

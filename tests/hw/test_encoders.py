@@ -67,14 +67,13 @@ def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     assert 0 < np.abs(forces).max() <= most
 
 
-def played(test, motion, ticks=900):
+def played(test, motion, ticks=6000):
     """Play a test to encoders with `motion`(k, applied so far) -> counts; what it asked for (ticks, m) [N]."""
-    forces, applied = [], []
+    forces, applied = [], np.zeros((ticks, 2), int)
     for k in range(ticks):
-        counts = motion(k, np.array(applied).reshape(-1, 2))
-        last = tuple(round(f / STEP) for f in forces[-1]) if forces else (0, 0)
-        applied.append(last)
-        force = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, counts, last), 1)
+        counts = motion(k, applied[:k])
+        applied[k] = [round(f / STEP) for f in forces[-1]] if forces else (0, 0)
+        force = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, counts, tuple(applied[k].tolist())), 1)
         if force is None:
             break
         forces.append(tuple(-f for f in force))  # the wire carries -f
@@ -101,8 +100,8 @@ def free_pair(mass=0.25):
     return nobody(load().replace(device=[device] * 2))
 
 
-def arming_test(cap=12.0, alive=False):
-    return EncoderTest(SafetyLimits((cap, cap)), T, UNITS, (1, 1), Expected(free_pair(), False), alive=alive)
+def arming_test(cap=12.0, closing=False):
+    return EncoderTest(SafetyLimits((cap, cap)), T, UNITS, (1, 1), Expected(free_pair(), False), closing=closing)
 
 
 def test_axes_are_tested_one_after_another():
@@ -133,16 +132,16 @@ def test_the_test_force_stays_within_the_cap(cap):
 def cut(test, most):
     """Play a test to encoders that stand still, with forces that are cut to `most` [N]."""
     sent = (0, 0)
-    for k in range(900):
+    for k in range(6000):
         asked = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, (0, 0), sent), 1)
         sent = tuple(round(max(-most, min(most, one)) / STEP) for one in asked)
 
 
-@pytest.mark.parametrize("alive", [False, True])
-def test_a_force_cut_short_is_no_test(alive):
+@pytest.mark.parametrize("closing", [False, True])
+def test_a_force_cut_short_is_no_test(closing):
     """An energy budget that allows 0.1 N of 1 N does not show that the motor is dead."""
     with pytest.raises(SafetyStop, match=r"the energy left allows 0.1 of 1 N: motor and encoder of axis 1 are not"):
-        cut(arming_test(alive=alive), 0.1)
+        cut(arming_test(closing=closing), 0.1)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -184,10 +183,10 @@ def test_a_moving_hand_hides_no_sign(hand, sign):
 
 
 @pytest.mark.parametrize("hand", [*REACH, *HANDS])
-@pytest.mark.parametrize("alive", [False, True])
-def test_a_moving_hand_is_no_motor(hand, alive):
+@pytest.mark.parametrize("closing", [False, True])
+def test_a_moving_hand_is_no_motor(hand, closing):
     with pytest.raises(SafetyStop, match="axis 1"):
-        played(arming_test(alive=alive), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
+        played(arming_test(closing=closing), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
 
 
 @pytest.mark.parametrize(("axis", "at"), checkered([1, 2], [0.7, 0.9]))
@@ -207,25 +206,62 @@ def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
     assert session.cause.startswith(f"axis {axis} moves {scale} times as far as expected")
 
 
-@pytest.mark.parametrize(("mass", "damping", "stiffness"), [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
-def test_hands_at_the_end_are_no_wrong_scale(scenario, rungs, mass, damping, stiffness):
-    """A hand that takes the handle during the session leaves less than half of the motion, in another shape."""
-    hand = Human((Link(mass, damping, stiffness),))
-    held = Emulator(scenario.replace(human=(hand, hand), tap=None)).plant
-    free = nobody(scenario)
+def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
+    """A live session: a `hand` (mass, damping, stiffness) takes both handles at 0.7 s, the end comes at 0.9 s.
 
-    def grasp(session, now):
-        states, rehearsal.emulator.plant = rehearsal.emulator.plant.s, held
-        held.s[:4] = states[:4]
+    The hand lets go at `lets_go` [s].
+    """
+    hands = Human((Link(*hand),))
+    still, faults = nobody(scenario), tuple(FaultInjection.parse(text) for text in faults)
+    held = Emulator(scenario.replace(human=(hands, hands), tap=None), faults).plant
+
+    def swap(session, now):
+        nonlocal held
+        held.s[:4] = rehearsal.emulator.plant.s[:4]
+        rehearsal.emulator.plant, held = held, rehearsal.emulator.plant
         return ()
 
-    def stop(session, now):
-        return session.stop("asked to", now)
-
+    actions = [(0.7, swap), (0.9, lambda session, now: session.stop("asked to", now)), (lets_go, swap)]
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=False))
-    rehearsal = Rehearsal(session, Emulator(free), lambda ages: rungs, actions=[(0.7, grasp), (0.9, stop)])
-    rehearsal.run_until_armed(1.9)
+    rehearsal = Rehearsal(session, Emulator(still, faults), lambda ages: rungs, faults, actions=actions)
+    rehearsal.run_until_armed(8.0)
+    return session
+
+
+@pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
+def test_handles_that_are_let_go_finish(scenario, rungs, hand):
+    """A hand on the handle is asked to let go; it is no wrong scale. With 0.25 kg it halves the motion at most."""
+    session = ended_live(scenario, rungs, hand, lets_go=2.5)
     assert session.stage == Stage.FINISHED, session.cause
+    assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
+
+
+@pytest.mark.parametrize("hand", [(0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
+def test_handles_that_stay_held_never_finish(scenario, rungs, hand):
+    session = ended_live(scenario, rungs, hand)
+    assert session.stage == Stage.STOPPED
+    assert session.cause == (
+        "the handle of axis 1 was not let go at the end: its motor and encoder were not tested again"
+    )
+
+
+WRONG = ["motor=-1", "motor=0.3", "motor=3", "scale=0.3", "reverse", "late=2", "cross=1"]
+
+
+@pytest.mark.parametrize("fault", WRONG)
+def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
+    """A fault after full gain, hidden by a firm hand until it lets go."""
+    session = ended_live(scenario, rungs, (0.5, 20.0, 1500.0), f"{fault}@0.8", lets_go=1.5)
+    assert session.stage == Stage.STOPPED, session.cause
+    assert "not let go" not in session.cause
+
+
+@pytest.mark.parametrize("at", [0.05, 0.3])
+def test_a_stop_before_the_end_test_is_no_finish(scenario, rungs, at):
+    """At 0.05 s the encoders are tested, and no gain has risen; at 0.3 s it has."""
+    session, _ = session_with(scenario, rungs, stop=at, seconds=1.5)
+    assert (session.stage == Stage.FINISHED) == (at == 0.3), session.cause
+    assert at == 0.3 or "before the motors of the last arming were tested" in session.cause
 
 
 def test_devices_of_three_axes_run_without_hands():

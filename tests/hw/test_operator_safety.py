@@ -151,8 +151,9 @@ def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
 def rehearsal_until_finished(scenario, rungs):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
-    rehearsal.run_until_armed(0.01)
+    rehearsal.run_until_armed(0.3)
     session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.5)
     return session
 
 
