@@ -95,7 +95,7 @@ def within(
         _counter.most, _counter.message, _counter.over = before
 
 
-_PRODUCT = 5e-8  # [units] a product and a sum of integers of up to 64 bits; measured up to 5000 bits
+_PRODUCT = 5e-8  # [units] one product and sum of short integers; growth with their bits was measured up to 5000
 _DIFFERENCE = 2e-6  # [units] a product and a difference of fractions
 
 
@@ -191,7 +191,7 @@ def inverse(M: Array) -> Array:
     except np.linalg.LinAlgError:
         raise SingularLoop(_TOO_STIFF) from None
     with np.errstate(over="ignore", invalid="ignore"):  # An overflow gives inf or nan, which is not <= 1e24.
-        # The product of the Frobenius norms is at least the condition number, whose singular values take far longer.
+        # The product of the Frobenius norms is at least the condition number, and takes far less time.
         below = _square_norm(M) * _square_norm(result) <= 1e24
     if M.size and not below.all() and np.max(np.linalg.cond(M)) > 1e12:
         raise SingularLoop(_TOO_STIFF)

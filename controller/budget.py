@@ -5,16 +5,17 @@
 
 *The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the
 energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), of which the device feels -a[k], and
-dx[k] = x[k+1] - x[k]. With the reduced damping Delta' = (1 - eps) Delta (on vectors, ' is the transpose) it computes
+dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta (on vectors, ' is the transpose) the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
 For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. Let R
 be the sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
 they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
-exists at every tick: with s = 0 the last tick lowers R by its largest loss, and W by at most this loss. So W >= 0
-always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the energy that
-the devices dissipate, devices and hands receive at most W0, and sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
+exists at every tick: a tick lowers R by its largest loss, and W by at most this loss, so that s = 0 is allowed. So
+W >= 0 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the
+energy that the devices dissipate, devices and hands receive at most W0, and
+sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
 
 *Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost. After that the
 device must set its force to zero. The largest loss of tick t is the largest r of these packets, channel by channel, and
@@ -118,7 +119,7 @@ class _Net(_Acting):
         np.minimum(self.least, scale, out=self.least)
 
     def figures(self, guarantee: str | None = None) -> ShellFigures:
-        """Return the present W, the least scale so far, and the limited ticks, of many simulations the worst."""
+        """Return the present W, the least scale so far, and the limited ticks, each the worst of all simulations."""
         return ShellFigures(
             **vars(super().figures(guarantee)),
             start_J=self._start,
@@ -309,14 +310,14 @@ class Shell(_Net):
     """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
     W[k+1] = W[k] + f'(u - u_-), where u_- is u of the previous tick, and f = s f_wanted with the largest s in [0, 1]
-    for which W[k+1] >= 0. V responds within the tick by its feedthrough D_V: u = u0 - D_V f, where u0 is u for f = 0.
+    for which W[k+1] >= 0. V responds within the tick by its direct part D_V: u = u0 - D_V f, where u0 is u for f = 0.
     So W[k+1] is a concave parabola in s, nonnegative at 0, and s is its upper root, or 1 if the root is larger. Then
     sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is certified for any
     environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:
-        """Raise ValueError if V is not square, or if its direct part is not passive."""
+        """Raise ValueError if V is not square, or if D_V is not passive."""
         super().__init__(start, np.inf, nsim)
         if V.inputs != V.outputs:
             raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected equal numbers")
@@ -364,7 +365,7 @@ class Shell(_Net):
         return force, self.book(force)
 
     def book(self, force: Array) -> Array:
-        """Update W for a force (m, nsim) [N] that acts in this tick without a limit; return the port's u [m]."""
+        """Update W for the force (m, nsim) [N] of this tick without limiting it; return the port's u [m]."""
         u = self._free - self._V.D @ force
         self._earn((force * (u - self._before)).sum(axis=0))
         self._state = self._V.A @ self._state + self._V.B @ force

@@ -282,8 +282,8 @@ PUBLISHED = {
 class MovingAverage(ReadOnly, Coupling):
     """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: a moving sum of the forces and a plain spring.
 
-    With weight T/(2 delta), theta + 1 terms and a small constant it is the stiffest coupling that any-environment
-    admits (docs/theory.md).
+    With weight T/(2 delta), theta + 1 terms and a small constant it is almost the stiffest linear coupling that
+    any-environment admits (docs/theory.md).
     """
 
     weight: Array  # (m,) [m/N]
@@ -421,7 +421,7 @@ class ForceFilter(ReadOnly, Coupling):
 
     There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
     coupling `_InternalModel`. R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
-    coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric for all springs.
+    coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric if E(1) is.
     R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 
     Raises:
@@ -485,7 +485,7 @@ class ForceFilter(ReadOnly, Coupling):
         return {"order": self.filter(T).order}
 
     def turned(self, Q: Array) -> ForceFilter:
-        """Return Q R Q', rounded to decimals with R_0 such that R(1) = g I holds exactly."""
+        """Return Q R Q', rounded to decimals, with R_0 chosen so that R(1) = g I holds exactly."""
         later = np.round(Q @ _own_columns(self.R[1:]) @ Q.T, 10)
         first = self._static() - numbers(later, Fraction(1)).sum(axis=0)
         return ForceFilter(self.poles, self.pairs, np.concatenate([first.astype(float)[None], later]))
@@ -540,7 +540,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
     A chain ends with the last function whose coefficient is not zero. The chain for the sum of all inputs is the sum of
-    the inputs' chains, so it needs states of its own only after the shortest of these has ended.
+    the inputs' chains, so it needs more states only beyond the length of the shortest of these.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size

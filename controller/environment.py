@@ -49,9 +49,9 @@ _SAME_LENGTH = 1e-15  # tolerance of a length of 1, so that normalising twice ch
 
 
 def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the direction scaled to length 1. Raises ValueError unless sizes are below 1e9 and one exceeds 1e-9."""
+    """Scale a direction to length 1. Raises ValueError unless all entries are below 1e9 in size and one above 1e-9."""
     if not (any(abs(c) > 1e-9 for c in direction) and all(abs(c) < 1e9 for c in direction)):
-        raise ValueError(f"{field} is {list(direction)}, expected entries below 1e9, not all 0 within 1e-9")
+        raise ValueError(f"{field} is {list(direction)}, expected sizes below 1e9, at least one above 1e-9")
     length = float(np.linalg.norm(direction))
     return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
 
@@ -356,7 +356,7 @@ class Network(
         if len(self.walls) > _MOST_WALLS:
             raise ValueError(f"the network has {len(self.walls)} walls, allowed are {_MOST_WALLS}")
         if self.block and len(self.block.D) != len(self.contacts):
-            raise ValueError(f"block has {len(self.block.D)} channels, expected {len(self.contacts)}, as contacts")
+            raise ValueError(f"block has {len(self.block.D)} channels, expected {len(self.contacts)}, one per contact")
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
             raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
         for part in (*self.springs, *self.walls):

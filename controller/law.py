@@ -69,7 +69,7 @@ class Law(ReadOnly):
 
     @property
     def unsolved(self) -> int:
-        """Number of vectors of limited forces that were set to 0 because no solution was found."""
+        """Number of times that limited forces were set to 0 because no solution was found."""
         return 0
 
     @property
@@ -248,7 +248,7 @@ class Limiter(Law):
     """
 
     limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
-    rho: Array  # (m,) [N/m] resists changes of the slip; 0 for any-environment, otherwise a share of delta/T
+    rho: Array  # (m,) [N/m] resists changes of the slip; 0 for any-environment with psi = 0, else a share of delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 
     if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold

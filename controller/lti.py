@@ -68,7 +68,7 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # largest numbers of rows, points and entries in a block, for the cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # largest block that fits the processor's cache: rows, points, entries
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
@@ -245,7 +245,7 @@ class Lti(ReadOnly):
         The other part of A, N = (I - P) A, has the many poles at or near 0 that belong to delays. Its powers vanish
         within 2^_DOUBLINGS samples, so that its response is a finite sum.
 
-        The error follows from the residual of B = (z I - A) X. The states
+        The error follows from the residual of (z I - A) X = B. The states
         X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 leave the residual
         (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1. Its entries, and the
         response of the outputs to it, are bounded over the unit circle. The bound does not depend on the units of the
@@ -354,8 +354,8 @@ class Lti(ReadOnly):
     def _rest(self) -> tuple[Array, Array]:
         """G(1), shape (..., p, m), and R = C (I - A)^-1, shape (..., p, n).
 
-        An exact block from a product, `feedback`, `diag`, `rows` or `hstack` computes both from its parts, because this
-        takes far less work than eliminating all states. Raises SingularLoop if A has the eigenvalue one.
+        An exact block from G @ H, G @ M, `feedback`, `diag`, `rows` or `hstack` computes both from its parts, because
+        this takes far less work than eliminating all states. Raises SingularLoop if A has the eigenvalue one.
         """
         if from_parts := self.__dict__.get("_parts"):
             try:

@@ -1,6 +1,6 @@
 """Uncertain environments: ranges of a network's parameters, their vertices, and random points within them.
 
-At a vertex every uncertain parameter is at an end of its range, and every contact that may be absent is present or
+At a vertex every uncertain parameter is at an end of its range, and every spring that may be absent is present or
 absent. An absent spring remains in its network with neither stiffness nor damping.
 """
 
@@ -58,7 +58,7 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the ranges with a fixed set of present contacts, in which only numbers vary."""
+    """A part of the ranges with a fixed set of present springs, in which only numbers vary."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
@@ -80,18 +80,18 @@ def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
 
 
 def number_of_vertices(network: Network, ranges: Ranges) -> int:
-    """Return the number of combinations of ends, and of present or absent contacts."""
+    """Return the number of combinations of ends, and of present or absent springs."""
     return prod(len(part.corners) for part in _parts(network, ranges))
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     """Return each vertex as the numbers of the parts' corners: all vertices, or 128 that include a linear code.
 
-    Each bit of a corner's number is the parity of the bitwise AND of the word's number and a mask. All masks have the
-    highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
+    Each bit of a corner's number is the parity of the bitwise AND of the code word's number and a mask. All masks have
+    the highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
     pairs of ends meet in every combination, unless one belongs to a part with ranges that may also be absent.
     Such a part usually has 3 or 5 corners: several words give the same vertex, and some combinations may be missing.
-    Random vertices then replace these words; they leave out fewer combinations than shifted words would.
+    Random vertices then replace these words; they leave out fewer combinations than a shifted copy of the code.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:
@@ -116,13 +116,13 @@ def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
 
 
 def where_proved(network: Network, ranges: Ranges) -> str:
-    """Return the vertices among the members of ranges in words: "every vertex", or "128 of 625 vertices"."""
+    """Return in words which vertices are members: "every vertex", or "128 of 625 vertices"."""
     count = number_of_vertices(network, ranges)
     return "every vertex" if count <= _MOST_VERTICES else f"{_MOST_VERTICES} of {count} vertices"
 
 
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
-    """Return the ranges as one region for every combination of present and absent contacts."""
+    """Return the ranges as one region for every combination of present and absent springs."""
     parts = _parts(network, ranges)
     return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
 
@@ -130,7 +130,7 @@ def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
     """Draw `count` environments uniformly from the ranges.
 
-    A contact that may be absent is absent with probability 1/2. A larger `count` only adds environments at the end.
+    A spring that may be absent is absent with probability 1/2. A larger `count` only adds environments at the end.
     """
     parts, rng = _parts(network, ranges), np.random.default_rng(seed)
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 PositionUnit = Literal["m", "rad"]
 _spoken: ContextVar[PositionUnit] = ContextVar("unit", default="m")
-#: from a unit in a text to the rotary unit; N, m and g alone are units only after "[", or after a digit or ) ] } and a
+#: the rotary unit for each unit in a text; N, m and g alone are units only after "[", or after one of 0-9 ) ] } and a
 #: space
 _ROTARY = {"N s/m": "N m s/rad", "N/m": "N m/rad", "m/N": "rad/(N m)", "m/s": "rad/s", "kg": "kg m2"}
 _ALONE = {"N": "N m", "m": "rad", "g": "g m2"}
@@ -41,7 +41,7 @@ def spoken() -> PositionUnit:
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
-    """Replace metres by radians in a text's units if `unit` (default: this command's) is rad, once or repeatedly."""
+    """Return `text` with radians for metres if `unit` (default: this command's) is rad. The function is idempotent."""
     return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
 
 

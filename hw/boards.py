@@ -1,4 +1,4 @@
-"""Drive several boards, each with a clock of its own, as one device (docs/hardware.md, "Two boards, two clocks").
+"""Drive several boards, each with its own clock, as one device (docs/hardware.md, "Two boards, two clocks").
 
 In a step, the host takes one sample of every board and computes one force for each. Steps are numbered by the ticks of
 the leading board. Each other board contributes its next sample, or repeats its last sample where its clock has fallen
@@ -204,7 +204,7 @@ class Boards:
         return [board.ages for board in self._boards]
 
     def info(self) -> wire.Info | None:
-        """Return one INFO with the axes of all boards. Raises SafetyStop if the boards do not fit together."""
+        """Return one INFO for all axes, or None until all came. Raises SafetyStop if the boards do not fit together."""
         with self._together():
             for i, board in enumerate(self._boards):
                 self._infos[i] = self._infos[i] or board.device.info()
@@ -224,7 +224,7 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send every board its part of a configuration, with its extra delay in theta. None until all have answered."""
+        """Send each board its part of `config` and its extra delay. Return the worst answer, or None until all came."""
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:

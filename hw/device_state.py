@@ -93,7 +93,7 @@ class Device:
             self.phase, self.cause = wire.Phase.STOPPED, cause
 
     def fault(self) -> None:
-        """Stop because the firmware found a fault of its own (an encoder, a driver)."""
+        """Stop because the firmware itself found a fault (an encoder, a driver)."""
         self.halt(wire.Cause.DEVICE)
 
     def estop(self, cause: wire.Cause = wire.Cause.ESTOP_DEVICE) -> None:
@@ -131,7 +131,7 @@ class Device:
                 self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
-        """Store the first force for a tick that is ahead and theta after the source; apply it at once if theta = 0."""
+        """Store the first force for tick source + theta if it is in time; apply it at once if theta = 0."""
         known = frame.command == wire.Command.RUN or (
             frame.command in (wire.Command.IDLE, wire.Command.ARM) and not any(frame.force)
         )

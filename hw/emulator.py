@@ -41,9 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = (
-    203  # The person starts to move after so many ticks at full cap; encoder tests may delay full gain beyond it.
-)
+_SETTLED = 203  # ticks at full cap after which the person starts to move; with encoder tests, full gain may come later
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 

@@ -167,7 +167,7 @@ class ForceDimension:
 
     @contextmanager
     def _off_after_an_error(self) -> Iterator[None]:
-        """Take the force off every device as soon as one of them has an error, and give none again."""
+        """Remove the force from every device as soon as one of them has an error, and apply none again."""
         try:
             yield
         except Exception:
@@ -192,7 +192,7 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device lacks power, link or, while armed, calibration or force, or has an error."""
+        """Raise SafetyStop if a device has no power, no link, an error or, while armed, no calibration or no force."""
         armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():
             status = self._status[index]

@@ -8,7 +8,7 @@ with the displacement x, the motor's force f and D = d/dt. The fit estimates the
 term k x stands for a cable, a spring or gravity that changes with position, f0 + f1 t for a constant force and its
 drift. A motor (m1) that drives the handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12,
 p = a b + l m, r = a m1. The balance has no fractions, since both sides were multiplied by 1 + l D + a D^2. A lag tau of
-the amplifier changes l to l - tau and a to a + tau^2/2, so the fit does not mistake this lag for negative damping. The
+the amplifier changes l to l - tau and a to about a + tau^2/2, so the fit does not mistake it for negative damping. The
 fit differentiates h, never the encoder, and integrates a force held for a tick exactly. The balance is linear in all
 parameters except the a before g, so a fit takes milliseconds. A fit needs no initial state.
 
@@ -305,7 +305,7 @@ def _apart(columns: Array, i: int) -> Array:
 
 
 def dry_friction(x: Array, T: float, found: Friction) -> Array:
-    """Return dry friction [N] for displacements x (N,) [m], without its Stribeck part; a bristle counts as _SLIP."""
+    """Return dry friction [N] for displacements x (N,) [m], without its Stribeck part; v0 is _SLIP for a bristle."""
     return found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
 
 

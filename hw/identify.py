@@ -29,7 +29,7 @@ from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, starts, viscosit
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
-_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length over `seconds`
+_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; its length / `seconds`
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as shares of the largest
 _CYCLES = 3  # cycles of the swing at each amplitude
 _LEAD = 0.3  # [s] of zero force, while the gain rises
@@ -191,8 +191,8 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool, lever: 
     # also refuse a stiffness that is too uncertain to exclude a hand
     if (most := law.stiffness + 2 * law.errors["stiffness"]) > allowed:
         raise ValueError(
-            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, allowed {allowed:.3g}): a hand "
-            "or a finger rests on it? The fit would count its damping as the device's; let go, or loosen the spring"
+            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, allowed {allowed:.3g}): does a "
+            "hand or a finger rest on it? The fit would count its damping as the device's; let go, or loosen the spring"
         )
     if law.delta <= 0:
         raise ValueError(
@@ -261,7 +261,7 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
         figures = ", ".join(f"{e.viscous:.4g}" for e in axis)
         told = f"axis {i}: {figures} N s/m in sittings 1 to {len(axis)}, a hand damped it in"
         if _more_damped(others[0], least):
-            raise ValueError(f"{told} one at least. The two least have to agree: let go, and take more (--sittings)")
+            raise ValueError(f"{told} one at least. The two lowest must agree: let go, and take more (--sittings)")
         if hands := [f"{k}" for k, e in enumerate(axis, start=1) if _more_damped(e, least)]:
             words.append(f"{told} {', '.join(hands)}, which did not count")
         slowest = min(axis, key=lambda e: e.viscosity.speed).viscosity  # no sitting's bound holds beyond its speed
