@@ -681,7 +681,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys, br
     options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "3600"]
     options += ["--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
-    found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
+    found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]
     assert found["rendered_stiffness"] > 0.5
     assert not found["ended_by_seconds"]
