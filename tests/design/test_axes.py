@@ -692,7 +692,7 @@ def switching_room(loop: Loop, coupling: ForceFilter, alpha: tuple[float, ...]) 
     [
         msgspec.structs.replace(ONE_DEVICE, varying_delay=DelayRange((1, 1), (2, 2))),
         pytest.param(
-            _with(environment=MASS, varying_delay=DelayRange((0, 0, 2, 2), (1, 1, 2, 2))), marks=pytest.mark.slow
+            _with(environment=MASS, varying_delay=DelayRange((0, 0, 2, 2), (1, 1, 2, 2))), marks=pytest.mark.validate
         ),
     ],
 )
