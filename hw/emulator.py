@@ -409,7 +409,8 @@ class Emulator:
                 case "unplug":
                     self.unplugged = True
                 case "reset":
-                    self.device = Device(self.info)
+                    held, self.device = self.device.deadman, Device(self.info)
+                    self.device.deadman = held
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
                 case "freeze" | "toggle" | "saturate" | "shake" | "drift" | "reverse" | "scale" | "late" | "noise":

@@ -80,7 +80,9 @@ class ForceDimension:
             sdk = self._sdk
             ID = sdk.openSerial(int(name[2:])) if name.startswith("sn") else sdk.openID(int(name))
             if ID < 0:
-                raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {sdk.errorGetLastStr()}")
+                why = sdk.errorGetLastStr()
+                self.__exit__()
+                raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {why}")
             self._ids[name] = ID
         self._status = {index: self._sdk.Status() for index in self._ids}
         first = next(iter(self._ids.values()))

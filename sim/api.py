@@ -58,7 +58,7 @@ class ScenarioRun:
     trace: Trace
     wall_s: float
     seed: int
-    unsolved: int  # number of force vectors that were set to 0 because the limiter found no solution
+    unsolved: int  # number of times that limited forces were set to 0 because no solution was found
 
     @cached_property
     def exact(self) -> Trace | None:

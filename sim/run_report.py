@@ -52,7 +52,7 @@ class Ran:
     encoder_step_m: Array
     steady_ticks: list[list[int]]
     environment: str
-    unsolved: int  # number of force vectors that were set to 0 because the limiter found no solution
+    unsolved: int  # number of times that limited forces were set to 0 because no solution was found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -340,9 +340,11 @@ def test_the_package_without_the_makers_sdk_says_so(monkeypatch):
     ],
 )
 def test_axes_that_are_none_are_refused(scenario, axes, words):
+    sdk = StandIn(scenario)
     with pytest.raises(InputError) as error:
-        ForceDimension(scenario, axes, StandIn(scenario))
+        ForceDimension(scenario, axes, sdk)
     assert words in str(error.value)
+    assert sdk.open == []
 
 
 def test_two_axes_of_one_device(scenario):

@@ -148,6 +148,14 @@ def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
         assert args.deadman == asked
 
 
+def test_a_reset_lets_go_of_no_deadman(scenario):
+    emulator = Emulator(scenario, (FaultInjection.parse("reset"),))
+    before = emulator.device
+    emulator.tick(0)
+    assert emulator.device is not before
+    assert emulator.device.deadman
+
+
 def rehearsal_until_finished(scenario, rungs):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
