@@ -35,7 +35,7 @@ from haptic_loop.sim.trace import Trace
 
 @dataclass(frozen=True)
 class PositionError:
-    """Error of device positions against the exact engine; None if nothing moves, or with a reason."""
+    """Error of device positions against the exact engine. Figures are None if nothing moves or a `reason` is given."""
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
@@ -415,8 +415,8 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
         return min(right, key=lambda choice: choice.cost)
     best = min(choices, key=lambda choice: choice.position_relative_rms)
     raise InputError(
-        f"--error {error:g}: the nearest setting, {best.name}, has a wrong verdict or "
-        f"error {best.position_relative_rms:.1g}"
+        f"--error {error:g}: the nearest setting, {best.name}, has error "
+        f"{best.position_relative_rms:.1g} or a wrong verdict"
     )
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-_WITHIN = 4  # numbers of a device with guaranteed bounds, each in [-1, 1] (models.device.Mechanics)
+_WITHIN = 4  # parameters in [-1, 1] that place a device within its guaranteed bounds (models.device.Mechanics)
 _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
 
@@ -127,8 +127,8 @@ def search_population(
 ) -> Worst:
     """Search for the worst sets of hands that the scenario's population can draw.
 
-    In every generation half of the sets are new draws. The others take each device's hand from one of the worst sets
-    so far, or from a new draw. Each hand is therefore one that the population drew, whatever its class.
+    In the first generation all sets are new draws, later half of them. The others take each device's hand from one of
+    the worst sets so far, or from a new draw. Each hand is therefore one that the population drew, whatever its class.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []

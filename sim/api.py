@@ -77,7 +77,7 @@ def run_scenario(
     net: Wanted | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> ScenarioRun:
-    """Close the loop for the scenario's duration, for `sim.run` and `simulate`.
+    """Run the closed loop for the scenario's duration, as `sim.run` and `simulate` do.
 
     `lag` is rho (m,) [N/m] of the limiter of the forces, or None to clip them. `net` acts between controller and
     devices. Raises InputError for impossible settings.

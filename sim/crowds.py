@@ -3,8 +3,8 @@
 Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
 the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4
 integrator, which shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a
-fifth of RK4's cost. The exact engine simulates all humans, MuJoCo all or a sample (`_witnessed`). Workers end when
-their parent ends.
+fifth of RK4's cost, but RK4 under varying delays or ticks. The exact engine simulates all humans, MuJoCo all or a
+sample (`_witnessed`). Workers end when their parent ends.
 """
 
 from __future__ import annotations
@@ -354,7 +354,7 @@ def _traced(
 ) -> ImpulseTest:
     """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are the other's.
 
-    Periods are even, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
+    Periods are constant, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks

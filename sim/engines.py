@@ -121,7 +121,7 @@ class ExactEngine(_Exact):
 
 
 class OneByOne:
-    """An engine that moves each simulation of a buffer by an engine of its own."""
+    """An engine that moves each simulation of a buffer by a separate engine."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
         self._engines = engines
@@ -487,7 +487,7 @@ class MujocoBatchEngine:
 
 @lru_cache(64)  # Successive runs often have the same plant.
 def _step_of(plant: Plant, n: int, h: float) -> Array:
-    """Return the step from [s; a] to s after h seconds, for one plant with n joints."""
+    """Return the step from [s; qacc] to s after h seconds, for one plant with n joints."""
     stacked = _stacked(plant)
     return exponential_step(stacked.A, h, n, stacked.felt)[0]
 

@@ -32,7 +32,7 @@ Cells = NDArray[np.intp]
 # The exact loop's eigenvalues, with every human.
 
 
-_MIN_FREQUENCY_HZ = 2.0  # lowest of a fast mode; slower modes decay slowly and would hide one that is about to grow
+_MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes decay slowly and would hide one about to grow
 _LEADING = 0.1  # share of the humans who are tried first; the others are tried in cells that all of these leave stable
 
 
@@ -112,7 +112,10 @@ class HeldDevices:
         return (vector / positions[np.argmax(np.abs(positions))]).real
 
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of a tenth of the humans, at least 8: the most often unstable, then the least damped."""
+        """Return a mask (n,) of a tenth of the humans, at least 8.
+
+        First come those who are unstable with most of the force maps `some`, then the least damped.
+        """
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
         first = np.zeros(len(self), dtype=bool)

@@ -74,7 +74,7 @@ class Plugged:
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh shell for `nsim` runs. Raises ValueError if the loop has none, or for a wrong `start`."""
+        """Return a fresh shell for `nsim` runs. Raises ValueError if no shell fits the loop, or for a wrong `start`."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("an environment of your own needs a coupling with a compliance V before it")

@@ -394,7 +394,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
     """Draw the ideal forces, broad and pale, and cut them at three times the largest other force."""
     forces, percent = ideal
     label = "pale: the force of the object itself for this motion"
-    if percent is not None:  # The report compares forces before the motors' limits.
+    if percent is not None:  # sim.accuracy.force_error says which forces are compared.
         label += " (equal to the commanded force)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))

@@ -80,7 +80,7 @@ class EncoderSteps:
 
 
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
-    """Compare the devices' friction with that needed for their encoder steps; None without steps or a solvable loop."""
+    """Compare the devices' friction with that needed for encoder steps; None without steps, or for a singular loop."""
     fields = ("encoder_step", "friction", "friction_max")
     steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]

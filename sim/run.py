@@ -82,7 +82,7 @@ class Simulation:
     process: Process
     scene: Scene
     plant: HeldPlant  # for periods T, with forces that latch in the middle of the range of latencies
-    timing: Timing | None = None  # begin and latch times of ticks; None if all ticks are alike and forces latch at them
+    timing: Timing | None = None  # begin and latch times of ticks; None without `period` and `latency` in the scenario
 
     @cached_property
     def loop(self) -> Loop:
@@ -128,7 +128,7 @@ class Simulation:
 
     @property
     def even(self) -> Simulation:
-        """The simulation with even periods T and forces that latch at ticks, for comparing integrators."""
+        """The simulation with constant periods T and forces that latch at ticks, for comparing integrators."""
         if self.timing is None:
             return self
         return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
@@ -361,7 +361,7 @@ def make_engine(
 
     The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
     as it is; a user's class or function is called with the simulation. Raises ValueError for an unknown name, an object
-    that is no engine, the exact engine with Coulomb friction, or a user's own engine with uneven ticks or a latency.
+    that is no engine, the exact engine with Coulomb friction, or a user's own engine with `period` or `latency`.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)

@@ -66,7 +66,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def _usual_hand(i: int) -> Human:
     """Return the default hand of device i, from 0: 0.3 kg on a spring whose other end swings 15 mm at 0.6 Hz.
 
-    It swings a quarter period ahead of that of hand i - 1.
+    The phase of hand i is a quarter period ahead of that of hand i - 1.
     """
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
@@ -155,7 +155,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
     def _check_counts(self) -> None:
-        """Raise ValueError unless lists have an entry for each channel, and humans are one per device."""
+        """Raise ValueError unless lists have one entry per channel, and each device has one human."""
         contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
         if (axes := sum(len(device.free) for device in self.device)) != self.channels:
             several = any(device.axes > 1 for device in self.device)
@@ -331,7 +331,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.period is not None or any(least < most for least, most in self.latency or ())
 
     def timing(self, seed: int, ticks: int) -> Timing | None:
-        """Draw the times at which ticks begin and forces latch; None if both are at k T."""
+        """Draw the times at which ticks begin and forces latch; None without `period` and `latency`."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
         timing = drawn(self.T, self.period, self.latency, ticks, rng)
         if timing is None or timing.late is None or self.axis_devices is self.device:
@@ -672,7 +672,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 def _require_keys(raw: dict[str, Any]) -> None:
     """Raise ValueError if a key is missing that every scenario or every rotary device needs.
 
-    A file with unknown keys may lack keys of every scenario here, because `msgspec.convert` reports unknown keys.
+    Missing keys of a scenario pass here if the file has unknown keys, because `msgspec.convert` reports these.
     """
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
@@ -720,7 +720,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
         return raw
     for i, n in enumerate(counts, start=1):
         if n != counts[0]:
-            raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as of device #1: clamp its axes instead")
+            raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as for device #1: clamp axes instead")
     names = AXES[: counts[0]]
     held = [one.get("clamped", []) for one in tables]
     contacts, walls = table.get("contacts", []), table.get("walls", [])
@@ -914,7 +914,7 @@ _TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's ow
 
 
 def _is_own(name: str, value: Any) -> bool:
-    """Return whether humans or a population are of a class that no scenario can hold: a user's own, or MeasuredHand."""
+    """Return whether a value is a user's own population, or includes a MeasuredHand or a user's own human."""
     if name == "population":
         return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
     parts = value if isinstance(value, list | tuple) else ()

@@ -334,12 +334,12 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     elif simulation.friction:
         growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues leave friction out"
     elif trace.net:
-        growth, reason = None, "a passivity layer scales the forces; the eigenvalues are those of the loop without it"
+        growth, reason = None, "a passivity layer changes the forces; the eigenvalues are those of the loop without it"
     elif simulation.timing and not simulation.timing.steady:
         growth, window = linear_growth(simulation)
         decided = verdict_within(growth, window)
         how = f"growth of the linear loop after an impulse, over {window:.3g} s of periods and latencies as in the run"
-        reason = f"{how}; the eigenvalues are those of even periods and the middle of the latency"
+        reason = f"{how}; the eigenvalues are those of constant periods and the middle of the latency"
         reason += "" if decided else f"; {UNDECIDED}"
     else:
         loop = close(simulation.plant, simulation.F)
@@ -493,7 +493,7 @@ def impulse_test(
 def impulse_growth(
     process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int = 1
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return growth and clipping, (nsim,) each, after an impulse on every handle, for even or varying timing.
+    """Return growth and clipping, (nsim,) each, after an impulse on every handle, for constant or varying timing.
 
     `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
     the second: inf where numbers overflow, -inf at exact rest. Without force limits it does not depend on the size of

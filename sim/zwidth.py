@@ -137,7 +137,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), with walls touched and left; inf if refused or without bound."""
+        """Return required over available damping (n,), for contacts that make and break; inf: refused or unbounded."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)

@@ -140,7 +140,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
     assert report["run"]["timing"]["period_s"] == pytest.approx({"least": 0.8e-3, "mean": 1.1e-3, "largest": 1.4e-3})
     assert needs(report, "this-environment")["certified"]
     assert report["stability"]["verdict"] == "stable"
-    assert "even periods" in report["stability"]["reason"]
+    assert "constant periods" in report["stability"]["reason"]
     assert report["error"]["position_relative_rms"] < 1e-11
     assert "0.8 to 1.4 ms long, recorded" in capsys.readouterr().out
 
