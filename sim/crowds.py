@@ -352,7 +352,7 @@ def _traced(
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
 ) -> ImpulseTest:
-    """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are the other's.
+    """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are those of `other`.
 
     Periods are constant, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
     """

@@ -124,7 +124,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
-            seconds = f"each sample is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
+            seconds = f"each sample is a state, and the eigenvalues would take about {1e-8 * total**3:.0f} s"
             raise ValueError(f"{many}: {seconds}; a longer T has fewer samples for the same delay")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:

@@ -119,7 +119,7 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """Per condition: a multiplier (m,) that serves every coupling or None; why the loop is not covered or None."""
+        """For each condition, a multiplier (m,) for all couplings or None, and why the loop is not covered or None."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
