@@ -65,8 +65,8 @@ def position_error(
     if linear == n:
         return PositionError(relative, largest)
     until = f"the unstable run first clips at t = {linear * simulation.scenario.T:.3f} s"
-    reason = f"{until}; the relative rms until then is {relative:.1e}, and growth multiplies any difference"
-    return PositionError(reason=reason)
+    before = f"; the relative rms until then is {relative:.1e}" if relative is not None else ""
+    return PositionError(reason=f"{until}{before}, and growth multiplies any difference")
 
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
@@ -178,7 +178,7 @@ def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
     low, mid, high = level[peak - 1 : peak + 2]
     curvature = low - 2 * mid + high
     shift = 0.5 * (low - high) / curvature if curvature else 0.0
-    return float(force.std()), float((peak + shift) / (force.size * trace.t[1]))
+    return float(force.std()), float((peak + shift) / (force.size * (trace.t[1] - trace.t[0])))
 
 
 def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps: int | None) -> tuple[Trace, float]:

@@ -125,7 +125,7 @@ class Trace(ReadOnly):
             return None
         window = np.hanning(tail.shape[0])[:, None]
         spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
-        frequency = np.fft.rfftfreq(tail.shape[0], float(self.t[1]))
+        frequency = np.fft.rfftfreq(tail.shape[0], float(self.t[1] - self.t[0]))
         spectrum[frequency < 10.0] = 0.0
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 

@@ -10,9 +10,10 @@ from haptic_loop.cli.accuracy import main
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim import accuracy as yardstick
-from haptic_loop.sim.accuracy import Row, _with_front, credible
+from haptic_loop.sim.accuracy import Row, _with_front, credible, position_error
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.trace import Trace
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +74,23 @@ def test_runs_say_when_they_stop_being_credible():
     rigid = assemble(scenario.replace(device=(RigidDevice(), RigidDevice())), NoCoupling())
     part = credible(rigid, run(rigid, "exact", ticks=100))
     assert (part.transmission_force_n, part.until_s) == ([None] * 2, None)
+
+
+def test_a_run_that_clips_at_once_has_no_error():
+    """The tip begins 20 mm inside a stiff wall, so the first force is beyond the limit."""
+    scenario = load("one-wall")
+    wall = msgspec.structs.replace(scenario.environment.walls[0], gap=-0.02, stiffness=3e4)
+    walls = msgspec.structs.replace(scenario.environment, walls=(wall,))
+    scenario = scenario.replace(environment=walls, theta=(0,), duration=0.1)
+    simulation = assemble(scenario, NoCoupling())
+    trace = run(simulation)
+    error = position_error(trace, trace, simulation, grows=True)
+    assert error.position_relative_rms is None
+    assert error.reason.startswith("the unstable run first clips at t = 0.000 s, and growth")
+
+
+def test_a_dominant_frequency_ignores_the_first_time():
+    t = 1e-3 * np.arange(1000)
+    f, none = np.sin(2 * np.pi * 50 * t)[:, None], np.zeros((1000, 1))
+    rates = [Trace(t + begin, none, f, none, none, none, {}).dominant_frequency_hz() for begin in (0.0, 5.0)]
+    assert rates == pytest.approx([50.0, 50.0], abs=4.0)  # a line is 4 Hz wide
