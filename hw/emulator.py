@@ -73,7 +73,7 @@ _DEVICE = {
     "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
-    "cross": ("share of motor 1's force that motor 2 adds to its own; not with --latch arrival", -1.0, 1.0, 1.0),
+    "cross": ("share of motor 1's force that motor 2 adds to its own", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: faults of one axis of the device: kind -> (meaning, minimum, maximum and default of VALUE)
@@ -323,7 +323,13 @@ class Emulator:
         self.device.receive(data, now)
         if self._rest and self.device.applied != before:
             self._move(now)
-            self.applied = np.array(self.device.applied) * self.force_step * self._motor
+            self.applied = self._motor_forces(self.device.applied)
+
+    def _motor_forces(self, steps: tuple[int, ...]) -> Array:
+        """Return the forces (m,) [N] that the motors make of latched forces, with the faults of the motors."""
+        forces = np.array(steps) * self.force_step * self._motor
+        forces[1:2] += self._crossed * forces[0]
+        return forces
 
     def _move(self, now: float) -> None:
         """Advance the plant to `now` [us] within the current tick."""
@@ -351,8 +357,7 @@ class Emulator:
         if self.device.phase in RUNNING and self.armed_at is None:
             self.armed_at = now
         self._wake_person()
-        self.applied = np.array(steps) * self.force_step * self._motor
-        self.applied[1:2] += self._crossed * self.applied[0]
+        self.applied = self._motor_forces(steps)
         return b"" if self.unplugged else data
 
     def advance(self) -> None:

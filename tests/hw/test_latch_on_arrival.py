@@ -12,7 +12,7 @@ from haptic_loop.cli.bridge import _overlong_tick
 from haptic_loop.cli.bridge import main as bridge
 from haptic_loop.cli.replay import main as replay
 from haptic_loop.hw.control import certified_couplings, timed
-from haptic_loop.hw.emulator import Emulator
+from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import SafetyStop
 from haptic_loop.hw.recording import Recorder
@@ -26,8 +26,12 @@ LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] of an emulated link
 
 
-def test_the_last_force_holds_until_the_answer():
-    """The trace's positions, again, from its forces alone, by exponentials before and after each latch."""
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_the_last_force_holds_until_the_answer(share):
+    """The trace's positions, again, from its forces alone, by exponentials before and after each latch.
+
+    Motor 2 adds a share of force 1 to its own, which is too small for the test at arming.
+    """
     session = session_for(LAB, LinkSettings(measure=60))
     session.record = recorder = Recorder(2)
 
@@ -36,8 +40,9 @@ def test_the_last_force_holds_until_the_answer():
         assert met.latency == ((pytest.approx(30e-6), pytest.approx(230e-6)),) * 2
         return certified_couplings(met, "I", None, None, link, spare=0)
 
-    emulator = Emulator(LAB)
-    rehearsal = Rehearsal(session, emulator, plan)
+    faults = (FaultInjection.parse(f"cross={share}"),)
+    emulator = Emulator(LAB, faults)
+    rehearsal = Rehearsal(session, emulator, plan, faults)
     rehearsal.run_until_armed(1.4)
     assert session.stage == Stage.ARMED
     assert session.config.theta == 0
@@ -49,7 +54,7 @@ def test_the_last_force_holds_until_the_answer():
     whole = np.zeros((n + w + 2, n + w + 2))
     whole[:n, :n], whole[:n, n:] = P.A, P.B
     early, later = expm(whole * 1e-6 * TAU)[:n], expm(whole * (T - 1e-6 * TAU))[:n]
-    applied = link["applied"] * emulator.force_step
+    applied = link["applied"] * emulator.force_step @ np.array([[1.0, share], [0.0, 1.0]])
     assert abs(applied).max() > 0.2
     first = int(np.argmax(link["tick"] == emulator.begun_at))
     pushed = np.zeros((len(applied), w))
@@ -63,6 +68,17 @@ def test_the_last_force_holds_until_the_answer():
     counts = LAB.device[0].encoder_step or 1e-12 * emulator.info.encoder_step[0]
     apart = abs(np.array(places) - link["x"][:-1])
     assert apart.max() < 0.51 * counts
+
+
+def test_coupled_motors_are_found_at_arming():
+    def plan(ages):
+        met, link = timed(LAB, ages, 0.99, 100.0, at_once=True)
+        return certified_couplings(met, "I", None, None, link, spare=0)
+
+    session, faults = session_for(LAB, LinkSettings(measure=60)), (FaultInjection.parse("cross=-1"),)
+    Rehearsal(session, Emulator(LAB, faults), plan, faults).run_until_armed(1.0)
+    assert session.stage == Stage.STOPPED
+    assert "moves encoder 2, too" in session.cause
 
 
 def test_a_link_slower_than_a_period_is_refused():
