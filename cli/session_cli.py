@@ -328,7 +328,7 @@ def _rehearsed(
 ) -> _Held:
     """Run the session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
-    with options.refused("the scenario cannot stand behind a serial link: "):
+    with options.refused("the scenario cannot run behind a serial link: "):
         emulator = Emulator(axis_by_axis(alone or options.scenario_from(args)), faults, coulomb=coulomb)
     with progress("rehearsing") as move:
 

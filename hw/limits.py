@@ -32,9 +32,9 @@ from haptic_loop.sim.scenario import Scenario
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
 _COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
-_LARGEST_MARGIN_US = 30_000  # largest margin in a STATE, an i16 in microseconds from which ages are computed
+_LARGEST_MARGIN_US = 30_000  # largest margin in a measurement; the field of STATE, an i16, carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
-_HOLD, _RAMP_US = 4, 5000  # A device without new forces holds the last one for these ticks, then ramps to zero [us].
+_HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last one; its ramp to zero [us]
 
 
 class Stage(StrEnum):
@@ -87,7 +87,7 @@ class SafetyLimits:
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
-    vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole
+    vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector whose length is limited
     lever: float = 1.0  # [m] radius of the hand on a rotary device, which scales the limits; else 1
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class SafetyLimits:
         T: float,
         test: Sequence[float] | None = None,
     ) -> _Shaped:
-        """Return the force to send for `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
+        """Shape `asked` (m,) [N], at a gain within [0, 1], into a force that may be sent after `previous` (m,) [N].
 
         A vector that is capped keeps its direction. A vector with an axis above the slew rate moves straight towards
         its goal, with its fastest axis at the slew rate.
@@ -363,7 +363,7 @@ def probe_delay(T: float) -> int:
 
 
 def watchdog_for(T: float) -> int:
-    """Return the longest silence [us] of a device that ticks every T [s]: five ticks, but at least 6 ms for busy hosts.
+    """Return the allowed silence [us] of a device that ticks every T [s]: five ticks, but at least 6 ms for busy hosts.
 
     Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a device may push without a new force.
     """

@@ -28,7 +28,7 @@ from haptic_loop.sim.scenario import Scenario
 _STATES_PER_ANSWER = 8  # most STATEs per measured age: of several FORCEs in a USB frame, only one margin is reported
 _INFERRED = 0.005  # largest share of inferred ages: half of the 1 % that the default quantile leaves out
 _MEASURED_TOLERANCE = 0.01  # largest relative difference between the device's mean tick and T
-_UNTOLD = 0.9  # largest share of STATEs without a margin, of which USB frames with several FORCEs cause some
+_UNTOLD = 0.9  # largest share of STATEs without a margin; USB frames that carry several FORCEs cause some
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
 _BLOCK = 200  # ticks over which a clock is compared
 _CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of the device
@@ -51,7 +51,7 @@ _STRONG = 2  # first block of the test at the end of a session
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
-_FORGETTING = 8  # right ticks that cancel one wrong tick; wrong ticks that come more often stop a session, too
+_FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops if wrong ticks stay more frequent
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Ages:
     ticks: tuple[int, ...] = ()  # [us] lengths of the device's ticks by its own clock
 
     def longest_tick(self, T_us: float, q: float = 1.0) -> float:
-        """Return the quantile q of the tick lengths [us], or T unless that is longer by more than the clock's error."""
+        """Return the quantile q of the tick lengths [us], or T unless it exceeds T by more than the clock's error."""
         ordered = sorted(self.ticks)
         longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(longest) if longest > T_us + _CLOCK_US else T_us
@@ -345,7 +345,7 @@ class LinkMonitor:
             raise SafetyStop(f"no STATE in {part}: the device's forces are unknown")
         if self._untold / window > _UNTOLD:
             raise SafetyStop(
-                f"{100 * _UNTOLD:g} % of the last {window} STATEs may lack a margin, more do: their lateness is unknown"
+                f"more than {100 * _UNTOLD:g} % of the last {window} STATEs lack a margin: their lateness is unknown"
             )
         if late > self.settings.late:
             return f"{100 * late:.0f} % of the last {window} answers were late"

@@ -43,7 +43,7 @@ class Cause(IntEnum):
     HOST = 1  # a STOP from the host
     WATCHDOG = 2  # more than `hold` ticks in a row without a FORCE
     COMMAND = 3  # a FORCE with IDLE while armed
-    DEVICE = 4  # the firmware found a fault of its own
+    DEVICE = 4  # the firmware called hl_fault
     ESTOP_DEVICE = 5  # the emergency stop at the device
     ESTOP_HOST = 6  # a STOP with reason ESTOP
 

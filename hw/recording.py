@@ -61,9 +61,9 @@ class Recorder:
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
-        """Return rows [first, stop) with a linear loop, for each arming with full gain: before cap, slew or budget act.
+        """Return rows [first, stop) of each arming, from full gain to the first cut by cap, slew rate or budget.
 
-        Missed ticks are included. `force_step` is (m,) [N].
+        In these rows the loop is linear. Missed ticks are included. `force_step` is (m,) [N].
         """
         link = self.link()
         wanted = -np.round(link["asked"] / np.array(force_step))
@@ -80,9 +80,8 @@ class Recorder:
         """Return a trace in the form of sim.run. Handles and external forces are not measured (nan, or no column)."""
         link = self.link()
         n, m = len(self), self.channels
-        last = np.maximum.accumulate(
-            np.where(link["received"], np.arange(n), 0)
-        )  # a force is held until the next is known
+        # a missing force counts as held: each row without a STATE repeats the last known force
+        last = np.maximum.accumulate(np.where(link["received"], np.arange(n), 0))
         f = -link["applied"][last] * np.array(units.force_step)
         unknown = np.full((n, m), np.nan)
         t = np.arange(n, dtype=float) * T

@@ -1,7 +1,7 @@
 """Run a whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
 
 Nothing waits in real time, and all random numbers have a seed. A session of some seconds takes less than one second
-beside the design of its couplings, and repeats exactly.
+in addition to the design of its couplings, and repeats exactly.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class _Cable:
 
 @dataclass(frozen=True)
 class _Further:
-    """One more emulated board of a rehearsal, with a clock of its own (hw/boards.py)."""
+    """One more emulated board of a rehearsal, with its own clock (hw/boards.py)."""
 
     emulator: Emulator
     clock: float = 1.0  # length of a tick as a multiple of T
@@ -288,7 +288,7 @@ class Rehearsed:
         result: A Trace with t, x and f of every tick from arming on; handles are not measured. None if the session was
             never armed.
         zero_after: The time from the request to stop until all motors stay at zero [s], including the last test of
-            the motors; None where forces never acted, or do not stop.
+            the motors; None if the device was never armed, or forces do not stop.
     """
 
     stage: str
@@ -356,7 +356,7 @@ def rehearse(
     try:
         emulator = Emulator(scenario)
     except ValueError as error:
-        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
+        raise InputError(f"the scenario cannot run behind a serial link: {error}") from None
     rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[stop])
     rehearsal.run_to_the_end(seconds + _LONGEST)
     outcome(case, session, recorder, 0)  # changes a finished session with doubtful forces to a stopped one

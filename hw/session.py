@@ -3,8 +3,8 @@
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
 
-Every other end is a stage of its own with a cause in the log: refused, stopped, lost, e-stop. A session that has ended
-never arms again. It only repeats its STOP until the device rests, for 50 ms to a silent one.
+Every other end has its own stage (refused, stopped, lost, e-stop) and a cause in the log. A session that has ended
+never arms again. It only repeats its STOP until the device rests, or for 50 ms to a silent device.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 _PATIENCE_US = 2_000_000  # longest wait for the answer to HELLO or CONFIG
 _ARMING_US = 600_000  # time per axis in which the device must arm and its encoders must pass their test
-_QUIET_US = 1_000_000  # longest silence of a device while no force acts; none during the design
+_QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimited during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
 _ELSEWHERE = 5e-3  # [m] least motion after which a handle counts as moved to another place
@@ -156,8 +156,8 @@ class Session:
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
         """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
-        After the ramp the motors are tested once more, if encoders are tested. Without that test a session that was
-        armed ends as stopped: where the user `let_go` of the deadman, and before forces act or after they have ended.
+        After the ramp the motors are tested once more, if the settings request encoder tests. A session that was armed
+        ends as stopped if this test is impossible: the user `let_go` of the deadman, or no force acts at the moment.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:

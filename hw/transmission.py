@@ -53,7 +53,7 @@ class _Joint:
     """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay, 0].
 
     m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
-    is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model calls b d, and delta b.
+    is the motor's damping, and the forces have a lag and a delay [s]. In Spectra.model, b is called d, and delta b.
     """
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:
@@ -66,6 +66,7 @@ class _Joint:
         return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
 
     def fitted(self, start: Array, keep: Sequence[NDArray[np.bool_]]) -> Array:
+        """Return p without its last entry, fitted from `start` to the frequencies `keep` of each record."""
         import scipy
 
         def error(p: Array) -> Array:

@@ -168,7 +168,7 @@ class Live(Driver):
         self._watched = 0
 
     def run(self) -> Session:
-        """Run the session from HELLO to its end. After any exception the device is stopped first."""
+        """Run the session from HELLO to its end. Stop the device before an exception is raised again."""
         session = self.session
         with _signals(self.signals), _no_collections():
             try:

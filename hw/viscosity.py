@@ -34,7 +34,7 @@ from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 _FAST = 0.25  # a stroke counts if it reaches this share of the highest speed: dry friction is saturated
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
-#: [s] time constants of a memory; a shorter one counts as damping: an encoder of 5 um at 0.25 kg does not show 1 ms
+#: [s] time constants of a memory; a shorter memory counts as damping: encoders of 5 um at 0.25 kg do not show 1 ms
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, 1 N causes less motion than an encoder of 5 um resolves
 _LOUD = 0.05  # least force at a frequency, as a share of the strongest in the band

@@ -5,7 +5,7 @@
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
  *   ha_home   call while the handles stand at their reference; no force acts before
- *   ha_arm    tests each axis, whose handle nobody holds, by a small force; then raises the gain
+ *   ha_arm    tests each axis by a small force while nobody holds its handle; then raises the gain
  *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN, HA_DEAD), or drops the force at once (every other cause, and during a test)
  *   ha_tick   call once per period; it computes the forces for the next period
  */
@@ -26,7 +26,7 @@ typedef HA_REAL ha_real;
 #define HA_TEST_MAX 0.8f /* [N] test force in the last block, or half the cap if that is less */
 #define HA_SWING 0.03f   /* [s] between two changes of the test force's sign */
 #define HA_BLOCKS 4      /* blocks of four swings; each is twice as strong as the one before */
-#define HA_DEGREE 5      /* of the polynomial that is subtracted from a motion: gravity, drift and the user's hand */
+#define HA_DEGREE 5      /* degree of the polynomial subtracted from a motion to remove gravity, drift and the hand */
 #define HA_FIT 0.8f      /* least share of a motion's sum of squares with the shape of a free mass's answer */
 #define HA_REST 0.1f     /* [s] window without forces in which the noise of the sensors is measured */
 #define HA_PRESSING 0.3f /* [N] a sensor that stands still for HA_PRESSED [s] under a larger force is dead */
@@ -53,8 +53,8 @@ typedef struct { /* the test of one axis: sums over the ticks of a block */
     uint16_t tick;
     uint8_t block;
     ha_real acting;              /* [N] force since the last tick */
-    ha_real velocity, path, from; /* velocity [N s] and path [N s2] of a mass of 1 under this force; position [m] at first */
-    ha_real paths, moves, both;  /* sums of squares of path and motion, and of their product */
+    ha_real velocity, path, from; /* the force integrated once [N s] and twice [N s2]; position [m] at the start */
+    ha_real paths, moves, both;  /* sums of path squared, motion squared, and path times motion */
     ha_real path_in[HA_DEGREE + 1], move_in[HA_DEGREE + 1]; /* sums of products with the orthogonal polynomials */
 } ha_answer;
 

@@ -187,7 +187,7 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
         silent += 1
     assert silent == 181
     assert session.stage == Stage.STOPPED
-    assert session.cause == "90 % of the last 200 STATEs may lack a margin, more do: their lateness is unknown"
+    assert session.cause == "more than 90 % of the last 200 STATEs lack a margin: their lateness is unknown"
 
 
 def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
