@@ -5,11 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import cache, wraps
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -136,9 +140,29 @@ def _blas() -> ThreadpoolController:
     thread anyway.
     """
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        import scipy.linalg  # noqa: F401
-
+        compiled("scipy.linalg._flapack")
     return ThreadpoolController()
+
+
+def compiled(name: str) -> Any:
+    """Return a compiled module of SciPy, such as "scipy.linalg._flapack", without the Python code of its package.
+
+    The import of scipy.linalg takes 0.35 s, that of scipy.optimize as much again; a compiled module takes 0.01 s.
+
+    Raises:
+        ImportError: SciPy has no such module.
+    """
+    if name in sys.modules:
+        return sys.modules[name]
+    import scipy
+
+    folder = Path(scipy.__path__[0], *name.split(".")[1:-1])
+    spec = PathFinder.find_spec(name, [str(folder)])
+    if spec is None or spec.loader is None:
+        raise ImportError(f"SciPy {scipy.__version__} has no module {name}", name=name)
+    sys.modules[name] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 _ZERO, _ONE = Fraction(0), Fraction(1)

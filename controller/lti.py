@@ -28,6 +28,7 @@ from haptic_loop.controller.arithmetic import (
     Array,
     Number,
     SingularLoop,
+    compiled,
     eye,
     fractions,
     inverse,
@@ -475,9 +476,12 @@ class Lti(ReadOnly):
 
 
 def _schur_form(A: Array) -> tuple[Complex, Complex]:
-    import scipy  # slow to load
-
-    S, U, *_ = scipy.linalg.schur(A, output="complex")
+    """Return S, U with A = U S U^H, as scipy.linalg.schur(A, "complex") does. Raises LinAlgError."""
+    gees, entries = compiled("scipy.linalg._flapack").zgees, np.asarray_chkfinite(A, np.complex128)
+    size = int(gees(lambda pole: None, entries, lwork=-1)[-2][0].real)
+    S, *_, U, _, fault = gees(lambda pole: None, entries, lwork=size, sort_t=0)
+    if fault:
+        raise np.linalg.LinAlgError("the Schur form did not converge")
     return S, U
 
 

@@ -11,18 +11,15 @@ known devices is not affine in its multiplier; `KnownDeviceLoop` computes it ane
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec, module_from_spec
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from haptic_loop.controller.arithmetic import compiled
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -263,36 +260,49 @@ class SampledLoop:
         """Return x after at most `most` steps towards a local optimum."""
         m = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
-        condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
-        slope, problem = self.square_mismatch_slope, {"bounds": bounds, "constraints": condition}
-        return _slsqp()(self.square_mismatch, x, jac=slope, **problem, maxiter=most, ftol=1e-7).x
+        objective, constraint = (self.square_mismatch, self.square_mismatch_slope), (self.room, self.room_slope)
+        return _slsqp(objective, constraint, x, bounds, most, 1e-7)
 
 
-@cache
-def _slsqp() -> Callable[..., Any]:
-    """Import SLSQP without the other solvers of scipy.optimize, whose import takes half as long as a design.
+_Differentiable = tuple[Callable[[Array], Any], Callable[[Array], Any]]  # a function and its derivative
 
-    The module of SLSQP is private. If a release of SciPy has no such module, return the public function.
+
+def _slsqp(
+    objective: _Differentiable, constraint: _Differentiable, x: ArrayLike, bounds: Any, most: int, ftol: float
+) -> Array:
+    """Return x (n,) after at most `most` steps of SLSQP: least objective where constraint(x) (m,) >= 0.
+
+    In SciPy 1.17 this is the loop of `minimize` over the compiled routine, whose state and workspace are private to a
+    release. The import of scipy.optimize would take a third of a design. Other releases get the public function.
     """
-    name = "scipy.optimize"
-    spec = None if name in sys.modules else find_spec(name)
-    if spec:
-        sys.modules[name] = module_from_spec(spec)  # an empty package, so that its __init__ is not run
-    try:
-        return import_module(f"{name}._slsqp_py")._minimize_slsqp
-    except (ImportError, AttributeError):
-        sys.modules.pop(name, None)
-        return _public_slsqp
-    finally:
-        if spec:
-            sys.modules.pop(name, None)
+    import scipy  # slow to load
 
-
-def _public_slsqp(f: Any, x: Array, *, maxiter: int, ftol: float, **problem: Any) -> Any:
-    """Call `scipy.optimize.minimize` with the arguments of the private SLSQP function."""
-    from scipy.optimize import minimize
-
-    return minimize(f, x, method="SLSQP", options={"maxiter": maxiter, "ftol": ftol}, **problem)
+    (f, slope), (room, room_slope) = objective, constraint
+    if not scipy.__version__.startswith("1.17."):
+        condition, options = {"type": "ineq", "fun": room, "jac": room_slope}, {"maxiter": most, "ftol": ftol}
+        optimum = scipy.optimize.minimize(
+            f, x, jac=slope, bounds=bounds, constraints=condition, method="SLSQP", options=options
+        )
+        return optimum.x
+    step = compiled("scipy.optimize._slsqplib").slsqp
+    low, high = (np.array(each, dtype=float) for each in zip(*bounds, strict=True))
+    x = np.clip(np.asarray(x, dtype=float), low, high)
+    value, gradient, rooms = f(x), slope(x), np.array(room(x), dtype=float)
+    normals = np.array(room_slope(x), dtype=float, order="F")
+    m, n = normals.shape
+    state = dict.fromkeys(("alpha", "f0", "gs", "h1", "h2", "h3", "h4", "t", "t0"), 0.0)
+    state |= dict.fromkeys(("exact", "inconsistent", "reset", "iter", "line", "meq", "mode"), 0)
+    state |= {"acc": ftol, "tol": 10 * ftol, "itermax": most, "m": m, "n": n}
+    multipliers, indices = np.zeros(m + 2 * n + 2), np.zeros(m + 2 * n + 2, dtype=np.int32)
+    buffer = np.zeros(n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28)
+    while True:
+        step(state, value, gradient, normals, rooms, x, multipliers, low, high, buffer, indices)
+        if state["mode"] == 1:
+            value, rooms[:] = f(x), room(x)
+        elif state["mode"] == -1:
+            gradient, normals[:] = slope(x), room_slope(x)
+        else:
+            return x
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from haptic_loop.controller import lti
 from haptic_loop.controller.arithmetic import SingularLoop, times
 from haptic_loop.controller.coupling import ForceFilter
 from haptic_loop.controller.delay import delay
@@ -264,3 +265,15 @@ def test_chains_of_slow_poles_keep_their_digits():
     z = np.exp(1j * np.geomspace(1e-5, np.pi, 100))
     product = chain.around(Sampled.of(oscillator, z[None])).G[0]
     np.testing.assert_allclose(chain.around(oscillator).at(z), product, rtol=0, atol=2e-12 * np.abs(product).max())
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 30])
+def test_schur_forms_are_unitary_and_triangular(n):
+    """Rounding is at most a small multiple of n eps (Golub and Van Loan, 7.5.6); a NaN is refused, not iterated."""
+    A = np.random.default_rng(n).standard_normal((n, n))
+    S, U = lti._schur_form(A)
+    assert not np.tril(S, -1).any()
+    assert np.abs(U @ U.conj().T - np.eye(n)).max() < 20 * n * np.finfo(float).eps
+    assert np.abs(U @ S @ U.conj().T - A).max() < 20 * n * np.finfo(float).eps * np.linalg.norm(A)
+    with pytest.raises(ValueError, match="infs or NaNs"):
+        lti._schur_form(A * np.nan)

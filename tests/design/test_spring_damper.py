@@ -1,16 +1,15 @@
 """The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
 
 import re
-import subprocess
-import sys
 
 import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
+import scipy
 from analysis import analysis, solve
 from asked import any_environment, this_environment
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize, rosen, rosen_der
 from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from haptic_loop.controller.coupling import SpringDamper
@@ -349,34 +348,15 @@ def test_limits_help_no_loop_that_fails_without() -> None:
     assert not limited
 
 
-def test_slsqp_alone_is_that_of_scipy():
-    """The optimum of a function of Rosenbrock's inside a disc is equal bit for bit."""
-    code = """
-import sys
-from haptic_loop.design.gain_search import _slsqp
-
-alone = _slsqp()
-assert "scipy.optimize" not in sys.modules
-from scipy.optimize import minimize, rosen, rosen_der
-
-disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
-problem = {"jac": rosen_der, "bounds": [(-1.5, 0.9)] * 2, "constraints": disc}
-found = minimize(rosen, [-1.0, 1.0], method="SLSQP", **problem)
-assert found.success
-assert list(alone(rosen, [-1.0, 1.0], **problem).x) == list(found.x)
-"""
-    renamed = """
-import sys
-sys.modules["scipy.optimize._slsqp_py"] = None
-from haptic_loop.design.gain_search import _slsqp
-
-own = _slsqp()
-del sys.modules["scipy.optimize._slsqp_py"]
-from scipy.optimize import minimize, rosen, rosen_der
-
-public = own(rosen, [-1.0, 1.0], jac=rosen_der, maxiter=7, ftol=1e-7).x
-options = {"maxiter": 7, "ftol": 1e-7}
-assert list(public) == list(minimize(rosen, [-1.0, 1.0], jac=rosen_der, method="SLSQP", options=options).x)
-"""
-    for each in (code, renamed):
-        subprocess.run([sys.executable, "-c", each], check=True)
+@pytest.mark.parametrize("steps", [7, 100])
+@pytest.mark.parametrize("release", [scipy.__version__, "1.15.0"])
+def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
+    """The optimum of Rosenbrock's function inside a disc is equal bit for bit, by the public function, too."""
+    disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
+    bounds, options = [(-1.5, 0.9)] * 2, {"maxiter": steps, "ftol": 1e-7}
+    start = [-1.6, 1.0]  # outside the bounds
+    public = minimize(rosen, start, jac=rosen_der, method="SLSQP", bounds=bounds, constraints=disc, options=options)
+    assert public.success is (steps > 7)
+    monkeypatch.setattr(scipy, "__version__", release)
+    own = gain_search._slsqp((rosen, rosen_der), (disc["fun"], disc["jac"]), start, bounds, steps, 1e-7)
+    assert own.tolist() == public.x.tolist()
