@@ -96,6 +96,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
+_SMOOTH = 0.1  # A larger step of the ratio beyond the edge may be a jump, where a secant says nothing.
 _NOT_CERTIFIED = "not certified, so there are no margins"
 
 
@@ -239,46 +240,39 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """Return an argument at which the damping suffices, as near to `outside` as possible (relative accuracy _EDGE)."""
+    """Return an argument at which the damping suffices, within _EDGE of the edge towards `outside`, relative to itself.
+
+    The distance to the edge is that between the two nearest arguments on its sides, or an estimate by their secant. The
+    steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28,
+    1997). They aim half of _EDGE inside the edge, so that the last one is mostly the result. Five values of `ratio`
+    take less time than importing scipy.optimize.brentq.
+    """
     if suffices(ratio(outside)):
         return outside
 
     def above(x: float) -> float:
         return float(np.clip(math.log(max(ratio(x), 1e-9) / (1 - GUARD)), -3, 3))
 
-    root = _crossing(above, inside, outside)
-    for back in _EDGE * 4.0 ** np.arange(12):
-        x = root + back * (inside - root)
-        if suffices(ratio(x)):
-            return float(x)
-    return inside
-
-
-def _crossing(f: Callable[[float], float], inside: float, outside: float) -> float:
-    """Return the root of `f`, to an error of 2 _EDGE (|root| + |inside|).
-
-    The steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software
-    28, 1997). About ten values of `f` take less time than importing scipy.optimize.brentq.
-    """
     a, b = outside, inside
-    fa, fb = f(a), f(b)
-    share = 0.5
+    fa, fb = above(a), above(b)
+    share = min(0.9, max(0.1, fa / (fa - fb)))
     while True:
         x = a + share * (b - a)
-        fx = f(x)
-        if fx * fa > 0:
+        fx = above(x)
+        if (fx < 0) == (fa < 0):
             c, fc = a, fa
         else:
             c, fc, b, fb = b, fb, a, fa
         a, fa = x, fx
-        best = a if abs(fa) < abs(fb) else b
-        least = _EDGE * (abs(best) + abs(inside)) / abs(b - a)
-        if least > 0.5 or not fa:
-            return best
+        least = _EDGE * abs(a if fa < 0 else b) / abs(b - a)
+        distance = min(fa, fb) / (min(fa, fb) - max(fa, fb)) if max(fa, fb) < _SMOOTH else 1.0
+        if distance <= least:
+            return a if fa < 0 else b
         place, level, share = (a - b) / (c - b), (fa - fb) / (fc - fb), 0.5
         if 1 - math.sqrt(1 - place) < level < math.sqrt(place):
             share = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-        share = min(1 - least, max(least, share))
+        share += math.copysign(least / 2, fa)
+        share = min(1 - least / 2, max(least / 2, share))
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -22,7 +23,7 @@ from haptic_loop.design.api import certify
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, _remedies, audit, edge, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
-from haptic_loop.design.result import ANY, CAVEATS
+from haptic_loop.design.result import ANY, CAVEATS, GUARD, suffices
 from tests.asked import needs, safe_with
 
 CONDITIONS = ("this-environment", "any-environment")
@@ -274,6 +275,29 @@ def test_edge_takes_the_certified_side():
     assert edge(lambda x: x, 0.5, 2.0) == pytest.approx(1, rel=1e-6)
     assert edge(lambda x: 0.9, 0.5, 2.0) == 2.0
     assert edge(lambda x: 0.5 if x < 1.3 else np.inf, 1.0, 2.0) == pytest.approx(1.3, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "inverse", "inside", "outside"),
+    [
+        (lambda x: 0.4 + x, lambda r: r - 0.4, 1e-9, 1.0),
+        (lambda x: x**0.5, lambda r: r**2, 0.5, 2.0),
+        (lambda x: x + x**3 / 2, lambda r: np.roots([0.5, 0, 1, -r])[-1].real, 0.1, 2.0),
+        (lambda x: 1 / x, lambda r: 1 / r, 3.0, 0.5),
+    ],
+)
+def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside):
+    """The edge is exact to 1e-7. Bisection would take 24 values, and brentq on the way to 1e-12 about ten."""
+    values = []
+
+    def swept(x):
+        values.append(x)
+        return ratio(x)
+
+    at, last = edge(cache(swept), inside, outside), inverse(1 - GUARD)
+    assert suffices(ratio(at))
+    assert abs(at - last) <= 1e-7 * last
+    assert len(values) <= 8
 
 
 @pytest.mark.parametrize(
