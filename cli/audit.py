@@ -22,7 +22,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 if TYPE_CHECKING:
     from haptic_loop.design.audit import Audit, Help, Margins
     from haptic_loop.design.coverage import SwitchingFigures
-    from haptic_loop.sim.report import EncoderSteps
+    from haptic_loop.sim.couplings import EncoderSteps
 
 _EXAMPLES = (
     "python -m design.audit --K 2870,2320 --B 5.47,5.55",
@@ -58,8 +58,7 @@ def main(argv: list[str]) -> int:
     from haptic_loop.design.audit import audit
     from haptic_loop.design.certificate import named
     from haptic_loop.design.designs import name_and_own
-    from haptic_loop.sim.couplings import from_file, read_coupling
-    from haptic_loop.sim.report import encoder_steps
+    from haptic_loop.sim.couplings import encoder_steps, from_file, read_coupling
 
     if args.devices:
         extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from haptic_loop.cli import render
 from haptic_loop.controller.environment import RIGID_WALL, Environment
@@ -14,11 +13,8 @@ from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
 from haptic_loop.design.robustness import Robustness
 from haptic_loop.design.transparency import BAND_HZ
-from haptic_loop.sim.couplings import assessed, choose
+from haptic_loop.sim.couplings import EncoderSteps, assessed, choose
 from haptic_loop.sim.scenario import Scenario
-
-if TYPE_CHECKING:
-    from haptic_loop.sim.report import EncoderSteps  # loads the simulation
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
 from haptic_loop.controller.environment import Environment
@@ -13,7 +15,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.api import COUPLING, bare, certified_for, fitting
 from haptic_loop.design.assessment import Assessment, PluggedEnvironment, assess, shelled
 from haptic_loop.design.certificate import verify
-from haptic_loop.design.conditions import Condition
+from haptic_loop.design.conditions import Condition, encoder_friction
 from haptic_loop.design.coupling_file import Stored, load
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT
@@ -249,3 +251,68 @@ def assessed(
     if scenario.loses_packets and assessment.guarantee and not budgeted:
         return assessment.without_guarantee("a lost packet makes a force older than the range of delays")
     return assessment
+
+
+# ----------------------------------------------------------------------------------------------------
+# Encoder steps under the devices' Coulomb friction.
+
+
+@dataclass(frozen=True)
+class EncoderSteps:
+    """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
+
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, where nothing is proved
+    covered: bool
+    words: str
+
+    @classmethod
+    def of(
+        cls,
+        loop: Loop,
+        coupling: Coupling,
+        steps: Sequence[float],
+        friction: Sequence[float],
+        friction_max: Sequence[float | None] | None = None,
+    ) -> EncoderSteps | None:
+        """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
+
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing.
+        """
+        if not any(steps):
+            return None
+        widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+        published = tuple(friction_max or [None] * len(steps))
+        values = tuple(steps), tuple(friction), published
+        if loop.environment.walls:
+            return cls(*values, None, False, f"encoder steps of {widths} um: with walls no friction is proved enough")
+        needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
+        covered = bool((needed <= np.asarray(friction)).all())
+        amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
+        verdict = "are covered while forces stay below the limits" if covered else "are not covered"
+        if any(most is not None for most in published):
+            bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
+            has = f"at least {has} N (published: at most {bounds} N)"
+        else:
+            has += " N"
+        enough = f"friction of {amounts} N is enough for {widths} um, the axes have {has}"
+        return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
+
+
+def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
+    """Compare the devices' friction with that needed for encoder steps; None without steps, or for a singular loop."""
+    fields = ("encoder_step", "friction", "friction_max")
+    steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
+    friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
+    try:
+        return EncoderSteps.of(scenario.loop(case), coupling, steps, friction, most)
+    except ValueError:  # The algebraic loop has no solution, which the conditions report.
+        return None
+
+
+def _shared(scenario: Scenario) -> list[float]:
+    """Return the divisor of each channel's friction: sqrt(n) if one number is the friction of n axes together."""
+    counts = [1 if isinstance(d.friction, tuple) else len(d.free) for d in scenario.device]
+    return [count**0.5 for d, count in zip(scenario.device, counts, strict=True) for _ in d.free]

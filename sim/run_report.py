@@ -13,13 +13,12 @@ from haptic_loop.design.result import ANY, MAKING, Chosen
 from haptic_loop.design.robustness import Robustness
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun
+from haptic_loop.sim.couplings import EncoderSteps, encoder_steps
 from haptic_loop.sim.passivity_layer import idle
 from haptic_loop.sim.report import (
-    EncoderSteps,
     PaperRow,
     UnevenTicks,
     VaryingDelays,
-    encoder_steps,
     friction_left_out,
     switched_stability,
 )

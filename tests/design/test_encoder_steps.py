@@ -10,7 +10,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
-from haptic_loop.sim.report import EncoderSteps
+from haptic_loop.sim.couplings import EncoderSteps
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
