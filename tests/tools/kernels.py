@@ -5,8 +5,7 @@ test may pass on one of them only. Two more settings round differently, too: Num
 chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
-    python tests/tools/kernels.py --one           one foreign kernel, without the slow tests; the next commit takes the
-                                                  next kernel (for CI)
+    python tests/tools/kernels.py --one           one foreign kernel; the next commit takes the next (for CI)
     python tests/tools/kernels.py --only HASWELL  this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
@@ -88,13 +87,12 @@ def foreign(every: dict[str, dict[str, str]]) -> str:
     return others[int(count or 0) % len(others)] if others else "native"
 
 
-def tested(name: str, variables: dict[str, str], workers: int, slow: bool) -> tuple[int, int, int, float]:
+def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int, int, float]:
     """(passed, failed, skipped, seconds) of the numerical tests under a setting; the lines of failures are printed."""
     OUT.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     parallel = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"]
-    marked = [] if slow else ["-m", "not slow and not validate"]
-    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *marked, *TESTS]
+    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *TESTS]
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, **variables}
     path = OUT / f"{name.replace(' ', '-')}.txt"
     with path.open("w") as file:
@@ -118,7 +116,7 @@ def main() -> int:
         os.environ.pop(name, None)  # the native setting is what the processor chooses, whatever the caller has set
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="SETTING")
-    parser.add_argument("--one", action="store_true", help="one foreign kernel, no slow tests")
+    parser.add_argument("--one", action="store_true", help="one foreign kernel")
     parser.add_argument("--list", action="store_true", help="name the settings, run nothing")
     parser.add_argument("-n", type=int, default=os.cpu_count() or 1, help="tests at a time (default: one per core)")
     args = parser.parse_args()
@@ -129,7 +127,7 @@ def main() -> int:
     if args.list:
         print(*names, sep="\n")
         return 0
-    rows = [(name, *tested(name, every[name], args.n, not args.one)) for name in names]
+    rows = [(name, *tested(name, every[name], args.n)) for name in names]
     print(f"\n{'setting':16}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
     for name, passed, failed, skipped, seconds in rows:
         print(f"{name:16}{passed:8}{failed:8}{skipped:9}{seconds:9.0f}")
