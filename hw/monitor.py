@@ -557,7 +557,7 @@ class EncoderTest:
     small or late motion is a wrong one only where it has the shape of a free handle and not that of a handle in a hand
     as heavy as the device. The mode of a transmission makes these shapes differ; a rigid device has equal shapes. If an
     axis never moves as a free handle does, the session does not finish. Where it swings at the frequency of the force,
-    at any phase, the message blames the hand, because an axis with a dead motor does not swing.
+    at any phase, the message names a hand, too, because an axis with a dead motor does not swing.
     """
 
     def __init__(
@@ -700,8 +700,8 @@ class EncoderTest:
             tested = f"motor and encoder of axis {axis} are not tested"
             return f"the energy left allows {self._pushed:.2g} of {most:g} N: {tested}. Raise --energy-budget"
         if self._unknown_hands and self._swings:
-            held = f"the handle of axis {axis} was not let go at the end"
-            return f"{held}: its motor and encoder were not tested again"
+            free = f"axis {axis} did not move as a free handle does at the end of the session"
+            return f"{free}: a hand held it, or its motor or encoder is wrong"
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
