@@ -357,14 +357,16 @@ def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
         return "P is not symmetric"
     if _refuted_in_floating_point(G, P):
         return "the KYP matrix has a negative direction, beyond the error bound of floating point"
-    reason, diagonal = "P", [*np.diag(P.num), *np.diag(G.D)]
-    for bits, finer in _ACCURACIES if all(v > 0 for v in diagonal) else ():
+    if any(v <= 0 for v in np.diag(G.D)):
+        return "D + D' is not positive definite"
+    at_fault = "P"
+    for bits, finer in _ACCURACIES if all(v > 0 for v in np.diag(P.num)) else ():
         if _definite(_rounded(P, _halves(P), bits), bits):
-            reason = "the KYP matrix"
+            at_fault = "the KYP matrix"
             W, units = _kyp_matrix(G, P, bits, finer)
             if units < _MOST_UNITS and _definite(_less(W, math.ceil(units)), finer):
                 return None
-    return f"{reason} is not positive definite, or too close to singular for a proof"
+    return f"{at_fault} is not positive definite, or too close to singular for a proof"
 
 
 def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:

@@ -577,7 +577,7 @@ class _Search:
 
     def solved(self, least: float) -> Array:
         """Return the x of least share that satisfies all tangents. Raises DesignFailed if the solver finds none."""
-        sweep, m = self.sweep, self.m
+        sweep = self.sweep
         weights = np.where(self.inverse, 1 / least, 1.0)
         unit = np.concatenate([self.largest(least), weights, [least]])
         last = unit.size - 1
@@ -588,10 +588,11 @@ class _Search:
         for sign, ends in ((1, low / unit[:last]), (-1, -top / unit[:last])):
             rows = sign * np.eye(last, unit.size)[:, :, None, None].swapaxes(0, 1)
             blocks.append(Inequality(-ends[:, None, None], rows, range(unit.size)))
-        # c0 >= 0, with s in units of `least` and beta in units of the largest beta for that share, if c0 is 0 there. If
-        # c2 is 0 there, the inequality is tighter than c0 >= 0.
-        root = np.array([[0.0, 1.0], [1.0, 0.0]]) / _LARGEST_ETA
-        blocks += [Inequality.of(lambda y: np.diag([y[1], 1.0]) + y[0] * root, [i, last]) for i in range(m)]
+        # s >= `Sweep.floor`, with s in units of `least` and beta in units of the largest beta for that share.
+        floors = self.beta(unit) ** 2 * sweep.P / (4 * least * np.array(sweep.loop.delta))
+        for i, floor in enumerate(-sweep.loop.per_device(-floors)):
+            root = np.array([[0.0, 1.0], [1.0, 0.0]]) * np.sqrt(floor) / _LARGEST_ETA
+            blocks.append(Inequality.of(lambda y, root=root: np.diag([y[1], 1.0]) + y[0] * root, [i, last]))
         program = ConeProgram(np.eye(unit.size)[-1], blocks)
         # The minimum cannot exceed `least`, because the point with that share satisfies all tangents.
         settings = (SETTINGS[0], INTERIOR, *SETTINGS[1:])
@@ -663,10 +664,10 @@ class KnownDevice(Condition):
     plain: Multiplied = THIS_ENVIRONMENT  # the condition with the same facts for beta -> 0
 
     def beyond(self, loop: Loop) -> str | None:
+        if loop.latency:  # No declaration mends it, so it is named before missing bounds.
+            return _LATE
         if not loop.known_devices:
             return _NONE
-        if loop.latency:
-            return _LATE
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:

@@ -223,6 +223,9 @@ def test_a_wrong_storage_matrix_proves_nothing():
     assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or too close to singular for a proof"
     )
+    # D + D' = 0 behind inputs that move nothing: no P can mend it
+    still = Lti(*([[Fraction(v)]] for v in ("1/2", "0", "0", "0")), Fraction(1))
+    assert _prove_positive_real(still, Matrix.of([[1]])).startswith("D + D' is not positive definite")
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
     assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the model has 1 states"
 

@@ -39,6 +39,7 @@ from haptic_loop.design.known_device import (
     _check_q,
     _exact_cost,
     _q_bounds,
+    _Search,
     period_cost,
     positive,
 )
@@ -223,6 +224,22 @@ def test_the_cost_is_concave_in_damping_and_beta():
         excess = form(*middle) - (form(*ends[0]) + form(*ends[1])) / 2
         root = 1 / np.sqrt(np.diag(form(*middle)))
         assert np.linalg.eigvalsh(root[:, None] * excess * root).min() > -1e-9
+
+
+def test_tangents_bound_a_sweep_over_beta():
+    """c2 limits beta here, and the least share is far below the one from which the search begins."""
+    T, high = 1e-3, 3.0
+    loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
+    sweep = sweep_of(wall(309.8, 3.44, 1, T), loop)
+    least = min(sweep.required(np.array([eta]) * sweep.highest, high)[0] for eta in np.linspace(0.1, 0.108, 9))
+    search = _Search(sweep, high)
+    for eta in (0.01, 0.03, 0.1, 0.3, 0.9):
+        search.cut(np.append(eta * search.largest(high), high))
+    for _ in range(6):
+        x = search.solved(high)
+        assert x[-1] <= least
+        search.cut(np.append(x[:-1], min(search.least(x, high)[0], high)))
+    assert x[-1] > 0.9 * least
 
 
 def test_the_cost_bounds_every_period_of_a_range():
@@ -597,6 +614,7 @@ def test_any_environment_couplings_are_proved_from_files():
         ({"known_devices": None}, "no guaranteed bounds"),
         ({"T_max": 1.3e-3}, "T_min"),
         ({"latency": ((0.0, 1e-4),) * 2}, "latency"),
+        ({"latency": ((0.0, 1e-4),) * 2, "known_devices": None}, "latency"),
     ],
 )
 def test_loops_that_are_not_covered_are_refused(changes, said):
