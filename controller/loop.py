@@ -42,8 +42,10 @@ class DelayRange(Strict, frozen=True):
     hi: _Steps  # (m,) [samples]
 
     def __post_init__(self) -> None:
-        if len(self.lo) != len(self.hi) or any(not 0 <= a <= b for a, b in zip(self.lo, self.hi, strict=True)):
-            raise ValueError(f"delays from {list(self.lo)} to {list(self.hi)}, expected 0 <= lo <= hi on every channel")
+        ends = [*zip(self.lo, self.hi, strict=True)] if len(self.lo) == len(self.hi) else [(1, 0)]
+        if any(not 0 <= a <= b <= MOST_SAMPLES for a, b in ends):
+            shown = f"delays from {list(self.lo)} to {list(self.hi)} samples"
+            raise ValueError(f"{shown}, expected 0 <= lo <= hi <= {MOST_SAMPLES} on every channel")
 
     def __str__(self) -> str:
         """Return '[1, 2] samples', or '[1, 2], [0, 3] samples' if the channels differ."""
@@ -111,8 +113,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, the environment has {m} contacts")
         for name in ("theta", "psi", "lam"):
             steps = getattr(self, name)
-            if any(n != int(n) or n < 0 for n in steps):
-                raise ValueError(f"{name} is {list(steps)}, expected whole numbers of samples, zero or more")
+            if any(n != int(n) or not 0 <= n <= MOST_SAMPLES for n in steps):
+                raise ValueError(f"{name} is {list(steps)}, allowed are whole numbers of samples, 0 to {MOST_SAMPLES}")
         if any(0 < d < _LEAST_DAMPING for d in self.delta):
             raise ValueError(f"delta is {list(self.delta)}, expected 0 or at least {_LEAST_DAMPING:g} N s/m")
         if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):

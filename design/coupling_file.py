@@ -170,8 +170,12 @@ def _place(content: bytes, message: str) -> str:
 
 def save(stored: Stored, path: str | Path) -> None:
     """Write the stored coupling through a temporary file, so that `path` is always complete. Raises InputError."""
-    if _read_back(stored) is stored:
+    try:
+        content = msgspec.json.encode(stored)
+        msgspec.json.decode(content, type=Stored)
+    except (TypeError, msgspec.ValidationError) as error:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
-        own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")
-        raise InputError(f"{path}: the loop cannot be stored: a class of your own ({own}), or a field out of range")
-    write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
+        own = [type(part).__name__ for part in known if type(part).__module__ != Network.__module__]
+        reason = f"a class of your own ({own[0]})" if own else " ".join(str(error).split())
+        raise InputError(f"{path}: the loop cannot be stored: {reason}") from None
+    write(Path(path), msgspec.json.format(content, indent=1) + b"\n")

@@ -509,6 +509,22 @@ def test_a_long_delay_is_proved_from_its_file(tmp_path):
     assert load(tmp_path / "late.json").loop.theta == (1, 101)
 
 
+@pytest.mark.parametrize("psi", [1001, 10**9, 2**70])
+def test_a_delay_beyond_all_files_is_refused(psi):
+    with pytest.raises(ValueError, match=rf"psi is \[{psi}, {psi}\], allowed are .* 0 to 1000"):
+        msgspec.structs.replace(PAIR, psi=(psi, psi))
+    with pytest.raises(ValueError, match=rf"to \[{psi}, {psi}\] samples, expected 0 <= lo <= hi <= 1000"):
+        DelayRange((1, 1), (psi, psi))
+
+
+def test_a_loop_that_no_file_holds_names_its_field(tmp_path):
+    """`replace` makes a loop whose damping is negative, which files refuse."""
+    stored = Stored(msgspec.structs.replace(PAIR, delta=(1.0, -1.0)), SOFT.form())
+    with pytest.raises(InputError, match=r"bad.json: .* > 0.0 - at `\$.loop.delta"):
+        save(stored, tmp_path / "bad.json")
+    assert not (tmp_path / "bad.json").exists()
+
+
 # the edge
 
 
