@@ -20,7 +20,7 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import ANY, KNOWN_CONDITIONS, PLAIN_CONDITIONS, RANGES, Chosen
-from haptic_loop.models.human import Human, Population
+from haptic_loop.models.human import Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
 from haptic_loop.sim.couplings import NAMES
@@ -197,9 +197,9 @@ def _save(
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
-        crowd = question.crowd(i)
-        if not isinstance(crowd.humans(0)[0], Human):  # No file can hold a hand of a user's own class.
+        if not question.can_store(i):
             continue
+        crowd = question.crowd(i)
         remark = f"seed {question.seed}, index {i}"
         mechanics = crowd.mechanics[0] if crowd.mechanics else ()
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0), mechanics))
@@ -368,7 +368,7 @@ def _reported(
         environments=verdicts.EnvironmentsMet.met(question, findings),
         unstable=verdicts.Unstable.of(question, int(bad.sum()), int(grows.sum())),
         disagreements=disagreements,
-        disagreement_words=verdicts.disagreement_words(findings, engine_name(question.engine)),
+        disagreement_words=verdicts.disagreement_words(question, findings),
         disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
         worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,
         **tests._asdict(),

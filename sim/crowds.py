@@ -33,7 +33,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member
 from haptic_loop.controller.tick import Process
 from haptic_loop.models.hold import hold
-from haptic_loop.models.human import Population
+from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
 from haptic_loop.sim.accuracy import simulated_growth
 from haptic_loop.sim.engines import EXPONENTIAL, Engine, ExactEngine, MujocoBatchEngine, OneByOne, least_substeps
@@ -129,6 +129,10 @@ class Validation:
         """Draw the set of humans with this index."""
         ((_, crowd),) = self.crowds([index])
         return crowd
+
+    def can_store(self, index: int) -> bool:
+        """Return whether a file can hold the humans with this index; none can hold a hand of a user's own class."""
+        return all(isinstance(human, Human) for human in self.crowd(index).humans(0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -365,7 +365,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Return the title of reports and pictures, which names a case for the paper's loop only."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
-        return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
+        if case == "none":
+            return f"{self.name}, no coupling"
+        lam, loop = self.reference_delays(case), tuple(map(sum, zip(self.theta, self.psi, strict=True)))
+        if not any(lam) and (case == "II" or any(loop)):
+            return f"{self.name}, reference without delay"
+        return self.name if lam == loop else f"{self.name}, reference {list(lam)} samples late"
 
     @property
     def lever(self) -> float:

@@ -68,16 +68,18 @@ class EnvironmentsMet:
         return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
 
 
-def disagreement_words(findings: Findings, engine: str) -> str:
-    """Return the number of disagreements, and for the first three both rates and a command that repeats them."""
+def disagreement_words(question: Validation, findings: Findings) -> str:
+    """Return the number of disagreements, and for the first three both rates and, if a file holds them, a command."""
+    engine = "MuJoCo" if isinstance(question.engine, str) else engine_name(question.engine)
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
     for k in places[:3]:
         rates = f"exact {findings.exact[k]:+.3g} 1/s, {engine} {findings.mujoco[k]:+.3g} on its map"
         if findings.trace_decides[k]:
             rates += f" and {findings.trace[k]:+.3g} ± {findings.trace_error[k]:.2g} on its trace"
-        index = findings.index[k]
-        words.append(f"index {index}: {rates}; replay disagreement-{index}.toml with sim.run --error 1e-6")
+        index = int(findings.index[k])
+        replay = f"; replay disagreement-{index}.toml with sim.run --error 1e-6" if question.can_store(index) else ""
+        words.append(f"index {index}: {rates}{replay}")
     return "; ".join(words)
 
 

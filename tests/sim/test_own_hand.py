@@ -1,7 +1,7 @@
 """A user's own hand, written in this file, in the whole chain: both engines, verdicts, random draws."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -20,6 +20,7 @@ from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, _load_humans
 from haptic_loop.sim.stability import close, dominant_mode
+from haptic_loop.sim.verdicts import disagreement_words
 
 AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
 SCENARIO = load().replace(duration=1.5)
@@ -157,6 +158,11 @@ def test_own_hand_populations_agree_in_both_engines():
     assert 0 < (found.exact > 0).sum() < 40
     assert not found.disagreements.any()
     np.testing.assert_allclose(found.mujoco, found.exact, atol=2e-2, rtol=1e-3)
+    contradicted, question = (
+        replace(found, mujoco=-found.exact),
+        Validation(scenario, NoCoupling(), 0, 40, 1, "both", 0.5),
+    )
+    assert "replay" not in disagreement_words(question, contradicted)  # No file holds these hands.
     again = validate(scenario, None, humans=10, duration=0.0, engine="exact")
     np.testing.assert_array_equal(again.exact, found.exact[:10])
     assert found.mass.shape == (40,)

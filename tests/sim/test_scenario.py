@@ -15,7 +15,7 @@ from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
-from haptic_loop.sim.scenario import SCENARIOS, InputError, built_in, load, parse
+from haptic_loop.sim.scenario import CASES, SCENARIOS, InputError, built_in, load, parse
 
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 
@@ -126,6 +126,15 @@ def test_the_default_is_the_papers():
     assert (scenario.T, scenario.theta, scenario.psi, scenario.delta) == (1.2e-3, (1, 2), (0, 0), (1.37, 1.37))
     assert scenario.reference_delays("I") == (1, 2)
     assert scenario.reference_delays("II") == (0, 0)
+
+
+def test_titles_name_the_delay_of_the_reference():
+    """By definition: the reference is `lam` samples late, in case I theta + psi and in case II 0 if lam is absent."""
+    own = load("omega-pair").replace(name="own", theta=(1, 1), psi=(0, 1))
+    titles = {(case, lam): own.replace(lam=lam).title(case) for case in CASES for lam in (None, (0, 0), (1, 0), (1, 2))}
+    late, without = "own, reference [1, 0] samples late", "own, reference without delay"
+    each = {"none": ["own, no coupling"] * 4, "I": ["own", without, late, "own"], "II": [without, without, late, "own"]}
+    assert list(titles.values()) == [title for case in CASES for title in each[case]]
 
 
 def test_replacing_checks_again():
