@@ -103,7 +103,7 @@ _CELLS: dict[str, str | Callable[[Row], str]] = {
     "position": lambda r: render.optional(r.position_relative_rms, "{:.1e}"),
     "growth": "{r.growth_rate_error:+.1e}",
     "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
-    "cycle N": lambda r: render.optional(r.cycle_amplitude_n, "{:.4f}"),
+    "cycle N": lambda r: render.optional(r.cycle_deviation_n, "{:.4f}"),
     "Hz": lambda r: render.optional(r.cycle_frequency_hz, "{:.3f}"),
     "real": lambda r: f"{1 / r.wall_s_per_simulated_s:.0f}",
 }

@@ -31,7 +31,10 @@ _MOST = 6  # curves that can be told apart in one panel
 
 
 def main(argv: list[str]) -> int:
-    """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed."""
+    """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed.
+
+    Ctrl-C ends the command without a report, because a table without all couplings would name a wrong best one.
+    """
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "design.compare")

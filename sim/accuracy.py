@@ -92,9 +92,9 @@ class Row:
     position_relative_rms: float | None
     growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
-    cycle_amplitude_n: float | None  # standard deviation of a force in the limit cycle without coupling
+    cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
     cycle_frequency_hz: float | None
-    cycle_amplitude_error: float | None  # relative
+    cycle_deviation_error: float | None  # relative
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
     pareto: bool = False  # whether the setting is on the Pareto front (`_with_front`)
@@ -206,12 +206,12 @@ def _cycle(
     """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors."""
     if truth.cycle is None:
         return None, None, None, None
-    channel, amplitude, frequency = truth.cycle
+    channel, deviation, frequency = truth.cycle
     trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
     if trace.diverged:
         return None, None, None, None
     own, turns = _limit_cycle(trace, channel)
-    return own, turns, own / amplitude - 1, turns - frequency
+    return own, turns, own / deviation - 1, turns - frequency
 
 
 def _point(row: Row) -> Array:

@@ -41,6 +41,12 @@ def test_ctrl_c_while_the_solver_is_imported(tmp_path):
     assert interrupted_after("clarabel", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
 
 
+def test_an_interrupted_comparison_reports_nothing(tmp_path):
+    """The runs import MuJoCo after some couplings are designed."""
+    assert interrupted_after("mujoco", ["design.compare", "--json", "r.json"], tmp_path) == (130, ["interrupted"])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
     """nohup, and `command &` in a script, have SIGINT ignored."""
     words = ["-c", "import os, signal, sys; signal.signal(2, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"]

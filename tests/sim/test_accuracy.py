@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from haptic_loop.cli.accuracy import main
-from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim import accuracy as yardstick
-from haptic_loop.sim.accuracy import Row, _with_front, credible, position_error
+from haptic_loop.sim.accuracy import Row, _with_front, credible, measure, position_error, reference
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.trace import Trace
@@ -43,6 +43,15 @@ def test_figures(report):
     assert not rows["Euler", 1]["verdict_correct"]
     assert not rows["discrete", 12]["verdict_correct"]
     assert all(row["wall_s_per_simulated_s"] > 0 for row in outcome["rows"])
+
+
+def test_a_limit_cycle_has_its_forces_deviation():
+    """Of the last 4000 ticks of the channel that varies most; an engine that is the reference has no error."""
+    scenario = load().replace(duration=5.0)
+    loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
+    row = measure(reference(*loops), "exact", None, None)
+    assert row.cycle_deviation_n == pytest.approx(run(loops[1], "exact").f[-4000:].std(axis=0).max(), rel=1e-12)
+    assert row.cycle_deviation_error == 0
 
 
 def test_the_front_is_what_nothing_beats():

@@ -56,8 +56,8 @@ def test_the_limit_cycle_of_saturation():
         _limit_cycle(run(loop, make_engine(loop, *setting)), 1)
         for setting in (("exact",), ("mujoco", "RK4", 4), ("mujoco", "Euler", 1))
     ]
-    for name, (amplitude, frequency) in zip(("exact", "RK4 x 4", "Euler x 1"), cycles, strict=True):
-        print(f"limit cycle, {name}: {amplitude:.3f} N, {frequency:.3f} Hz")
+    for name, (deviation, frequency) in zip(("exact", "RK4 x 4", "Euler x 1"), cycles, strict=True):
+        print(f"limit cycle, {name}: {deviation:.3f} N, {frequency:.3f} Hz")
     exact, own, wrong = cycles
     assert exact == pytest.approx((9.635, 83.848), abs=1e-3)
     assert own == pytest.approx(exact, rel=1e-4)
