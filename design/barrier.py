@@ -14,11 +14,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.controller.arithmetic import spend
+from haptic_loop.controller.arithmetic import compiled, spend
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
@@ -74,9 +75,7 @@ class MatrixInequality:
 
     def changed(self, U: Array) -> MatrixInequality:
         """Return the inequality in the unknowns y = U x."""
-        import scipy
-
-        slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
+        slope = solve_triangular(U, self.slope.reshape(-1, len(U)).T, transposed=True).T
         return MatrixInequality(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
 
 
@@ -201,18 +200,54 @@ class Program:
         U is the factor R of a QR decomposition of the stacked rows of objective and barrier. Inner products of these
         rows would lose digits, because the coordinates x of a basis of filters are ill-conditioned.
         """
-        import scipy
-
         dense = [block for block in self.blocks if isinstance(block, MatrixInequality)]
         assert len(dense) == len(self.blocks)
         rows = [block.directions(x) for block in dense]
         scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
-        U = np.asarray(scipy.linalg.qr(stacked, mode="r")[0])[: x.size]
-        A = scipy.linalg.solve_triangular(U, self.A.T, trans=1).T
+        U = triangular_factor(stacked)
+        A = solve_triangular(U, self.A.T, transposed=True).T
         blocks = tuple(block.changed(U) for block in dense)
-        return Program(A, self.b, scipy.linalg.solve_triangular(U, self.c, trans=1), blocks), U
+        return Program(A, self.b, solve_triangular(U, self.c, transposed=True), blocks), U
+
+
+# ----------------------------------------------------------------------------------------------------
+# LAPACK's routines as scipy.linalg calls them, bit for bit, without the import of its Python code (`compiled`).
+
+
+def _lapack(name: str) -> Any:
+    return getattr(compiled("scipy.linalg._flapack"), name)
+
+
+def triangular_factor(rows: Array) -> Array:
+    """Return the factor R (n, n) of the QR decomposition of rows (k, n), k >= n; its diagonal may be negative."""
+    rows, geqrf = np.asarray_chkfinite(rows), _lapack("dgeqrf")
+    size = int(geqrf(rows, lwork=-1)[-2][0])
+    return np.triu(geqrf(rows, lwork=size)[0])[: rows.shape[1]]
+
+
+def solve_triangular(U: Array, b: Array | Complex, transposed: bool = False) -> Any:
+    """Return x (n, ..) with U x = b, or U' x = b, for an upper triangular U (n, n). Raises LinAlgError if singular."""
+    b = np.asarray_chkfinite(b)
+    by_columns = U.flags.f_contiguous
+    trtrs, trans = _lapack("ztrtrs" if np.iscomplexobj(b) else "dtrtrs"), transposed is by_columns
+    x, fault = trtrs(U if by_columns else U.T, b, lower=not by_columns, trans=trans)
+    if fault:
+        raise np.linalg.LinAlgError(f"the triangular matrix has a zero in row {fault}")
+    return x
+
+
+def _solve_positive(H: Array, b: Array) -> Array:
+    """Return H^-1 b for a symmetric H > 0, by its Cholesky factor. Raises LinAlgError if H is not positive definite."""
+    factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(H), lower=False, clean=False)
+    if fault:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=False)[0]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The path.
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
@@ -249,14 +284,12 @@ def towards(start: Array, x: Array, program: Program) -> Array:
 
 
 def _solved(hessian: Array, right: Array) -> Array:
-    import scipy
-
     scale = 1 / np.sqrt(np.diag(hessian))
     unit = scale[:, None] * hessian * scale
     diagonal, ridge = unit.diagonal().copy(), 0.0
     while True:
         try:
-            return scale * scipy.linalg.cho_solve(scipy.linalg.cho_factor(unit), scale * right)
+            return scale * _solve_positive(unit, scale * right)
         except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
             np.fill_diagonal(unit, diagonal + ridge)

@@ -22,7 +22,17 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.design import budgets
 from haptic_loop.design.arguments import number, one_of
-from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
+from haptic_loop.design.barrier import (
+    EntryInequality,
+    MatrixInequality,
+    Program,
+    centre,
+    joined,
+    packed,
+    solve_triangular,
+    towards,
+    triangular_factor,
+)
 from haptic_loop.design.conditions import even_damping, this_environment_demand
 from haptic_loop.design.environments import SWITCHING, LimitedForces, named_parts
 from haptic_loop.design.facts import KnownMotor
@@ -466,13 +476,11 @@ class Problem:
 
         The start is x. If x is infeasible, the start is a feasible point between `start` and x.
         """
-        import scipy
-
         parts = [self.block(*one, own, w) for one, own, w in zip(pairs, self.own, imposed, strict=True)]
         program = Program(A, b, c, joined([*parts, self._positive(0)]))
         x = towards(start, x, program)
         program, U = program.conditioned(x)
-        return program, U @ x, lambda y: scipy.linalg.solve_triangular(U, y)
+        return program, U @ x, lambda y: solve_triangular(U, y)
 
     @property
     def _entries(self) -> bool:
@@ -487,20 +495,18 @@ class Problem:
 
         The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
         """
-        import scipy
-
         n, m, _ = self.span.used.shape
         z = on_circle(np.unique(np.concatenate(imposed)))
         functions = self.span.responses(z)
         rows = np.vstack([functions, functions / np.abs(z - 1)[:, None]])
-        U = np.asarray(scipy.linalg.qr(np.vstack([rows.real, rows.imag]), mode="r")[0])[:n]
-        turned = lambda X: scipy.linalg.solve_triangular(U, X, trans=1)  # noqa: E731
+        U = triangular_factor(np.vstack([rows.real, rows.imag]))
+        turned = lambda X: solve_triangular(U, X, transposed=True)  # noqa: E731
 
         def there(x: Array) -> Array:
             return np.append((U @ x[1:].reshape(n, -1)).T.ravel(), x[0])
 
         def back(y: Array) -> Array:
-            return np.append(y[-1], scipy.linalg.solve_triangular(U, y[:-1].reshape(-1, n).T).ravel())
+            return np.append(y[-1], solve_triangular(U, y[:-1].reshape(-1, n).T).ravel())
 
         blocks: list[MatrixInequality | EntryInequality] = [self._positive(self.unknowns - 1)]
         for (case, constraint), w in zip(pairs, imposed, strict=True):

@@ -10,6 +10,7 @@ import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
+import scipy
 from asked import this_environment
 from scipy.optimize import minimize_scalar
 
@@ -19,7 +20,7 @@ from haptic_loop.controller.coupling import ForceFilter, NoCoupling, SpringDampe
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
-from haptic_loop.design import program
+from haptic_loop.design import barrier, program
 from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre
 from haptic_loop.design.bound import BoundBeside, _causal, bound
 from haptic_loop.design.certificate import prove, verify
@@ -483,6 +484,24 @@ def test_requests_that_make_no_sense_are_refused():
 
 
 # the solver ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 5, 60])
+def test_matrix_routines_are_those_of_scipy(n):
+    """Bit for bit, for every storage order, because couplings are compared by their bytes."""
+    rng = np.random.default_rng(n)
+    rows = rng.standard_normal((3 * n, n))
+    U = scipy.linalg.qr(rows, mode="r")[0][:n]
+    assert (barrier.triangular_factor(rows) == U).all()
+    for stored in (U, np.asfortranarray(U), np.ascontiguousarray(U)):
+        for b in (rng.standard_normal(n), rng.standard_normal((4, n)).T, rng.standard_normal((n, 3)) + 1j):
+            for transposed in (False, True):
+                x = scipy.linalg.solve_triangular(stored, b, trans=int(transposed))
+                assert (barrier.solve_triangular(stored, b, transposed) == x).all()
+    H, b = rows.T @ rows, rng.standard_normal(n)
+    assert (barrier._solve_positive(H, b) == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H), b)).all()
+    with pytest.raises(np.linalg.LinAlgError):
+        barrier._solve_positive(-H, b)
 
 
 def test_the_barrier_finds_what_a_cone_solver_finds():
