@@ -198,7 +198,7 @@ class Lti(ReadOnly):
         step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
         parts = [self._resolved(points[i : i + step]) for i in range(0, max(points.size, 1), step)]
         G = (parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)) + self.D[:, :, None]
-        return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
+        return G.transpose(2, 0, 1).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
         """Return C (z I - A)^-1 B, shape (p, m, points).
@@ -257,7 +257,7 @@ class Lti(ReadOnly):
             triangular or the error may exceed _ERROR.
         """
         core, lines = self._lines
-        A, B = self.A[np.ix_(core, core)], self.B[core]
+        A, B = self.A[core[:, None], core], self.B[core]
         if _is_lower(A):
             return None
         C = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
@@ -336,7 +336,7 @@ class Lti(ReadOnly):
         Schur form, and S keeps the zeros of A. The blocks of S are in reverse order.
         """
         core = self._lines[0]
-        A, n = self.A[np.ix_(core, core)], core.size
+        A, n = self.A[core[:, None], core], core.size
         last = np.maximum.accumulate(np.where((A != 0) | np.eye(n, dtype=bool), np.arange(n), 0).max(axis=1))
         ends = 1 + np.flatnonzero(last == np.arange(n))
         if ends.size == 1 < n:
@@ -374,7 +374,7 @@ class Lti(ReadOnly):
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]
-        eigenvalues = np.linalg.eigvals(self.A[np.ix_(core, core)])
+        eigenvalues = np.linalg.eigvals(self.A[core[:, None], core])
         return np.append(eigenvalues, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:

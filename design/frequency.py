@@ -289,12 +289,12 @@ def _narrowed(response: Response, bracket: Array) -> Array:
     spend(_POINT * trial.size)
     w = np.concatenate([bracket[0], trial])
     values = np.concatenate([bracket[1], response(trial.ravel()).reshape(trial.shape)])
-    order = np.argsort(w, axis=0, kind="stable")
-    w, values = np.take_along_axis(w, order, 0), np.take_along_axis(values, order, 0)
+    order, each = np.argsort(w, axis=0, kind="stable"), np.arange(w.shape[1])
+    w, values = w[order, each], values[order, each]
     at = np.argmax(values, axis=0)
-    best = np.take_along_axis(w, at[None], 0)  # Some points may coincide.
+    best = w[at, each]  # Some points may coincide.
     three = np.stack([np.maximum((w < best).sum(axis=0) - 1, 0), at, np.minimum((w <= best).sum(axis=0), len(w) - 1)])
-    return np.stack([np.take_along_axis(w, three, 0), np.take_along_axis(values, three, 0)])
+    return np.stack([w[three, each], values[three, each]])
 
 
 def _reach(bracket: Array) -> Array:
