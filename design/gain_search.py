@@ -273,7 +273,7 @@ def _slsqp(
     """Return x (n,) after at most `most` steps of SLSQP: least objective where constraint(x) (m,) >= 0.
 
     In SciPy 1.17 this is the loop of `minimize` over the compiled routine, whose state and workspace are private to a
-    release. The import of scipy.optimize would take a third of a design. Other releases get the public function.
+    release. The import of its Python code would take 0.2 s. Other releases get the public function.
     """
     import scipy  # slow to load
 
