@@ -181,7 +181,7 @@ def test_a_multiplier_below_zero_lends_no_damping():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"lo": [2, 2], "hi": [1, 1]}, "expected 0 <= lo <= hi on every channel - at `$.loop.varying_delay`"),
+        ({"lo": [2, 2], "hi": [1, 1]}, "expected 0 <= lo <= hi <= 1000 on every channel - at `$.loop.varying_delay`"),
         ({"lo": [1, 1, 1], "hi": [2, 2, 2]}, "varying_delay has 3 ranges for 2 channels"),
         ({"lo": [2, 2], "hi": [3, 3]}, "theta is [1, 2], outside of its varying_delay, [2, 3] samples"),
         ({"lo": [1, 1], "high": [2, 2]}, "unknown field `high`"),
