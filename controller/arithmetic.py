@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import cache, wraps
+from importlib import import_module
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from pathlib import Path
@@ -159,7 +160,7 @@ def compiled(name: str) -> Any:
     folder = Path(scipy.__path__[0], *name.split(".")[1:-1])
     spec = PathFinder.find_spec(name, [str(folder)])
     if spec is None or spec.loader is None:
-        raise ImportError(f"SciPy {scipy.__version__} has no module {name}", name=name)
+        return import_module(name)  # in a package that is laid out in another way
     sys.modules[name] = module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
