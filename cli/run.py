@@ -53,19 +53,20 @@ def main(argv: list[str]) -> int:
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     encoder = encoder_steps(scenario, args.case, chosen.coupling)
     render.announce(args, verdicts.verdict(assessment, encoder=encoder))
+    nearby = _nearby(scenario.loop(args.case), chosen, assessment)
+    if lost := verdicts.lost(assessment, nearby):
+        render.announce(args, lost)
     from haptic_loop.sim.run_report import run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
-    nearby = _nearby(scenario.loop(args.case), chosen, assessment)
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
     report = replace(report, robustness=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
-    if lost := verdicts.lost(assessment, nearby):
-        render.announce(args, lost)
+    render.show(args, _tables(scenario, report), report.remarks, _details(report))
     with render.progress("storing the trace and drawing the picture"):
         files = _save(args, out, run, report)
-    render.publish(args, report, _tables(scenario, report), report.remarks, out, files, details=_details(report))
+    render.publish(args, report, (), folder=out, files=files)
     return options.exit_code(True, run.trace.interrupted)
 
 

@@ -50,6 +50,17 @@ def test_case_none_is_figure_5(tmp_path):
     assert np.abs(trace.f).max() == 12.0
 
 
+def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
+    def interrupted(*picture):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("haptic_loop.sim.plots.save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        main(["--coupling", "published", "--duration", "0.1", "--out", str(tmp_path)])
+    assert "growth, eigenvalues" in capsys.readouterr().out
+    assert not (tmp_path / "report.json").exists()
+
+
 def test_the_default_is_the_design_for_this_environment(tmp_path):
     """Not the paper's condition: that renders half the stiffness, and the first run should show what is possible."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10")
