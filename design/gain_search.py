@@ -137,17 +137,19 @@ class SampledLoop:
         self._sample("conditions", w)
         self._known.clear()
         self._last: tuple[Array, Array, Complex] | None = None
-        z, shape = on_circle(w)[None], (1, w.size, m, m)
+        both = np.stack([0 * np.eye(m), np.eye(m)]).astype(np.complex128)  # G = 0 and G = I
+        response = Sampled(on_circle(w)[None], np.broadcast_to(both[:, None], (2, w.size, m, m)), self.loop.T)
+        first, second = np.arange(m), np.arange(m, m + self.active.size)
+        rows = np.concatenate([first, second, self.active, second])
+        columns = np.concatenate([first, self.active, second, second])
 
-        def entries(G: float, mu: float) -> Complex:
-            response = Sampled(z, np.broadcast_to(np.asarray(G * np.eye(m), np.complex128), shape), self.loop.T)
-            H = self.block(response, np.full(self.active.size, mu)).G[0]
-            first, second = np.arange(m), np.arange(m, m + self.active.size)
-            rows = np.concatenate([first, second, self.active, second])
-            return H[:, rows, np.concatenate([first, self.active, second, second])]
+        def entries(mu: float) -> Complex:
+            H = self.block(response, np.full(self.active.size, mu)).G
+            return np.broadcast_to(H, (2, *H.shape[1:]))[:, :, rows, columns]
 
-        none, of_G, of_mu = entries(0, 0), entries(1, 0), entries(0, 1)
-        self._affine = none, of_G - none, of_mu - none, entries(1, 1) - of_G - of_mu + none
+        none, of_G = entries(0)
+        of_mu, of_both = entries(1) if self.active.size else (none, of_G)
+        self._affine = none, of_G - none, of_mu - none, of_both - of_G - of_mu + none
 
     def _sample(self, where: str, w: Array) -> None:
         """Sample Psi E at exp(jw)."""

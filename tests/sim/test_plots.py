@@ -5,7 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
+from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import InputError
 from haptic_loop.sim import map_plot, plots
 from haptic_loop.sim.trace import Trace
@@ -262,6 +264,20 @@ def test_environment_maps_mark_their_design_point(drawn):
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other one is not on the map
     assert "this environment: certified inside this edge" in legend(figure)
+
+
+def test_every_unit_in_a_picture_becomes_radians():
+    """Only tick labels are not rewritten, which have no unit."""
+    f = np.sin(np.arange(2000) / 20)[:, None] * np.exp(np.arange(2000) / 500)[:, None]
+    figure = plots.draw_run(trace(f), "2 mm", 8.0, ideal=(f, 15.0), onset=plots.Onset(2.0, 1500))
+    figure.axes[0].annotate("1 N", (0, 0))
+    ticks = [len(part.majorTicks) for axis in figure.axes for part in (axis.xaxis, axis.yaxis)]
+    plots.relabel(figure, "rad")
+    assert [len(part.majorTicks) for axis in figure.axes for part in (axis.xaxis, axis.yaxis)] == ticks
+    figure.canvas.draw()
+    texts = [text.get_text() for text in figure.findobj(Text)]
+    assert {"2 mrad", "1 N m"} <= set(texts)
+    assert [in_unit(text, "rad") for text in texts] == texts
 
 
 def test_lines_are_told_apart_without_colours():
