@@ -127,11 +127,11 @@ def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) 
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
-    """Repeat the search between the vertices if the file guarantees ranges; else return None."""
+    """Repeat the search between the vertices of the ranges if the file guarantees for ranges; else return None."""
     if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
     loop, coupling = stored.loop, stored.built()
-    with render.progress("searching the ranges between their vertices") as move:
+    with render.progress("searching the parameter ranges between their vertices") as move:
         proved_by = condition_of(stored.certificate, condition)
         if proved_by.extensible and not proved_by.multiplier_sizes(loop):
             return search_ranges(loop, coupling, move)

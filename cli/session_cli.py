@@ -37,7 +37,7 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] time by which a rehearsal may exceed its run before it is stopped
+_SPARE = 600.0  # [s] virtual time that a rehearsal may take beyond the requested seconds
 _SHOWN_US = 100_000  # [us] virtual time between two updates of a rehearsal's progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 
@@ -47,7 +47,7 @@ def add_link_options(parser: options.Parser) -> None:
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
-    port += f"{FORCE_DIMENSION}[:0x,1x], devices and axes"
+    port += f"{FORCE_DIMENSION}[:0x,1x]: number of a device and letter of its axis, for each channel"
     add("--port", metavar="PATH", help=port)
     virtual = "the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
@@ -80,7 +80,7 @@ def add_link_options(parser: options.Parser) -> None:
 def add_output_options(parser: options.Parser, picture: bool = False) -> None:
     """Add the options for files, and --seed of a rehearsal."""
     parser.add_output(picture=picture)
-    parser.only("with --rehearse: a session with a device draws nothing", lambda args: args.rehearse, "seed")
+    parser.only("with --rehearse: a session with a device uses no random numbers", lambda args: args.rehearse, "seed")
 
 
 def add_safety_options(parser: options.Parser) -> None:
@@ -205,7 +205,7 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
         raise InputError(f"--port has {count} ports, the scenario {devices} devices: give one for each, or one for all")
     if scenario.T_min:
         raise InputError(
-            "T_min: clocks of several boards drift, and no period is the shortest; leave it out with several ports"
+            "T_min cannot be guaranteed with several ports, because the clocks of the boards drift: remove it"
         )
     return ticks_behind(scenario.theta, [len(device.free) for device in scenario.device])
 

@@ -30,7 +30,8 @@ _Rows = tuple[tuple[float, ...], ...]
 class Coupling:
     """Base class of couplings, which close a loop around the delayed environment.
 
-    A subclass defines `compliance`, and `form` if it can be stored. A coupling without a V overrides `around` instead.
+    A subclass defines `compliance`, or `channels` if V is diagonal, and `form` if it can be stored. A coupling without
+    a V overrides `around` instead.
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
@@ -41,7 +42,7 @@ class Coupling:
         """Return (I + Psi E V)^-1 Psi E for `environment` = Psi E. The last `further` ports (walls) have no coupling.
 
         Raises:
-            ValueError: The number of contacts differs, or the class defines no compliance.
+            ValueError: The environment has another number of contacts, or the class defines no compliance.
         """
         V = self.compliance(environment.T)
         if V is None:
@@ -69,7 +70,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return the equivalent V for the internal model `model`; None if there is no such V."""
+        """Return the V equivalent to an internal-model coupling with this model; None for every other coupling."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -89,16 +90,16 @@ class Coupling:
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
-        """Return the entries of a report: the order of V, Q or R, and the gains if there are any."""
+        """Return the entries of a report: the order of V, of Q (internal model) or of R (filter), and gains if any."""
         V = self.compliance(T)
         return {"order": V.order if V else 0}
 
     def form(self) -> Form:
         """Return the content of the coupling in a file. Raises ValueError if it cannot be stored."""
-        raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
+        raise ValueError(f"a coupling of class {type(self).__name__} cannot be stored in a file")
 
     def __repr__(self) -> str:
-        """Return the class and the order of V, Q or R."""
+        """Return the class and the order, as in `figures`."""
         try:
             return f"{type(self).__name__}(order {self.figures(1.0)['order']})"
         except (ValueError, TypeError):  # a user's own class may have no compliance
@@ -146,9 +147,7 @@ class SpringDamper(ReadOnly, Coupling):
         for name in "KB":
             object.__setattr__(self, name, frozen(getattr(self, name), max(1, np.ndim(getattr(self, name))), name))
         if self.K.shape != self.B.shape:
-            raise ValueError(
-                f"K has {self.K.shape[-1]} channels and B has {self.B.shape[-1]}; give one of each per channel"
-            )
+            raise ValueError(f"K has the shape {self.K.shape} and B has {self.B.shape}; give one of each per channel")
         if not self.K.shape[-1]:
             raise ValueError("K has no channels, expected one stiffness per channel")
         if not ((self.K > 0) & (self.K <= _LARGEST_COEFFICIENT)).all():
@@ -184,7 +183,9 @@ class SpringDamper(ReadOnly, Coupling):
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> SpringDamper:
         return replace(self, K=stiffness * self.K, B=damping * self.B)
 
-    def turned(self, Q: Array) -> _MatrixSpringDamper:
+    def turned(self, Q: Array) -> Coupling:
+        if self.cutoff is not None:  # a matrix of springs and dampers has no velocity filter
+            return super().turned(Q)
         K, B = (Q * gains @ Q.T for gains in (self.K, self.B))
         return _MatrixSpringDamper((K + K.T) / 2, (B + B.T) / 2)
 
@@ -271,7 +272,7 @@ def _scalar(value: Any) -> Any:
 
 
 #: The gains that the paper prints: (27) for case I, Lambda = Theta Psi, and (28) for case II, Lambda = I. Neither
-#: satisfies the paper's own condition.
+#: satisfies the condition of the paper's Theorem 4.
 PUBLISHED = {
     "I": SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55]),
     "II": SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81]),
@@ -516,8 +517,9 @@ def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> N
     """Return the basis functions b_k(z) of a filter, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
     b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each function
-    is multiplied by the all-pass sections of the poles before it, which makes it a Takenaka-Malmquist function up to
-    scale. Poles at zero give 1, 1/z, 1/z^2 and so on.
+    is multiplied by the all-pass sections of the poles before it. For real poles this makes it a Takenaka-Malmquist
+    function up to scale; the two functions of a pair span the same space as two such functions. Poles at zero give 1,
+    1/z, 1/z^2 and so on.
     """
     values, through = [np.ones_like(z)], np.ones_like(z)
     for a in poles:
@@ -602,7 +604,7 @@ class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
 
     @property
     def shape(self) -> None:
-        """The field that determines the number of channels, and its size; None for any number."""
+        """The field that determines the number of channels, and its size; None if any number is allowed."""
         return None
 
     def build(self, T: float) -> NoCoupling:

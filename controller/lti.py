@@ -1,7 +1,8 @@
 """Discrete-time linear systems x+ = A x + B u, y = C x + D u, in any arithmetic, and their sampled responses.
 
-A condition is written once as an expression over blocks and evaluated in several ways. `Lti` holds floats, a stack of
-systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit circle. Both have the operators
+A stability condition is written once as an expression over blocks, and is evaluated in several ways. `Lti` holds
+floats, a stack of systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit circle. Both have
+the operators
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
     G.feedback(H)           (I + G H)^-1 G
@@ -79,7 +80,10 @@ _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
-    """Return the work of a response in units of `spend`, within a factor of 2.5 up to 200 states and 2000 points."""
+    """Return the work of a response, in the units that `spend` counts.
+
+    It is right within a factor of 2.5 for up to 200 states and 2000 points.
+    """
     return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
 
@@ -295,18 +299,18 @@ class Lti(ReadOnly):
         return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
 
     def at_rest(self, x: Array) -> Array:
-        """Return the equilibrium state z = A z + B x for constant inputs x.
+        """Return the equilibrium state s = A s + B x for constant inputs x.
 
         If the equilibrium is not unique (an environment with a free mass), return the solution of least norm.
         """
-        z: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
-        return z
+        s: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
+        return s
 
     @cached_property
     def _lines(self) -> tuple[NDArray[np.intp], list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]]:
         """Split the states into core states and delay lines, given as (index of the core state, states, delays).
 
-        The states of a delay line are delayed copies of a core state, and only the output reads them.
+        The states of a delay line are delayed copies of a core state. No core state reads them.
         """
         reads = self.A != 0
         repeats = (reads.sum(axis=1) == 1) & (self.A.sum(axis=1) == 1) & ~self.B.any(axis=1)
@@ -370,7 +374,7 @@ class Lti(ReadOnly):
         return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
-        """Return the eigenvalues of A, shape (..., n). Delay lines at outputs have exact zeros, except in a stack."""
+        """Return the eigenvalues of A, (..., n). Without a stack, delay lines at outputs have exact poles at 0."""
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]

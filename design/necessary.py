@@ -4,9 +4,10 @@ A linear motor (mass m, damping delta) is connected to the hand by a transmissio
 parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
 responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
 conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
-held. With one channel, or channels with equal devices, every point of the disk is attained by some lossless hand. The
-sweep uses the device of least mass, least damping, stiffest spring and least damper within the bounds. Compare Fardad
-and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the proof.
+held. With one channel, or channels with equal devices, every point of the disk is attained by some passive hand, and
+every point of its circle by a lossless one. The sweep uses the device of least mass, least damping, stiffest spring
+and least damper within the bounds. Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for
+one channel. docs/theory.md has the proof.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from haptic_loop.design.result import Requirement, listed
 
 
 def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
-    """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m].
+    """Return sig0 and sig2 (n,) [m/(N s)] at w (n,) [rad/sample] for motors of `damping` (n,) [N s/m].
 
     sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n). Here
     a_n = delta + j m w_n, g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. The terms are rational in
@@ -61,7 +62,9 @@ class _Necessary(NamedTuple):
     held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
 
 
-_LOWEST = 1e-4  # [rad/sample]; at z = 1 the disk touches the point that it must not contain
+_LOWEST = (
+    1e-4  # [rad/sample] lowest frequency of the sweep; at z = 1 the disk touches the point that it must not contain
+)
 _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the damping
 
 
@@ -110,7 +113,8 @@ class LeftOver:
         required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less, and
             better proofs than known-device can gain at most the difference. Otherwise less may be enough.
         frequency_hz: The binding frequency.
-        attained: Whether a lossless hand destabilises the loop at every smaller damping (one channel, equal devices).
+        attained: Whether a lossless hand destabilises the loop at every smaller damping. This holds for
+            one channel, and for channels with equal devices.
         known_device_damping: (m,) [N s/m] that known-device requires, by a sweep; None if it is infinite.
     """
 

@@ -32,7 +32,7 @@ from haptic_loop.sim.scenario import Scenario
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
 _COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
-_LARGEST_MARGIN_US = 30_000  # largest margin in a measurement; the field of STATE, an i16, carries 32767 us
+_LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
 _HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last one; its ramp to zero [us]
 
@@ -83,7 +83,7 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    #: [m/s] fastest motion while forces act; at 2 N a single drifting encoder brings no free handle to 1 m/s
+    #: [m/s] fastest motion while forces act; with it and a cap of 2 N, one drifting encoder leaves a handle below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors

@@ -211,7 +211,7 @@ class Session:
         except wire.SafetyStop as fault:
             return self.end(Stage.STOPPED, str(fault), now)
         except Exception as error:  # any error stops the device
-            return self.end(Stage.STOPPED, f"{type(error).__name__} in the bridge: {error}", now)
+            return self.end(Stage.STOPPED, f"{type(error).__name__} in the host program: {error}", now)
 
     def poll(self, now: int) -> Said:
         """Act on time-outs and on a STOP that must be repeated."""

@@ -30,7 +30,7 @@ _GROUPS = 5  # groups of a record's frequencies that are left out in turn
 _SIGMAS, _SCALE = 2.0, 0.005  # bounds are moved by so many standard errors, and by this relative error of the encoder
 _WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
 _STEPS = 60  # most evaluations in a fit
-_LATE = 0.05  # [T] largest delay of a force: no proof covers a slower current loop
+_LATE = 0.05  # [T] largest lag with delay of a force, as of a current loop; no proof covers a slower one
 _FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # lower bounds of log m1, log m2, log k, log b, delta and lag
 
 
@@ -87,10 +87,10 @@ def transmission_bounds(
     friction: Friction,
     lever: float = 1.0,
 ) -> TransmissionBounds:
-    """Return the bounds of one axis from its records: (displacements [m], forces [N]) (N,) each, with period T [s].
+    """Return the bounds of one axis from its records: displacements [m] and forces [N], one of each per period T [s].
 
-    `step` [m] is the encoder step, `friction` was estimated from the free record. A rotary axis with the hand at the
-    radius `lever` [m] has radians and N m everywhere; only the fit is made in metres and N at the hand.
+    `step` [m] is the encoder step, `friction` was estimated from the free record. For a rotary axis with the hand at
+    the radius `lever` [m], arguments and results are in radians and N m; the fit is made in metres and N at the hand.
 
     Raises:
         ValueError: Two masses with a spring and a damper in parallel do not explain the records, the clamped mode is
@@ -128,7 +128,8 @@ def transmission_bounds(
     if not (least[0] > 0 and least[2] > 0):
         shown, lowest = lever**2 * b, lever**2 * least[2]
         raise ValueError(
-            f"motor mass or transmission damping, {shown:.3g} N s/m, cannot be told from 0: damping >= {lowest:.2g}"
+            f"the bounds of motor mass or transmission damping are not above 0: the damping is {shown:.3g} N s/m, its "
+            f"lower bound {lowest:.2g}"
         )
     figures = least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0)
     return at_radius(TransmissionBounds(*figures), lever)

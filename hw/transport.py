@@ -157,7 +157,7 @@ class Live(Driver):
         device: HapticDevice,
         plan: Callable[[Ages], Sequence[Armable]],
         operator: Operator,
-        keyboard: int | None = None,  # a file descriptor with single keys
+        keyboard: int | None = None,  # file descriptor of a terminal that delivers single keys
         watch: Callable[[Session], None] = lambda session: None,  # called ten times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
     ) -> None:
@@ -180,13 +180,13 @@ class Live(Driver):
                     super().turn()
             except BaseException as error:
                 with suppress(PortLost):
-                    cause = f"{type(error).__name__} in the bridge: {error}"
+                    cause = f"{type(error).__name__} in the host program: {error}"
                     self.do(session.end(Stage.STOPPED, cause, self.clock()))
                 raise
         return session
 
     def turn(self) -> None:
-        """Call the device once, then handle keys, arming, the planned end and signals."""
+        """Exchange messages with the device once, then handle keys, arming, the planned end and signals."""
         super().turn()
         try:
             self._steer(self.clock())
@@ -242,7 +242,7 @@ class Live(Driver):
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """Collect SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), to be handled between two calls."""
+    """Collect SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), to be handled between two exchanges."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:

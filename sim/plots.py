@@ -40,7 +40,7 @@ class Run(Protocol):
     @property
     def x_handle(self) -> Array: ...  # (N, m) [m]
     @property
-    def names(self) -> tuple[str, ...]: ...  # (m,) names of the channels, or () if they have numbers
+    def names(self) -> tuple[str, ...]: ...  # (m,) names of the channels; () if they are only numbered
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 
 
 def _texts(figure: Figure) -> list[Text]:
-    """Return all texts but tick labels; findobj would create all ticks, which the layout creates again."""
+    """Return all texts but tick labels. findobj would create all ticks, and the layout would create them once more."""
     texts = list(figure.texts)
     for axis in figure.axes:
         texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
@@ -126,7 +126,7 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
 
 
 _PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
-_LEGEND = 0.8  # columns of a legend per entry, in a figure that is not shrunk
+_LEGEND = 0.8  # columns of a legend per entry, before the figure is shrunk
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
@@ -139,7 +139,7 @@ def _fit_paper(figure: Figure) -> None:
         text.set_fontsize(min(max(share * float(text.get_fontsize()), _LETTERS[0]), _LETTERS[1]))
     for line in figure.findobj(Line2D):
         line.set_linewidth(max(share * line.get_linewidth(), 0.4))
-    for old in tuple(figure.legends):  # Letters shrink less than the page, so that fewer columns fit.
+    for old in tuple(figure.legends):  # Letters shrink less than the figure, so fewer columns fit.
         entries = dict(zip([text.get_text() for text in old.get_texts()], old.legend_handles, strict=True))
         columns = max(1, int(_LEGEND * share * len(entries)))
         old.remove()
@@ -156,7 +156,7 @@ def _literal(figure: Figure) -> None:
 
 
 def _plain_numbers(axes: Any) -> None:
-    """Label axes 0.1, 1, 10, which are read and drawn faster than powers of ten."""
+    """Label axes with plain numbers such as 0.1 and 10, which are read and drawn faster than 10^-1 and 10^1."""
     for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
@@ -204,7 +204,7 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or the run.
+        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or a shorter run.
             If nothing grows and no part stands out (`_stands_out`), there is no zoom.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
@@ -347,10 +347,10 @@ def _draw_forces(axes: Array, result: Run, parts: tuple[slice, ...], around: Con
 
 
 def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:
-    """Grey out the part of the run that no real device could follow."""
+    """Grey out the run after `until` [s], where the linear model of the devices is no longer credible."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
-    text = "grey: beyond what the\ndevices declare credible"
+    text = "grey: beyond the devices'\ncredible force or speed"
     where: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "right", "va": "top"}
     axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
@@ -382,7 +382,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
 def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
     """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, in windows of 12 periods.
 
-    There are no amplitudes in less than two windows.
+    Both arrays are empty if `ticks` is less than two windows.
     """
     T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
     width = max(8, round(12 / (max(hertz, 1.0) * T)))
@@ -415,7 +415,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
     """Return the part of the first `ticks` in which the forces turn most sharply: six periods, or 60 ticks if longer.
 
-    It is up to half of the ticks if no force has six turning points in a shorter part.
+    It is doubled, up to half of the ticks, until some force has six turning points in it.
     """
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
@@ -486,9 +486,9 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
-    """Plot cost against both errors, one line per integrator; wrong verdicts are crossed."""
+    """Plot the errors of position and growth rate over computing time, one line per integrator; crosses: wrong."""
     errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
-    figure, axes = _panels("speed against error (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
+    figure, axes = _panels("error over computing time (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
     names = list(dict.fromkeys(row.integrator for row in rows if row.integrator))
     for axis, (key, label) in zip(axes[0], errors.items(), strict=True):
         for name, style in zip(names, STYLES, strict=False):
@@ -575,7 +575,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
         top = scale * min(max([1.0, *(part.ratio for part in parts if np.isfinite(part.ratio))]), _HIGHEST)
         for coupling, part, style in zip(report.couplings, parts, STYLES, strict=False):
             if part.demand is None:
-                axis.plot([], [], label=f"{coupling.name} (no curve: see the notes)", **style)
+                axis.plot([], [], label=f"{coupling.name} (no curve: see the printed remarks)", **style)
                 continue
             axis.plot(hz, scale * part.demand, label=coupling.name, **style)
             binds = scale * part.ratio
@@ -593,7 +593,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
 
 def plot_perceived(report: Comparison, path: Path) -> Path:
     """Plot the effective impedance of each channel as a stiffness and a damping, beside the ideal one."""
-    title = "felt by each user, the other devices held still; linear near zero"
+    title = "felt by each user, the other devices held still; vertical axes are linear near zero"
     figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
     hz = report.frequency_hz
     curves = [("ideal: E itself", report.ideal, _IDEAL)]

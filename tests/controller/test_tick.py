@@ -126,7 +126,7 @@ def test_encoders_do_not_move_the_device():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: SpringDamper([1.0, 2.0], [1.0]), "K has 2 channels and B has 1"),
+        (lambda: SpringDamper([1.0, 2.0], [1.0]), r"K has the shape \(2,\) and B has \(1,\)"),
         (lambda: SpringDamper([0.0], [1.0]), "expected positive stiffnesses"),
         (lambda: SpringDamper([1.0], [-1.0]), "expected dampings >= 0"),
         (lambda: Compliance(Lti.constant([[1.0]], T)).around(environment(FIGURE_4, T)), "has 2 contacts"),

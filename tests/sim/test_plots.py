@@ -189,7 +189,7 @@ def test_binding_frequencies_are_marked(drawn):
     np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # at 0 Hz, and 40 times what there is
     assert here.get_title() == "this environment"
     assert here.get_ylabel() == "required damping [N s/m]"
-    assert "soft (no curve: see the notes)" in lines(anywhere)
+    assert "soft (no curve: see the printed remarks)" in lines(anywhere)
     here, anywhere = drawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
     assert here.get_ylabel() == "required damping over available damping"
     assert anywhere.get_title() == "any passive environment (with a multiplier for this environment)"
