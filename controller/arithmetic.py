@@ -100,7 +100,7 @@ def within(
         _counter.most, _counter.message, _counter.over = before
 
 
-_PRODUCT = 5e-8  # [units] one product and sum of short integers; growth with their bits was measured up to 5000
+_PRODUCT = 5e-8  # [units] one product and one sum of short integers; longer ones were measured up to 5000 bits
 _DIFFERENCE = 2e-6  # [units] a product and a difference of fractions
 
 

@@ -365,7 +365,7 @@ class Shell(_Net):
         return force, self.book(force)
 
     def book(self, force: Array) -> Array:
-        """Update W for the force (m, nsim) [N] of this tick without limiting it; return the port's u [m]."""
+        """Update W for the force (m, nsim) [N] that acts in this tick, without limiting it. Return u [m]."""
         u = self._free - self._V.D @ force
         self._earn((force * (u - self._before)).sum(axis=0))
         self._state = self._V.A @ self._state + self._V.B @ force

@@ -535,17 +535,9 @@ def environment(network: Network, T: Number) -> Lti:
     dampers and masses. The block is added. The arithmetic is that of T. Raises ValueError if an internal node has no
     mass and nothing holds it, or if the rounding of directions alone holds it.
     """
-    known, period, E = _latest
-    if E is None or known is not network or period is not T:
-        free = _free_directions(network, network.springs, T)
-        E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
-        E = E + network.block.at(T) if network.block else E
-        _latest[:] = network, T, E
-    return E
-
-
-#: The arguments and the result of the last call of `environment`, because a design calls it often with the same ones.
-_latest: list[Any] = [None, None, None]
+    free = _free_directions(network, network.springs, T)
+    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
+    return E + network.block.at(T) if network.block else E
 
 
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:

@@ -299,7 +299,7 @@ class Lti(ReadOnly):
         return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
 
     def at_rest(self, x: Array) -> Array:
-        """Return the equilibrium state s = A s + B x for constant inputs x.
+        """Return the state s in equilibrium, s = A s + B x, for constant inputs x.
 
         If the equilibrium is not unique (an environment with a free mass), return the solution of least norm.
         """

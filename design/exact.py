@@ -79,7 +79,8 @@ class Matrix:
 _LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and for each of their bits
 
 
-#: Up to as many products of integers, those of 21 states, Python is as fast as FLINT, whose import takes 0.05 s.
+#: largest number of products of integers that Python multiplies; FLINT is no faster for them (21 states), and its
+#: import takes 0.05 s
 _FEW = 20_000
 
 

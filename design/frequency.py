@@ -270,8 +270,9 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
     return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
-#: distances of trial points from the parabola's peak, in widths of the bracket. Near points find a smooth peak: its
-#: distance from the parabola's peak falls with the square of the width. Far points find a kink.
+#: distances of trial points from the parabola's peak, as multiples of the bracket's width. These points find a smooth
+#: peak, because its distance from the parabola's peak falls with the square of the width. The points at eighths of the
+#: bracket find a kink.
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
 _EIGHTHS = np.arange(1, 8)[:, None] / 8
 

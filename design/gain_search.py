@@ -296,7 +296,7 @@ def _slsqp(
     state |= dict.fromkeys(("exact", "inconsistent", "reset", "iter", "line", "meq", "mode"), 0)
     state |= {"acc": ftol, "tol": 10 * ftol, "itermax": most, "m": m, "n": n}
     multipliers, indices = np.zeros(m + 2 * n + 2), np.zeros(m + 2 * n + 2, dtype=np.int32)
-    buffer = np.zeros(n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28)
+    buffer = np.zeros(2 * (n * (n + 1) // 2 + 3 * m * n + 9 * m + 8 * n * n + 35 * n + 28))  # twice that of `minimize`
     while True:
         step(state, value, gradient, normals, rooms, x, multipliers, low, high, buffer, indices)
         if state["mode"] == 1:

@@ -62,9 +62,7 @@ class _Necessary(NamedTuple):
     held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
 
 
-_LOWEST = (
-    1e-4  # [rad/sample] lowest frequency of the sweep; at z = 1 the disk touches the point that it must not contain
-)
+_LOWEST = 1e-4  # [rad/sample] lowest frequency; at z = 1 the disk touches the point that it must not contain
 _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the damping
 
 

@@ -352,7 +352,9 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """Return the delay theta [ticks] during the measurement: the largest whose margins fit into their field of STATE.
+    """Return the delay theta [ticks] during the measurement.
+
+    It is the largest delay with which the margin of every answer fits into its field in STATE.
 
     Raises ValueError where T [s] is too long for theta = 1.
     """

@@ -619,7 +619,7 @@ class EncoderTest:
 
     @property
     def request(self) -> str | None:
-        """Return what the person has to do because a block is repeated, or None."""
+        """Return what the person must do so that the axis can pass its test, or None."""
         return f"let go of the handle of axis {self._axis + 1}" if self._block >= _BLOCKS else None
 
     def _compare(self) -> tuple[Array, Array, float, float, bool]:

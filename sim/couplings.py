@@ -254,7 +254,7 @@ def assessed(
 
 
 # ----------------------------------------------------------------------------------------------------
-# Encoder steps under the devices' Coulomb friction.
+# Comparison of the energy of encoder steps with the devices' Coulomb friction.
 
 
 @dataclass(frozen=True)

@@ -227,7 +227,7 @@ class Trace(ReadOnly):
 # ---- octaves, and lasting oscillations
 
 _PERIODS = 4  # least periods of an octave in a window; with fewer the window function mixes neighbouring octaves
-_TREND = 7  # degree of the subtracted polynomial; of a motion of 15 mm at 0.6 Hz it leaves about 1 um in 1 s
+_TREND = 7  # degree of the subtracted polynomial, which leaves 1 um of a motion of 15 mm at 0.6 Hz in 1 s
 SUSTAINED = 0.95  # least ratio of a lasting oscillation's amplitude in the last window to that in the first
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 

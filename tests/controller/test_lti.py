@@ -269,7 +269,7 @@ def test_chains_of_slow_poles_keep_their_digits():
 
 @pytest.mark.parametrize("n", [1, 2, 7, 30])
 def test_schur_forms_are_unitary_and_triangular(n):
-    """Rounding is at most a small multiple of n eps (Golub and Van Loan, 7.5.6); a NaN is refused, not iterated."""
+    """Rounding errors are small multiples of n eps (Golub and Van Loan, 7.5.6). Matrices with NaN are refused."""
     A = np.random.default_rng(n).standard_normal((n, n))
     S, U = lti._schur_form(A)
     assert not np.tril(S, -1).any()

@@ -3,10 +3,12 @@
 import subprocess
 import sys
 
+import clarabel
 import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
+from scipy.sparse import csc_matrix
 
 from haptic_loop.design import cone
 from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
@@ -151,6 +153,27 @@ def test_a_refused_optimum_is_not_used():
     assert next(answers, None) is None
     with pytest.raises(DesignFailed, match="could not be solved"):
         LEAST_TRACE.solve("it", accept=lambda x: False)
+
+
+def test_clarabel_reads_the_same_matrix_from_scipy():
+    """The solver's own interface takes a csc_matrix; the light stand-in for it gives the same bits."""
+    rng = np.random.default_rng(2)
+    A = np.where(rng.random((9, 4)) < 0.6, rng.normal(size=(9, 4)), 0.0)
+    A[:, 2] = 0.0  # a column without entries
+    real, (row, column) = csc_matrix(A), np.nonzero(A)
+    order = np.lexsort((row, column))
+    starts = np.searchsorted(column[order], np.arange(5))
+    light = cone._columns(A.shape, starts, row[order], A[row, column][order])
+    for name in ("indptr", "indices", "data"):
+        assert getattr(light, name).tolist() == getattr(real, name).tolist()
+    solutions = []
+    for matrix in (real, light):
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        cones, nothing = [clarabel.NonnegativeConeT(9)], csc_matrix(np.eye(4))
+        solver = clarabel.DefaultSolver(nothing, np.ones(4), matrix, np.ones(9), cones, settings)
+        solutions.append(np.array(solver.solve().x).tolist())
+    assert solutions[0] == solutions[1]
 
 
 def test_a_design_loads_no_modelling_language(tmp_path):

@@ -267,7 +267,7 @@ def test_environment_maps_mark_their_design_point(drawn):
 
 
 def test_every_unit_in_a_picture_becomes_radians():
-    """Only tick labels are not rewritten, which have no unit."""
+    """Tick labels have no unit, so they are not rewritten."""
     f = np.sin(np.arange(2000) / 20)[:, None] * np.exp(np.arange(2000) / 500)[:, None]
     figure = plots.draw_run(trace(f), "2 mm", 8.0, ideal=(f, 15.0), onset=plots.Onset(2.0, 1500))
     figure.axes[0].annotate("1 N", (0, 0))
