@@ -275,7 +275,7 @@ def test_a_device_is_identified_over_the_line(tmp_path, paces):
         if report["session"]["log"][-1]["stage"] == "finished" and "without a STATE" not in report.get("reason", ""):
             break
     else:  # the machine is too busy for a session with a clock
-        late = "no new STATE", "by the host's clock", "without a STATE", "cause watchdog"
+        late = "no new STATE", "by the host's clock", "without a STATE", "cause watchdog", "never arrived"
         assert any(words in report["reason"] for words in late)
         assert len(paces) == 1
         return
