@@ -18,7 +18,7 @@ Z = np.exp(1j * np.geomspace(1e-4, np.pi, 40_000))
 
 
 def object_(loop):
-    """E(z) (n, m, m) [N/m]: springs, dampers and masses by backward Euler, inner nodes eliminated."""
+    """Return E(z) (n, m, m) [N/m]: springs, dampers and masses by backward Euler, inner nodes eliminated."""
     env, rate = loop["environment"], (1 - 1 / Z) / loop["T"]
     nodes, m = [*env["contacts"], *env.get("masses", {})], len(env["contacts"])
     Y = np.zeros((Z.size, len(nodes), len(nodes)), complex)

@@ -10,7 +10,7 @@ K, B = (2870.0, 2320.0), (5.47, 5.55)  # the paper's gains (27) [N/m], [N s/m]
 
 
 def safe(share: float) -> bool:
-    """Whether the gains times `share` are certified in this environment."""
+    """Return whether the gains times `share` are certified in this environment."""
     gains = SpringDamper([share * k for k in K], [share * b for b in B])
     return certify(LOOP, gains)["this-environment"].certified
 

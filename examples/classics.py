@@ -1,8 +1,8 @@
-"""The classics of passivity (PO/PC, energy bounding) and our couplings with the same hands. Half a minute.
+"""Compare classic passivity layers (PO/PC, energy bounding) with our couplings, in half a minute.
 
 Columns: the rms error of the applied force; the force's rms above 40 Hz and its peak; the share of ticks in which the
-layer acted;
-of 100 pairs of lossless hands, started at 0.1 m/s, how many are faster in the tenth second, and the largest speed then.
+layer changed a force. The last two are about 100 pairs of lossless hands that start at 0.1 m/s: how many are faster in
+the tenth second, and the largest speed in that second.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # pairs of lossless hands, duration of a 
 class PassivityControl:
     """Passivity observer and series controller (Hannaford and Ryu, IEEE Trans. Robotics and Automation 18, 2002).
 
-    The observer adds up f dx; while the sum is negative, a damper returns it in one tick. `delta` (m,) [N s/m] is our
-    credit for what the devices dissipate. The controller acts at the devices, behind the delays.
+    The observer adds up f dx; when the sum is negative, a damper dissipates the deficit in one tick. `delta` (m,)
+    [N s/m] is our credit for what the devices dissipate. The controller acts at the devices, behind the delays.
     """
 
     at_device = True
@@ -48,7 +48,7 @@ class PassivityControl:
 class EnergyBounding:
     """Energy bounding on each channel, made for loops without delay (Kim and Ryu, Int. J. Robotics Research 29, 2010).
 
-    f = f_- + b dx with b between -c1 - 2 f_-/dx and c1, which says |f| <= |f_- + c1 dx|; here c1 = 2 delta/T.
+    f = f_- + b dx with b between -c1 - 2 f_-/dx and c1, that is, |f| <= |f_- + c1 dx|; here c1 = 2 delta/T.
     """
 
     at_device = False
@@ -64,7 +64,7 @@ class EnergyBounding:
 
 
 class _Layer:
-    """A classic in the simulated loop; it sees forces within the motors' limits."""
+    """A passivity layer in the simulated loop; its law receives forces within the motors' limits."""
 
     def __init__(self, law: Any, within: Any) -> None:
         self.law, self.within, self.x, self.acted, self.ticks = law, within, None, 0, 0
@@ -90,7 +90,7 @@ class _Layer:
 
 @dataclass(frozen=True)
 class Classic:
-    """The settings of a classic, from which `netted` makes a layer."""
+    """The settings from which `netted` makes a passivity layer."""
 
     kind: type
     credited: bool = True

@@ -21,7 +21,7 @@ print(design)
 print(assess(loop, design).guarantee)
 print(transparency_of(loop, design))
 
-# %% Run the same hands with it, and others
+# %% Run the same hands with the coupling, then other hands
 after = simulate(scenario, design)
 print(f"designed coupling: growth {after.meta['stability']['exact_growth_rate_per_s']:+.3f} 1/s")
 print(validate(scenario, design, humans=50, engine="exact", duration=0))

@@ -1,4 +1,4 @@
-"""How good can any coupling be with other devices? Design the optimal one over damping, delay and period.
+"""How small can the error of a coupling be? Design optimal couplings for several dampings, delays and periods.
 
 python examples/limits_of_any_coupling.py [damping|delay|period ..]      (a minute for all three)
 """
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from haptic_loop import DesignFailed, Scenario, design_coupling, load, transparency_of
 
 BASE = load("omega-pair")  # T = 1.2 ms, theta = (1, 2) samples, 1.37 N s/m
-FLOOR = -60.0  # [dB] drawn where the loop needs no coupling: the optimal one is then exact
+FLOOR = -60.0  # [dB] shown for an exact coupling, as in loops that need none
 
 
 def scaled(factor: float) -> Scenario:
@@ -26,7 +26,7 @@ AXES = {
 
 
 def error_db(scenario: Scenario, kind: str) -> float | None:
-    """Return the rms transparency error [dB], or None where there is no such coupling."""
+    """Return the rms transparency error [dB], or None if the design fails."""
     try:
         return transparency_of(loop := scenario.loop("I"), design_coupling(loop, kind)).rms_mismatch_db
     except DesignFailed:

@@ -43,7 +43,7 @@ def main() -> None:
     (OUT / "cube.xml").write_text(SCENE)
     (OUT / "lab.toml").write_text(LAB)
     scenario = load(OUT / "lab.toml")
-    design = design_coupling(scenario.loop("I"), "moving-average")  # the stiffest for any object
+    design = design_coupling(scenario.loop("I"), "moving-average")  # the stiffest coupling for any passive object
     trace = simulate(scenario, design)
     print(trace)
     print(f"largest force {abs(trace.f).max():.2f} N; {trace.meta['guarantee']}")

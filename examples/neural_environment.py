@@ -1,4 +1,4 @@
-"""A recurrent network of random neurons as the environment: nobody has a model or a proof of it, but hands are safe.
+"""Touch a recurrent network of random neurons: it has no model and no proof, and yet hands are safe.
 
 The network is behind a coupling certified for any passive environment. A shell makes the network passive: it scales the
 forces so that they never give more energy than the budget. Replace the network by a physics engine or a trained one.
@@ -19,7 +19,7 @@ class Network:
     def __init__(self, seed: int = 3) -> None:
         rng = np.random.default_rng(seed)
         self.inward, self.outward = rng.normal(size=(NEURONS, 2)), rng.normal(size=(2, NEURONS))
-        self.weights = 1.5 * rng.normal(size=(NEURONS, NEURONS)) / np.sqrt(NEURONS)  # above 1: it never comes to rest
+        self.weights = 1.5 * rng.normal(size=(NEURONS, NEURONS)) / np.sqrt(NEURONS)  # above 1: no rest
         self.activity = np.zeros(NEURONS)
 
     def __call__(self, u: np.ndarray) -> np.ndarray:

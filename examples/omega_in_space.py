@@ -1,4 +1,4 @@
-"""Two Omegas move in x, y and z and hold a block between springs: requirement, guarantee, path of the handles."""
+"""Assess and simulate two Omegas that hold a block between springs in x, y and z, and draw the handles' paths."""
 
 from pathlib import Path
 

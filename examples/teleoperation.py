@@ -17,7 +17,7 @@ T, K, DELAYS = 1e-3, 500.0, range(9)  # [s], [N/m], [samples]
 
 
 class PositionPosition(Environment):
-    """E(z) = k [[1, -1/z^d], [-1/z^d, 1]]: the delay is inside, because each robot knows its own position at once."""
+    """E(z) = k [[1, -1/z^d], [-1/z^d, 1]]: the delay is in E, since each robot knows its own position at once."""
 
     contacts = ("robot 1", "robot 2")
 

@@ -2,13 +2,13 @@
 
     contact force times a gain   usual in robot simulators: the contact is at the device's position, and the device
                                  feels a part of the contact force, clipped by its motors
-    environment= function        the scene behind a certified coupling, stepped outside of it, with the energy shell
+    environment= function        the scene, a separate simulation, behind a certified coupling and an energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. It grows if hand and device receive,
-beyond what the device's damping dissipates, more energy than the 2 mJ of the shell and, with environment.world, what
-gravity and springs of the scene released. It shakes if, in the last fifth of the run, a force changes by more than a
-tenth of the limit in a tick.
+A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. Its motion grows if hand and device
+receive, beyond what the device's damping dissipates, more energy than the 2 mJ of the shell and, with
+environment.world, what gravity and springs of the scene released. The hand shakes if, in the last fifth of the run, a
+force changes by more than a tenth of the limit in a tick.
 """
 
 import sys
@@ -28,11 +28,11 @@ BLOCK = """<mujoco><default><geom solref="0.005 1" solimp="0.9 0.9 0.001"/></def
 <geom type="box" pos="0 0 0.06" size="0.03 0.03 0.06"/>
 <body name="pusher" pos="-0.05 0 0.06"><geom type="sphere" size="0.01" mass="2"/></body>
 <body name="presser" pos="0 0 0.14"><geom type="sphere" size="0.01" mass="2"/></body></worldbody></mujoco>"""
-GAINS = (1.0, 0.2)  # of the contact force
+GAINS = (1.0, 0.2)  # factors on the contact force
 
 
 class ContactForce:
-    """Moves the contacts of a scene to given positions and returns the contact forces on them."""
+    """Moves the contacts of a scene to given positions and returns the contact forces, to be fed back."""
 
     def __init__(self, scene):
         self.port = scene.port()
@@ -58,7 +58,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):
-        scene = scene_of(scenario, coupling)  # compiled anew, since ContactForce moves its springs
+        scene = scene_of(scenario, coupling)  # compiled anew, since ContactForce changes its springs
         port, outside = scene.port([limit] * scene.channels), ContactForce(scene)
         shell = Shell(coupling.compliance(T), start=START_J)
         mass, stiffness = 0.25 + rng.uniform(0.05, 0.5, 2), rng.uniform(50.0, 500.0, 2)
@@ -86,7 +86,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
             x = rest + swing * np.cos(rotation) + speed * np.sqrt(mass / stiffness) * np.sin(rotation)
             v = speed * np.cos(rotation) - swing * np.sqrt(stiffness / mass) * np.sin(rotation)
             dx = x - before
-            v = v - np.array(scenario.delta) / mass * dx  # by the damping, which dissipates at least delta dx^2/T
+            v = v - np.array(scenario.delta) / mass * dx  # the damping dissipates at least delta dx^2/T
             given += -(f @ dx) - (np.array(scenario.delta) / T * dx**2).sum()
             most, peak = max(most, given), max(peak, float(np.abs(f).max()))
         limited += int(shell.limited[0])
@@ -96,7 +96,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
 
 
 def scenes(folder):
-    """Return the packaged stack of boxes, and a fixed block with tips of 2 kg, like a robot's, and contacts of 5 ms."""
+    """Return the packaged stack of boxes, and a fixed block, tips of 2 kg like a robot's, contacts of 5 ms."""
     stack = load("world-stack")
     (Path(folder) / "block.xml").write_text(BLOCK)
     block = Path(folder) / "block.xml"

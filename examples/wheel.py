@@ -1,9 +1,9 @@
-"""A force-feedback wheel whose game sends torques at 60 or 360 Hz: which delay theta stands for a held torque?
+"""A force-feedback wheel whose game sends torques at 60 or 360 Hz: which delay theta describes a held torque?
 
 With `unit = "rad"` wheel.toml has rad, N m, N m s/rad and kg m2 in place of m, N, N s/m and kg. A torque
 that is computed within a period of the game and held for the next (n ticks of the wheel's 1 kHz loop) has a mean age of
-3 n/2 ticks. A tick holds for half a tick by itself, so theta = 3 n/2 - 1/2 stands for it. The script judges the exact
-loop, whose period is the game's (theta = 1); the 1 kHz loop with that theta needs nearly the same damping.
+3 n/2 ticks. The model of the 1 kHz loop already holds for half a tick, so theta = 3 n/2 - 1/2. The script judges
+the exact loop, whose period is the game's (theta = 1); the 1 kHz loop with that theta needs nearly the same damping.
 """
 
 import math
@@ -20,7 +20,7 @@ RIGID = SpringDamper([1e6], [0.0])  # as good as no coupling
 
 
 def theta_of(hertz: float) -> int:
-    """Return the delay in ticks of 1 ms, rounded up, that stands for torques held for a period of the game."""
+    """Return the delay in ticks of 1 ms, rounded up, that describes torques held for a period of the game."""
     return math.ceil(1.5 / (hertz * BASE.T) - 0.5)
 
 
@@ -41,7 +41,7 @@ def main() -> None:
         felt = np.abs(loop.F(design_coupling(loop).coupling).at(np.exp(2j * np.pi * hertz / rate)))[:, 0, 0]
         print(f"{rate:4d} Hz: theta = {theta:2d}; {bare}; coupled, {felt[0]:.2f} of 20 N m/rad are felt")
         axis.semilogx(hertz, felt, style, label=f"{rate} Hz, theta = {theta}")
-    axis.set(xlabel="frequency [Hz]", ylabel="felt stiffness [N m/rad]", title="What the wheel passes on of 20 N m/rad")
+    axis.set(xlabel="frequency [Hz]", ylabel="felt stiffness [N m/rad]", title="Felt part of a spring of 20 N m/rad")
     axis.set_ylim(bottom=0)
     axis.legend()
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "wheel.png", dpi=120)

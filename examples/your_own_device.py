@@ -15,7 +15,7 @@ SECONDS = 2.0
 
 
 def _wall(delay: float | None) -> float:
-    """Return the damping [N s/m] that a rigid wall behind a spring needs with this delay [s]; None: a sample."""
+    """Return the damping [N s/m] that a rigid wall behind a spring needs with this delay [s], None for a sample."""
     theta, latency = ((1,), None) if delay is None else ((0,), ((delay, delay),))
     wall = Loop(1.2e-3, theta, (0,), theta, (MINE["damping"],), RIGID_WALL, latency=latency)
     return certify(wall, SpringDamper([1000.0], [0.0]))["this-environment"].required[0]
@@ -34,7 +34,7 @@ def main() -> None:
     print(f"a wall of 1000 N/m at 1.2 ms needs {_wall(session.delay):.4f} N s/m, a whole sample late {_wall(None):.4f}")
     moved = np.abs(session.result.x).max()
     print(f"{len(session.result.t)} ticks, ended {session.stage}; handles moved up to {1e3 * moved:.1f} mm")
-    print(f"zero force {1e3 * session.zero_after:.1f} ms after the stop was asked for")
+    print(f"zero force {1e3 * session.zero_after:.1f} ms after the stop request")
 
 
 if __name__ == "__main__":

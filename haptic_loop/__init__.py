@@ -94,8 +94,8 @@ def _command_starts() -> bool:
     return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
 
 
-# Commands do not use the OpenGL backend of MUJOCO_GL (sim.view opens one of its own). Its import takes longer than the
-# rest of MuJoCo, and fails if the backend is not installed. The setting of a user's script is not changed.
+# Commands do not use the OpenGL backend that MUJOCO_GL names; sim.view opens a context itself. Importing the backend
+# takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
 

@@ -1,1 +1,1 @@
-"""The tests of this project: a package, so that no other folder of this name is taken for it."""
+"""The tests of this project. They are a package so that `import tests` finds no other folder of this name."""

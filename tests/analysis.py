@@ -1,4 +1,4 @@
-"""Theorem 4 for a given coupling, as a feasibility problem with a signed margin."""
+"""Check Theorem 4 for a given coupling by a feasibility problem with a signed margin."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from haptic_loop.design.lmi import (
 
 
 def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
-    """V where T = 1 and Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T, so that E V keeps its eigenvalues."""
+    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T. The eigenvalues of E V stay the same."""
     root = np.sqrt(np.asarray(delta))
     return Lti(V.A, V.B * root, root[:, None] / V.T * V.C, root[:, None] / V.T * V.D * root, 1.0)
 
 
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
-    """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
+    """Return E-hat without its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
     return _regular_part(delay(psi, E.T) @ E)
 
 
 def theta_hat(theta: Sequence[int]) -> Lti:
-    """(12) where T = 1 and Delta_D = I."""
+    """Return Theta-hat (12) in units T = 1, Delta_D = I."""
     return Lti.diag(*(taps([0.5] * (n + 1), 1.0) for n in theta))
 
 
 def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
-    """V-hat without its zero at z = 1, in the paper's ports: y1 = H u with H = V - Theta-hat, y2 = H(1)/2 - quotient.
+    """Return V-hat without its zero at z = 1, with the paper's two outputs; V(1) must be symmetric.
 
-    V-hat is Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u); V(1) must be symmetric. One state per channel fewer than
-    (16).
+    With H = V - Theta-hat they are y1 = H u and y2 = H(1)/2 u - (H - H(1))/(z - 1) u. V-hat is Delta-OSP iff
+    He y2/u >= (y1/u)* Delta (y1/u). The result has one state per channel fewer than (16).
     """
     H = V - theta_hat(theta)
     R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
@@ -50,19 +50,19 @@ def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
 
 
 def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
-    """(14): the excess of passivity of devices (I) and V-hat covers the shortage Phi of E-hat; also Delta_V > 0."""
+    """Return the matrix of (14), positive if the excess of devices (I) and V-hat covers the shortage Phi of E-hat."""
     return symmetric([[np.eye(Phi.shape[0]) - Phi, -Phi], [-Phi, Delta_V - Phi]])
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """The outcome; matrices are in units T = 1, Delta_D = I, None where no LMI was needed to refuse."""
+    """The result of `analysis`, in units T = 1, Delta_D = I; matrices are None if V was refused without an LMI."""
 
     margin: float  # > 0: Theorem 4 holds with this room in every inequality; < 0: it does not; -inf: no V-hat
     Phi: Array | None = None  # (N, N) shortage of passivity of E-hat
     Delta_V: Array | None = None  # (N, N) excess of passivity of V-hat
-    P_E: Array | None = None  # storage of E-hat, its regular part in balanced coordinates
-    P_V: Array | None = None  # storage of V-hat, likewise
+    P_E: Array | None = None  # storage of E-hat's regular part, in balanced coordinates
+    P_V: Array | None = None  # storage of V-hat, in balanced coordinates
     reason: str | None = None
 
     @property
@@ -71,9 +71,9 @@ class Analysis:
 
 
 def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float]) -> Analysis:
-    """Whether V satisfies Theorem 4 with this environment, with a signed margin.
+    """Judge whether V satisfies Theorem 4 with this environment.
 
-    Minimises s over E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
+    The problem minimises s subject to E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
     Delta_V + s >= 0; the margin is -s. Raises ValueError for an environment that is not passive.
     """
     Block.of(environment)
@@ -89,7 +89,7 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
 
 
 def balanced_ports(V: Lti, theta: Sequence[int]) -> Ports:
-    """`v_hat_ports` with both outputs balanced together (V in unit coordinates)."""
+    """Return `v_hat_ports` of V (in units T = 1, Delta_D = I), with both outputs balanced together."""
     G, m = v_hat_ports(V, theta), V.outputs
     both = balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
     return Ports(both.A, both.B, both.C[:m], both.D[:m], both.C[m:], both.D[m:])
@@ -114,7 +114,7 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
 
 
 def solve(problem: cp.Problem, solver: str = "CLARABEL") -> float:
-    """The optimal value, with the optimum left in the problem's variables; how exact it is, the caller judges."""
+    """Return the optimal value; the variables hold the optimum, whose accuracy the caller judges."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem.solve(solver=solver)

@@ -1,4 +1,4 @@
-"""The conditions of any block, whatever loop it may come from: dampings, delays and periods are those given here."""
+"""Conditions evaluated for a block, with dampings, delays and periods as arguments in place of a loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from haptic_loop.design.certificate import prove
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
-    """A loop with these; its environment is springs to ground, unless it is given."""
+    """Return a loop. By default each contact has a spring to ground, and the `walls` are at the first contact."""
     m = len(delta)
     contacts = tuple(f"contact {i}" for i in range(m))
     springs = tuple(Spring((contact, GROUND), 1.0) for contact in contacts)
@@ -44,7 +44,7 @@ def any_environment_per_channel(V, theta, delta):
 
 
 def walls_demand(G, delta, stiffness, a):
-    """Walls without dampers, with the multiplier a (w,) [N/m]; G has all delays."""
+    """Return the block of walls without dampers for the multiplier a (w,) [N/m]; G includes all delays."""
     none = (0,) * (3 * len(stiffness))
     return environments.THIS_ENVIRONMENT.block(G, loop(G.T, delta, walls=stiffness), (*a, *none))
 
@@ -62,7 +62,7 @@ def switching_sweep(G, lo, hi, delta, alpha=None, T_max=None):
 
 
 def prove_limiter(loop, coupling, beta=environments.BETA, c=None, swept=None):
-    """A certificate of limited forces, with a multiplier (m, lags) or the best one."""
+    """Return a certificate of limited forces for the multiplier c (m, lags), or for the best one."""
     condition = environments.LimitedForces(beta, len(c[0]) if c else 1)
     return prove(loop, coupling, condition, [v for row in c for v in row] if c else None, swept)
 
@@ -82,17 +82,17 @@ def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
 
 
 def decisive(report):
-    """The requirement of the condition that must hold, of a command's JSON."""
+    """Return the requirement of the condition that decides the verdict, from a command's JSON."""
     assessment = report["assessment"]
     return assessment["requirements"][assessment["condition"]]
 
 
 def needs(report, condition):
-    """The requirement of a condition, of a command's JSON."""
+    """Return the requirement of a condition, from a command's JSON."""
     return report["assessment"]["requirements"][condition]
 
 
 def safe_with(report):
-    """The environments of the guarantee, of a command's JSON; None where there is no guarantee."""
+    """Return the environments of the guarantee, from a command's JSON, or None if there is no guarantee."""
     guarantee = report["assessment"]["guarantee"]
     return guarantee and guarantee["environments"]

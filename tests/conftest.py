@@ -1,4 +1,4 @@
-"""What holds for every test: one BLAS thread, and no verdict on how fast the machine is."""
+"""Settings of all tests: one BLAS thread, and no failure because the machine is slow."""
 
 import gc
 import os
@@ -6,11 +6,11 @@ import signal
 import sys
 import time
 
-# `make test &` has SIGINT ignored, and whoever is started inherits that: tests that send it would wait for ever.
+# A shell runs `make test &` with SIGINT ignored, and child processes inherit this: tests that send it would hang.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The matrices here are small: a pool of BLAS threads costs more than it saves, most of all on a busy machine.
-# To be set before NumPy is loaded; the commands that tests start inherit it.
+# NumPy reads these variables when it is loaded; the commands that tests start inherit them.
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
@@ -22,14 +22,14 @@ sys.dont_write_bytecode = False
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-# Python's default, 700 new objects, has it look through all modules and fixtures thousands of times.
+# With Python's default of 700 new objects the collector would scan all modules and fixtures thousands of times.
 gc.set_threshold(100_000)
 
 settings.register_profile("no-clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("no-clock")
 
 
-#: files of the most seconds, in this order: begun first, so that no worker is alone with one at the end
+#: the slowest files, in this order; they start first, so that no worker is left alone with one at the end
 LONGEST = (
     *("test_docs.py", "test_known_device.py", "test_identify.py", "test_hostile.py", "test_optimal.py"),
     *("test_session.py", "test_live_bridge.py", "test_combinations.py", "test_run.py", "test_spring_damper.py"),
@@ -38,8 +38,8 @@ LONGEST = (
 )
 
 
-#: when the minute of `make check` is over, which begins with lint; some tests are always run, nearest first, and what
-#: is left is for `make test`
+#: time at which the minute of `make check`, which begins with lint, is over; at least 15 s remain for tests, and the
+#: tests that do not start by then are left to `make test`
 CHECK_UNTIL = max(float(os.environ.get("CHECK_UNTIL", "inf")), time.time() + 15)
 
 
@@ -56,7 +56,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
-    """Runs, maps and crowds ask for the same couplings again and again, seconds each: one design for all processes."""
+    """Share designs between all tests and processes: many tests need the same ones, which take seconds each."""
     from forked import share_designs
 
     folder = tmp_path_factory.getbasetemp()

@@ -1,4 +1,4 @@
-"""Many simulations closed at once from given plant states: what the laws about engines are stated on."""
+"""Closed loops from given plant states, many at once, for tests of the engines."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from haptic_loop.sim.run import _Outside, run_blocks
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """What every tick saw, (ticks, entries, nsim)."""
+    """The process states z, plant states s and forces f of the ticks, (ticks, entries, nsim)."""
 
     z: np.ndarray
     s: np.ndarray
@@ -22,7 +22,7 @@ class Driven:
 def driven(
     process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
-    """Close the loop from the plant states `start`, (2n, nsim); only the blocks of the last ticks are kept."""
+    """Close the loop from the plant states `start`, (2n, nsim); with `last`, keep only the blocks of the last ticks."""
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
@@ -34,7 +34,7 @@ def driven(
 
 
 def tick_by_tick(engine):
-    """The engine without blocks of ticks: every tick is looked at before the next."""
+    """Make the engine run tick by tick instead of in blocks, and return it."""
     start = engine.start
 
     def begin(buffer: StepBuffer) -> None:
@@ -46,7 +46,7 @@ def tick_by_tick(engine):
 
 
 def drive(process: Process, x: np.ndarray) -> StepBuffer:
-    """The buffer after displacements (ticks, m, nsim)."""
+    """Return the buffer after a tick for each row of the displacements x (ticks, m, nsim)."""
     buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
     for k, row in enumerate(x):
         buffer.x[k] = row
@@ -55,15 +55,15 @@ def drive(process: Process, x: np.ndarray) -> StepBuffer:
 
 
 def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
-    """Random displacements (ticks, channels, nsim)."""
+    """Return random walks of displacements (ticks, channels, nsim)."""
     return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * step
 
 
 def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.random.Generator, ticks: int) -> int:
-    """How many hands grow a hundredfold between a tenth of the ticks and the end.
+    """Return how many hands' motions grow a hundredfold between a tenth of the ticks and the end.
 
-    Each tick is one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average; without `mean` it is the
-    one that gives the hand most energy, `energy` (hands, 2) times [x^2, v^2].
+    Each tick multiplies the state by one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average.
+    Without `mean` it is the one after which the hand's energy, `energy` (hands, 2) times [x^2, v^2], is largest.
     """
     hands = len(energy)
     z = 1e-3 * rng.standard_normal((hands, steps.shape[2], 1))
@@ -84,6 +84,6 @@ def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.ran
 
 
 def alike(scene: Scene, count: int) -> Variants:
-    """So many copies of one scene, as a batch takes them."""
+    """Return `count` copies of a scene as the variants of a batch."""
     names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
     return Variants(scene, {name: np.tile(getattr(scene.model, name), (count, 1)) for name in names})

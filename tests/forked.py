@@ -1,6 +1,6 @@
-"""Commands as a user runs them, without their second of imports: one process has imported all and forks for each.
+"""Run commands as a user does, but without a second of imports: a process with all imports forks for each command.
 
-python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; a request a line, its answer a line
+python tests/forked.py FOLDER     cache designs in FOLDER; read one request and print one answer per line
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ def load() -> None:
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
-    """What commands work out again and again, seconds each, once for all tests and processes that ask for the same.
+    """Cache slow results that many tests and processes need, so that each is computed once.
 
-    That is: designs, bounds, requirements, proofs for limited forces, and how the couplings beside a run's
-    own are judged. What makes them, design.designs and the modules behind it, is as it was.
+    These are designs, bounds, requirements, proofs, searches of ranges, and alternatives to failed designs. Only the
+    names in the listed modules are replaced: other callers still compute.
     """
     import haptic_loop.cli.check
     import haptic_loop.cli.design
@@ -67,7 +67,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 
 def draw_once(folder: Path) -> None:
-    """The first picture of each command is drawn, and those after it are empty: they take most of a second each."""
+    """Draw each command's picture of a name only once, and an empty one afterwards: drawing takes most of a second."""
     from matplotlib.figure import Figure
 
     from haptic_loop.sim import plots
@@ -85,7 +85,7 @@ def draw_once(folder: Path) -> None:
 
 
 def _remembering(folder: Path, make):
-    """The same function, with its results kept in the folder; failures and loops without a digest are not."""
+    """Return `make` with a cache of its results in the folder; failures and calls without a digest are not cached."""
     from haptic_loop.design import budgets
     from haptic_loop.design.coupling_file import digest
 
@@ -93,11 +93,11 @@ def _remembering(folder: Path, make):
     def remembered(loop, *asked, **options):
         try:
             loop_and_asked = digest(loop), make.__name__, budgets.GROWTH, _asked(make, loop, *asked, **options)
-        except TypeError:  # an environment or a design of a test's own
+        except TypeError:  # an environment or a design that a test defines has no digest
             return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
         with file.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # whoever asks meanwhile waits for the one that is at it
+            fcntl.flock(lock, fcntl.LOCK_EX)  # other processes wait for the one that computes the result
             if not file.exists():
                 made = make(loop, *asked, **options)
                 part = file.with_suffix(".part")
@@ -109,7 +109,7 @@ def _remembering(folder: Path, make):
 
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
-    """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
+    """Return the arguments of a call except the loop, with defaults, in words that equal calls share."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT
@@ -118,10 +118,10 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     call.apply_defaults()
     words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
     if any(isinstance(x, Condition) and not type(x).__module__.startswith("haptic_loop.") for x in words.values()):
-        raise TypeError("a condition of a user's own")
+        raise TypeError("a condition that a user defines")
     if make.__name__ == "design_by_kind":
         if ":" in words["kind"]:
-            raise TypeError("a design of a user's own")
+            raise TypeError("a design that a user defines")
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
     return sorted((name, _word(x)) for name, x in words.items())
@@ -143,7 +143,7 @@ def _word(x: Any) -> str:
 
 @functools.cache
 def _warm() -> subprocess.Popen[str]:
-    """The process that forks; it ends with this one."""
+    """Return the process that forks; it ends when this process ends."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     words = [sys.executable, str(Path(__file__)), os.environ.get("SHARED_DESIGNS", "")]
     warm = subprocess.Popen(words, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -152,7 +152,7 @@ def _warm() -> subprocess.Popen[str]:
 
 
 def run(command: str | list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """`python -m MODULE ...` of a command, or `python FILE ...`, in a terminal of 100 columns."""
+    """Run `python -m MODULE ...` or `python FILE ...` in a terminal of 100 columns."""
     words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
     with tempfile.TemporaryDirectory() as place:
         files = [Path(place, name) for name in ("out", "err")]
@@ -161,12 +161,12 @@ def run(command: str | list[str], folder: Path, **environment: str) -> subproces
 
 
 def begin(module: str, *options: str, out: Path, err: Path) -> int:
-    """Begin `python -m MODULE ...`, a session of its own that writes to these files, and return its process id."""
+    """Begin `python -m MODULE ...` in a new session that writes to these files, and return its process id."""
     return _asked_for(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
 
 
 def _asked_for(words: list[str], folder: Path, files: list[Path], environment: dict[str, str], beside=False) -> int:
-    """The code that the command leaves with, or where it goes on beside, its process id."""
+    """Return the exit code of the command, or with `beside` the process id of the command, which runs on."""
     request = {"words": words, "folder": str(folder), "files": [str(file) for file in files]}
     request |= {"environment": environment, "beside": beside}
     print(json.dumps(request), file=_warm().stdin, flush=True)
@@ -174,7 +174,7 @@ def _asked_for(words: list[str], folder: Path, files: list[Path], environment: d
 
 
 def _command(words: list[str]) -> None:
-    """In the child: the command by its door, or the file; the code that it leaves with."""
+    """Run the command or the file in the child; a command ends with SystemExit."""
     from haptic_loop.cli.main import COMMANDS, door
 
     if words[0] != "-m":
@@ -188,11 +188,11 @@ def _command(words: list[str]) -> None:
 
 
 def _child(request: dict) -> None:
-    """Never returns."""
+    """Run the request in the child and exit."""
     code = 99
     try:
         if request["beside"]:
-            os.setsid()  # Ctrl-C is not for it
+            os.setsid()  # Ctrl-C does not reach a new session
         os.chdir(request["folder"])
         os.environ.update(request["environment"])
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

@@ -1,11 +1,11 @@
-"""Passive hands whose energy is known exactly: the tests of energy accounts hold the devices with them."""
+"""Passive hands whose energy is known exactly, for tests of energy accounts."""
 
 import numpy as np
 from scipy.linalg import expm
 
 
 class Hands:
-    """Devices in random passive hands, integrated by the matrix exponential; the energy is the textbook's."""
+    """Devices in random passive hands, integrated by the matrix exponential."""
 
     def __init__(self, rng, nsim, lossless, start=0.0, masses=None, T=1.2e-3, delta=(1.37, 0.9)):
         m = self.m = len(delta)  # channels

@@ -1,14 +1,14 @@
-"""The oldest versions that pyproject.toml allows, as pip takes them: `make oldest` runs tests with them."""
+"""Print the oldest versions that pyproject.toml allows, as requirements for pip; `make oldest` tests with them."""
 
 import re
 import tomllib
 from pathlib import Path
 
-NEEDED = {"pytest", "hypothesis", "pytest-benchmark", "control", "pyserial"}  # of the packages for development
+NEEDED = {"pytest", "hypothesis", "pytest-benchmark", "control", "pyserial"}  # development packages that tests need
 
 
 def floors() -> list[str]:
-    """name==floor.* of every dependency, and of what the tests need."""
+    """Return NAME==OLDEST.* for every dependency and for the packages that the tests need."""
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     dev = [one for one in project["optional-dependencies"]["dev"] if re.split(r"[^\w-]", one)[0] in NEEDED]
     kept = [*project["dependencies"], *dev]

@@ -1,4 +1,4 @@
-"""An emulated device behind a pseudo-terminal: in real time, in a process of its own, for tests of the serial stack."""
+"""An emulated device behind a pseudo-terminal, in real time and in a separate process, to test the serial stack."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from forked import begin
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, nobody
 from haptic_loop.sim.scenario import load
 
-_PATIENCE = 60.0  # [s] for the emulator to begin, and to end
-_LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
+_PATIENCE = 60.0  # [s] longest wait for the emulator to begin, and to end
+_LINGER_US = 50_000  # the emulator runs on after the cable was pulled: the device comes to rest
 
 
 class Terminal:
@@ -40,11 +40,11 @@ class Terminal:
     def read(self) -> bytes:
         try:
             return os.read(self.master, 4096)
-        except OSError:  # nothing there, or nobody
+        except OSError:  # there is nothing to read, or the other end is closed
             return b""
 
     def write(self, data: bytes) -> None:
-        with suppress(OSError):  # nobody reads: a cable keeps nothing either
+        with suppress(OSError):  # nobody reads: the data are lost, as on a cable
             os.write(self.master, data)
 
     def unplug(self) -> None:
@@ -56,8 +56,8 @@ class Terminal:
 class RealTimeEmulator:
     """The emulator in real time. Its timer never catches up.
 
-    Where this process was held up, the missed time is taken out of the device's clock, since catching up would look to
-    the host like answers that came too late.
+    If this process was held up, the lost time is subtracted from the device's clock. Catching up would look to the host
+    like late answers.
     """
 
     def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float, pace: float) -> None:
@@ -76,7 +76,7 @@ class RealTimeEmulator:
         return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
     def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
-        """Tick until the time is over, the cable is pulled or it is stopped."""
+        """Tick until the time is over, `asked_to_stop()` is true, or the cable was pulled 50 ms ago."""
         due, unplugged_at = self._period, None
         while not asked_to_stop() and self.now() < 1e6 * seconds:
             self._wait(due)
@@ -84,8 +84,8 @@ class RealTimeEmulator:
             if now < due:
                 continue
             if not self.emulator.unplugged:
-                self._hear(self.terminal.read(), due)  # what came while this process was held up is not late
-            if now - due > self._period / 2:  # held up: the device's timer was not
+                self._hear(self.terminal.read(), due)  # bytes that came in the meantime are on time
+            if now - due > self._period / 2:  # this process was held up, unlike a device's timer
                 self.late += 1
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)
@@ -98,7 +98,7 @@ class RealTimeEmulator:
                 return
 
     def _wait(self, due: float) -> None:
-        """Until the next tick is due or bytes come or go, and see to those first."""
+        """Wait until the next tick is due or bytes come or go, and handle the bytes."""
         first = min(due, self._queue[0][0]) if self._queue else due
         timeout = max(0.0, 1e-6 * (first - self.now()) / self._pace)
         if self.emulator.unplugged:
@@ -133,7 +133,7 @@ class RealTimeEmulator:
 
 
 class EmulatorProcess:
-    """An emulator in a process of its own, which is started with `options`; `path` is its terminal."""
+    """An emulator in a separate process, started with `options`; `path` is its terminal."""
 
     def __init__(self, *options: str) -> None:
         self._folder = tempfile.TemporaryDirectory()
@@ -144,7 +144,7 @@ class EmulatorProcess:
         self.path = path.read_text().strip()
 
     def end(self, patience: float = 0.0) -> dict[str, str]:
-        """What it says of its device at the end, which comes by itself where the cable was pulled."""
+        """Return the report on the device at the end; end the process if it runs on after `patience` [s]."""
 
         def ended() -> bool:
             return self._said.read_text().endswith("}\n")
@@ -166,7 +166,7 @@ def _within(seconds: float, true: Callable[[], bool]) -> bool:
 
 @contextmanager
 def emulated(*options: str) -> Iterator[str]:
-    """Yield the path of an emulator in a process of its own, which is ended afterwards."""
+    """Yield the path of an emulator in a separate process, which is ended afterwards."""
     emulator = EmulatorProcess(*options)
     try:
         yield emulator.path

@@ -1,4 +1,4 @@
-"""Sessions in virtual time: what the tests of hw/ rehearse with."""
+"""Sessions in virtual time, for the tests of hw/."""
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import SafetyLimits

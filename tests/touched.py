@@ -1,8 +1,8 @@
-"""The tests of what a change touches, and with `sources` the files of it: `make check` looks at these.
+"""Print the tests of changed files, or with `sources` the changed files of the packages, for `make check`.
 
-Changed tests come first; a file of a package is tested by the files of its name, or its folder's, under tests/, else by
-those that import it, else by the folder of its package. Nearest first: `make check` ends after a minute.
-What has changed is what git sees as different from HEAD, or the last commit where nothing does.
+Changed tests come first. A file of a package is tested by the files under tests/ named like it or its folder, else by
+those that import it, else by the folder of its package. Files with few tests come first: `make check` ends after a
+minute. Changed are the files that differ from HEAD or, if there are none, those of the last commit.
 """
 
 import re
@@ -14,13 +14,13 @@ PACKAGES = ("models", "controller", "design", "sim", "hw", "cli")
 
 
 def changed() -> list[str]:
-    """Paths that differ from HEAD, files that git does not track among them; those of the last commit where none do."""
+    """Return the paths that differ from HEAD, with untracked files, or else those of the last commit."""
     seen = _git("diff", "--name-only", "HEAD") + _git("ls-files", "--others", "--exclude-standard")
     return seen or _git("diff", "--name-only", "HEAD~1")
 
 
 def tests_of(paths: list[str]) -> list[str]:
-    """What to hand to pytest."""
+    """Return the arguments of pytest."""
     tests = [path for path in paths if path.startswith("tests/") and "/test_" in path and Path(path).exists()]
     found = [path for path in tests if "benchmarks" not in path] + ["tests/project/test_layers.py"]
     mirrors = [_mirror(path) for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES]
@@ -28,13 +28,13 @@ def tests_of(paths: list[str]) -> list[str]:
 
 
 def sources_of(paths: list[str]) -> list[str]:
-    """What to hand to pyright, which would look at everything if it were handed nothing."""
+    """Return the arguments of pyright: at least one file, since without a file it would check everything."""
     found = [path for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES and Path(path).exists()]
     return found or ["cli/__init__.py"]
 
 
 def _mirror(path: str) -> set[str]:
-    """Files of its name, or its folder's, else those of its package that import it, else all of its package."""
+    """Return the tests named like the file or its folder, else those that import it, else its package's folder."""
     package, *folders = Path(path).parts[:-1]
     tests, stem = sorted(Path("tests").glob("*/test_*.py")), Path(path).stem
     own = {str(test) for test in tests if test.stem[5:] in (stem, *folders)}

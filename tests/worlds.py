@@ -1,4 +1,4 @@
-"""What many tests share: the default pair, couplings for it, and formulas written out by hand."""
+"""Loops, couplings and formulas that many tests share: the default pair and formulas written out by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import Loop
 
-#: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
+#: Figure 4 of the paper as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
 FIGURE_4 = Network(
     contacts=("contact 1", "contact 2"),
     springs=(
@@ -26,7 +26,7 @@ FIGURE_4 = Network(
 def checkered(*sides):
     """Return all combinations of the sides' values as parameters; every second one is left to `make validate`.
 
-    Each value of each side stays with half of the values of every other side, like the fields of one colour.
+    `make test` runs each value with at least half of the values of every other side, like fields of one colour.
     """
     marks = ((), pytest.mark.validate)
     places = product(*(enumerate(side) for side in sides))
@@ -47,7 +47,7 @@ SOFT_NETWORK = Network(
     (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
     {"mass": 1.0},
 )
-#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-ranges and at nothing else
+#: a coupling of version 0.1: a diagonal Q of eight basis functions, designed for the vertices of omega-pair-ranges only
 POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
 DIAGONAL = (
     (-3.6184269801e-05, -2.9144270496e-05),
@@ -63,17 +63,17 @@ VERTICES_ONLY = _InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGON
 
 
 def force_map(E, coupling, theta, psi):
-    """F = Theta (I + Psi E V)^-1 Psi E (6), of an environment E(z)."""
+    """Return F = Theta (I + Psi E V)^-1 Psi E (6) of an environment E(z)."""
     return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)
 
 
 def loop_of(network, theta, psi, period: float = T) -> Loop:
-    """A loop whose tick is looked at: no damping and no reference matter to it."""
+    """Return a loop for tests of a tick, which depends neither on the damping nor on the reference."""
     return Loop(period, tuple(theta), tuple(psi), (0,) * len(theta), (1.0,) * len(theta), network)
 
 
 def environment_by_hand(network: Network, z: np.ndarray, period: float = T) -> np.ndarray:
-    """(M s^2 + D s + K)^-1 as the contacts feel it, the inner node eliminated: shape (k, 2, 2) at k points z."""
+    """Return E(z) (k, 2, 2) at k points z: M s^2 + D s + K with the inner node eliminated."""
     M, D, K = network.matrices()
     s = ((z - 1) / (period * z))[:, None, None]
     Z = M * s**2 + D * s + K
@@ -81,7 +81,7 @@ def environment_by_hand(network: Network, z: np.ndarray, period: float = T) -> n
 
 
 def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
-    """R(z) from the definition of its basis: shape (k, m, m) at k points z."""
+    """Return R(z) (k, m, m) at k points z, from the definition of its basis."""
     R, through = coupling.R[0].astype(complex), np.ones_like(z)
     for a, coefficient in zip(coupling.poles, coupling.R[1:], strict=False):
         R = R + coefficient * (through * (1 - a) / (z - a))[:, None, None]

@@ -1,4 +1,4 @@
-"""python -m design.check: exit codes, output, and that it needs no solver."""
+"""python -m design.check: exit codes and output; the command imports no solver."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from haptic_loop.design.coupling_file import Stored, save
 
 
 def leave(monkeypatch, *argv: str) -> int:
-    """The exit code of the command."""
+    """Run the command and return its exit code."""
     monkeypatch.setattr(sys, "argv", ["design.check", *argv])
     with pytest.raises(SystemExit) as leaving:
         execute(main)

@@ -1,4 +1,4 @@
-"""What every coupling costs and gives the same devices and hands."""
+"""design.compare: required damping and errors of several couplings for the same devices and hands."""
 
 import json
 
@@ -26,7 +26,7 @@ def test_each_coupling_has_its_price_and_error(tmp_path):
     assert none["required_damping"]["this-environment"] == pytest.approx([1.7229] * 2, rel=1e-4)
     assert free["guarantee"] == "any passive environment"
     assert [row["dc_ratio"] for row in (free, here, best)] == pytest.approx([0.476, 0.850, 1.0], abs=1e-3)
-    # over the band 1.8 %, every octave alike; less for the slow motion of this run
+    # the rms mismatch over the band is 1.8 %; the slow motion of this run has a smaller error
     assert best["force_error_percent"] == pytest.approx(0.58, abs=0.1)
     assert here["force_error_percent"] < free["force_error_percent"]
     assert best["rms_mismatch_db"] == pytest.approx(-34.87, abs=0.3)
@@ -35,7 +35,7 @@ def test_each_coupling_has_its_price_and_error(tmp_path):
 
 @pytest.mark.slow
 def test_a_row_is_the_run_of_that_coupling(tmp_path):
-    """The run uses the other engine."""
+    """The row and the run have the same error, though the run uses the other engine."""
     rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--no-plot")}
     assert run_once(["--no-plot", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
     error = json.loads((tmp_path / "run.json").read_text())["ideal_force"]["error_percent"]

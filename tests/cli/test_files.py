@@ -1,4 +1,4 @@
-"""Files are whole or not there; what is no file is written as it is; a full disk is one line."""
+"""Files are written completely or not at all, pipes directly; a full disk gives one error line."""
 
 import errno
 import os
@@ -52,7 +52,7 @@ def test_a_full_disk_keeps_the_old_file(tmp_path):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.skipif(not Path("/proc/kmsg").exists(), reason="a file of Linux")
+@pytest.mark.skipif(not Path("/proc/kmsg").exists(), reason="only Linux has /proc/kmsg")
 def test_files_that_would_wait_end_in_an_error():
     """Reading /proc/kmsg would wait for the kernel's next message."""
     code = "from haptic_loop.sim.scenario import load\nload('/proc/kmsg')"

@@ -1,4 +1,4 @@
-"""Every command's --help ends with an example of that command, and its arguments are what the command takes."""
+"""Every command's --help ends with two examples, whose arguments the command accepts."""
 
 import importlib
 import os
@@ -14,8 +14,8 @@ from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
 
 ROOT = Path(__file__).parents[2]
-DOOR = re.compile(r"    door\(\"(\w+)\"\)")  # how a file says that it is a command
-LAUNCH = re.compile(r"    execute\((\w+)\)")  # the same, of a file that holds its command
+DOOR = re.compile(r"    door\(\"(\w+)\"\)")  # the line with which a file starts a command of cli
+LAUNCH = re.compile(r"    execute\((\w+)\)")  # the line with which a file starts a command that it defines
 
 
 class Parsed(Exception):
@@ -23,7 +23,7 @@ class Parsed(Exception):
 
 
 def modules():
-    """Every command as python -m names it."""
+    """Return the names of all commands, as for python -m."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
     texts = {path: path.read_text() for path in files}
     doors = [path for path in files if DOOR.search(texts[path]) or LAUNCH.search(texts[path])]
@@ -72,7 +72,7 @@ def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
 
 @pytest.mark.parametrize("module", modules())
 def test_help_says_what_every_option_is(module, capsys, monkeypatch):
-    """No option without a word on what it does."""
+    """Every option has a help text."""
     parse = Parser.parse_args
     seen = []
 
@@ -105,7 +105,7 @@ def count(*_):
     ids=("command", "function"),
 )
 def test_commands_and_functions_compute_with_one_blas_thread(call):
-    """The last digits depend on how a sum is shared; an environment that asks for two threads changes nothing."""
+    """The last digits depend on the number of threads, so a user's OPENBLAS_NUM_THREADS=2 must change nothing."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "2"}
     words = [sys.executable, "-c", COUNT + call]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)

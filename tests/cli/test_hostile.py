@@ -1,4 +1,4 @@
-"""A thousand command lines and files that nobody should write; tests/tools/hostile.py says how each must end."""
+"""Hundreds of bad command lines and files; tests/tools/hostile.py says how each must end."""
 
 import os
 import re
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def driven(*options: str) -> int:
-    """The number of cases that the driver runs, in one process, forked for each; all are answered well."""
+    """Run the driver, assert that all cases are answered well, and return their number."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     words = [sys.executable, str(ROOT / "tests/tools/hostile.py"), *options]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
@@ -24,5 +24,5 @@ def driven(*options: str) -> int:
 
 @pytest.mark.slow
 def test_hostile_cases_are_answered_well():
-    """`make validate` has all pairs of commands, fields and values; here each occurs, in one pair of two or three."""
+    """Of pairs with values one in two or three runs, so that each field and value occurs; `make validate` runs all."""
     assert driven("--short") >= 500

@@ -25,7 +25,7 @@ def started(*words, **options):
 
 
 def interrupted_after(module, command, cwd):
-    """SIGINT as soon as Python reports that `module` is imported: a time in the command's life, on any machine."""
+    """Send SIGINT when Python reports that `module` is imported: the same moment of the command on any machine."""
     process = started("-X", "importtime", "-m", *command, cwd=cwd)
     for line in process.stderr:
         if line.rpartition("|")[2].strip() == module:
@@ -37,7 +37,7 @@ def interrupted_after(module, command, cwd):
 
 
 def test_ctrl_c_while_the_solver_is_imported(tmp_path):
-    """After the command has begun: the design imports it."""
+    """The design imports the solver after the command has begun."""
     assert interrupted_after("clarabel", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
 
 
@@ -48,7 +48,7 @@ def test_an_interrupted_comparison_reports_nothing(tmp_path):
 
 
 def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
-    """nohup, and `command &` in a script, have SIGINT ignored."""
+    """nohup, and `command &` in a script, start a command with SIGINT ignored."""
     words = ["-c", "import os, signal, sys; signal.signal(2, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"]
     process = started(*words, sys.executable, "-X", "importtime", "-m", "sim.run", "--help", cwd=tmp_path)
     for line in process.stderr:
@@ -71,7 +71,7 @@ AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certifie
     ],
 )
 def test_a_closed_pipe_keeps_the_exit_code(command, code, tmp_path):
-    """As `| head -1`, but leaving before the first line, so that every write finds nobody."""
+    """The reader closes the pipe before the first line, so that every write fails."""
     with started("-m", *command, cwd=tmp_path) as process:
         process.stdout.close()
         errors = process.stderr.read()
@@ -79,7 +79,7 @@ def test_a_closed_pipe_keeps_the_exit_code(command, code, tmp_path):
     assert "Broken" not in errors
     assert "Traceback" not in errors
     if "--help" not in command:
-        assert list(tmp_path.glob("out/*/report.json"))  # the work is done all the same
+        assert list(tmp_path.glob("out/*/report.json"))  # the command does its work nevertheless
 
 
 def test_the_folder_of_an_output_must_exist(tmp_path):
@@ -129,7 +129,7 @@ def test_only_drawing_commands_need_mujoco_gl(asked, tmp_path):
 
 
 def test_a_full_standard_output_is_one_line(tmp_path):
-    """And not exit code 1, which says that what was asked does not hold."""
+    """The exit code is not 1, which would mean that the coupling is not certified."""
     if not os.path.exists("/dev/full"):
         pytest.skip("there is no /dev/full here")
     command = [sys.executable, "-m", "design.audit", "--rigid", "--K", "1000", "--B", "1", "--out", str(tmp_path)]

@@ -1,4 +1,4 @@
-"""Types of options: one line that names the option, what came and what is allowed; names of conditions, old and new."""
+"""Bad options end with one line that names the option, its value and the allowed values."""
 
 import argparse
 from dataclasses import dataclass
@@ -70,7 +70,7 @@ class Report:
 
 
 def test_a_figure_is_a_field(capsys):
-    """Its name and format stand beside it; table and JSON follow."""
+    """Table and JSON follow the declaration of a field, which has its name and format."""
     reports = [Report("a", 1.0), Report("b", None, False)]
     assert list(render.rows_of(reports[0])) == [("loop", "a"), ("growth [1/s]", "+1.00")]
     assert list(render.rows_of(reports[1])) == [("loop", "b"), ("growth [1/s]", None)]
@@ -120,7 +120,7 @@ def scenario_of(words):
 
 
 def test_known_bounds_and_damping_are_both_taken():
-    """Bounds of an option replace the scenario's own, with and without --delta."""
+    """Bounds of --known-device replace those of the scenario, with and without --delta."""
     bounds = "--scenario omega-pair-known --known-device 0.06,14500,0.5,5"
     scenario = scenario_of(f"{bounds} --delta 1.2 --theta 2,2 --latency 1e-4 --T 1e-3")
     assert {bound.transmission_damping_max for bound in scenario.known_devices} == {5.0}
@@ -229,7 +229,7 @@ def test_options_without_effect_are_refused(command, words, option, tmp_path, mo
 
 
 def test_two_references_are_refused(tmp_path):
-    """lam of a scenario is the reference of both cases, so that --reference II would change nothing."""
+    """A scenario's lam is the reference of both cases, so --reference II would change nothing."""
     assert load().replace(lam=(0, 1)).loop("I").lam == load().replace(lam=(0, 1)).loop("II").lam
     text = (SCENARIOS / "omega-pair.toml").read_text()
     (tmp_path / "own.toml").write_text(text.replace("psi = ", "lam = [0, 1]\npsi = "))

@@ -1,4 +1,4 @@
-"""The condition that docs/extending.md shows, in every command: designed for, proved, judged, drawn, driven."""
+"""Every command accepts the condition that docs/extending.md shows."""
 
 import json
 import re
@@ -20,7 +20,7 @@ JSON = ["--json", "report.json"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """With the page's condition in a file, and a spring-damper that the command has designed for it."""
+    """Return a folder with the page's condition in a file, and a spring-damper that `design` made for it."""
     place = tmp_path_factory.mktemp("own")
     found = re.search(r"```python\n# joined.py\n(.*?)```", PAGE, re.DOTALL)
     (place / "joined_devices.py").write_text(found[1])
@@ -41,7 +41,7 @@ def test_a_design_for_it_is_proved_and_tight(folder):
     assert decisive(report) == needs
     assert (needs["proof"], report["stored"]["proof"]) == ("rational", "rational")
     assert 1.36 < max(needs["required_damping"]) < 1.37
-    # the devices' joint damping is a full matrix: its least eigenvalue is .2 less, its largest .2 more
+    # the devices' joint damping is a full matrix with the eigenvalues 1.37 - .2 and 1.37 + .2
     here = max(report["assessment"]["requirements"]["this-environment"]["required_damping"])
     assert 1.37 * here / 1.57 < max(needs["required_damping"]) < 1.37 * here / 1.17
     assert "yours to show" in report["claim"]
@@ -144,7 +144,7 @@ def test_in_python_it_is_the_class(folder, monkeypatch):
     assert needs[NAME].proof == "rational"
     assert certify(loop, made.coupling, own)[NAME].required == needs[NAME].required
     assert NAME not in certify(loop, made.coupling)
-    # with Delta = 1.37 I in the place of the full matrix its block is that of this-environment, so s is between
+    # with Delta = 1.37 I for the full matrix the block would be that of this-environment; its eigenvalues bound s
     assert 1 / 1.57 < needs[NAME].ratio / needs["this-environment"].ratio / 1.37 < 1 / 1.17
     assert np.isfinite(needs["any-environment"].ratio)
 

@@ -1,4 +1,4 @@
-"""Scenarios in radians: the numbers of metres, and the units of rotary devices in all that leaves the program."""
+"""Scenarios in radians give the same numbers as scenarios in metres, with the units of rotary devices."""
 
 import json
 import re
@@ -60,7 +60,7 @@ def test_keys_take_the_rotary_units():
 
 
 def test_radians_change_no_number():
-    """The wheel and the same numbers in metres: equal gains, requirement and trace; digests that differ."""
+    """The wheel and the same numbers in metres have equal gains, requirements and traces, but different digests."""
     wheel = load(WHEEL)
     handle = parse(WHEEL.read_text().replace('unit = "rad"', "").replace("radius = 0.15", ""))
     gains, needs, forces = [], [], []
@@ -78,7 +78,7 @@ def test_radians_change_no_number():
 
 @pytest.mark.slow
 def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
-    """Tables, reports, headers, texts of pictures, C comments and logs of the commands that a wheel goes through."""
+    """Tables, reports, headers, C comments and logs of seven commands have no linear unit."""
     stored, out = tmp_path / "wheel.json", tmp_path / "out"
     for command, *words in (
         ("run", "--duration", "0.2", "--out", str(out)),
@@ -139,7 +139,7 @@ def test_refused_options_are_rotary(command, words, unit):
 
 
 def test_the_live_window_is_rotary():
-    """Also in a thread of its own, where no command has set the unit."""
+    """The window's thread takes the unit from the scenario, since no command has set it there."""
     figure = _figure(0, np.zeros((2, 1)), np.zeros((2, 1)), 1.0, load(WHEEL).unit)
     assert figure.title == "force on device 1 [N m]"
 

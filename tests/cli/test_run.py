@@ -62,7 +62,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
-    """Not the paper's condition: that renders half the stiffness, and the first run should show what is possible."""
+    """The paper's condition would render half the stiffness; the first run should show what is possible."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"
@@ -73,7 +73,7 @@ def test_the_default_is_the_design_for_this_environment(tmp_path):
 
 
 def test_several_environments_default_to_any_environment(tmp_path):
-    """Ranges, and limited forces before walls, are covered by any-environment alone."""
+    """Loops with walls or ranges default to any-environment, which covers more environments."""
     assert all(usual_condition(load(name).loop("I")) == "any-environment" for name in ("one-wall", "omega-pair-ranges"))
     _, report = run(tmp_path, "--scenario", "one-wall", "--no-plot", "--duration", "0.5")
     assert report["assessment"]["condition"] == "any-environment"
@@ -131,7 +131,7 @@ def test_running_twice_gives_the_same_files(tmp_path):
 
 
 def test_a_tampered_coupling_is_named(tmp_path):
-    """One gain changed by 1 %: judged anew, and the report says that the file's certificate does not hold."""
+    """A coupling with one gain changed by 1 % is judged anew; the report says that its file's certificate fails."""
     scenario = load()
     data = SpringDamper((400.0, 300.0), (0.1, 0.1))
     stored = Stored.of(scenario.loop("I"), data, prove(scenario.loop("I"), data, "any-environment"))
@@ -208,8 +208,8 @@ def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
     *waiting, refusal = done.stderr.splitlines()
     assert done.returncode == 1
     assert refusal.startswith("not possible: Theorem 4 admits no coupling")
-    assert "use " not in refusal  # what was not run is not proposed
-    assert all(line.endswith(" ..") for line in waiting)  # what a slow machine is waiting for
+    assert "use " not in refusal  # no design is proposed that was not tried
+    assert all(line.endswith(" ..") for line in waiting)  # progress lines, on a slow machine
 
 
 def test_json_on_standard_output_is_only_json(tmp_path):
@@ -221,10 +221,10 @@ def test_json_on_standard_output_is_only_json(tmp_path):
 
 
 def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
-    """Each stage by its name, the optimal design by what it has reached; standard output is the report alone."""
+    """Standard error names each stage and the error reached by the optimal design; standard output has neither."""
     monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # one that is made before one's eyes
-    monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # by its first basis, which says what it has reached
+    monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # without the tests' cache
+    monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # stop after the first basis, which reports its error
     one_device = (
         "--scenario",
         str(Path(__file__).parents[2] / "benchmarks/loops/o13-no-mass.toml"),
@@ -239,7 +239,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
 
 
 def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
-    """Ctrl-C in the third block: the first two are written, and the exit code says so."""
+    """After Ctrl-C in the third block the first two are written, and the exit code is 130."""
     block, calls = loop.run_block, []
 
     def interrupted(*args):
@@ -296,7 +296,7 @@ def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
         text = f"{imported}\ndef {name}(loop): return SpringDamper([{K}] * 2, [1.0] * 2)\n"
         Path(f"{name}/mine.py").write_text(text)
         Path(f"{name}/loop.toml").write_text((SCENARIOS / "omega-pair.toml").read_text())
-        sys.modules.pop("mine", None)  # as in a process of its own
+        sys.modules.pop("mine", None)  # as in a new process
         coupling = ["--coupling", f"{name}/mine.py:{name}", "--scenario", f"{name}/loop.toml"]
         assert main([*coupling, "--duration", "0.01", "--no-plot"]) == 0
     sys.modules.pop("mine", None)

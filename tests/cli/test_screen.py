@@ -44,7 +44,7 @@ def test_a_table_that_fits_is_as_it_was():
 
 
 def test_every_report_is_printed_on_a_screen():
-    """A bare rich Console cuts: only the progress bar may use one."""
+    """A bare rich Console cuts numbers: only the progress bar may use one."""
     bare = set()
     for path in (file for world in ("design", "sim", "hw", "cli") for file in (ROOT / world).rglob("*.py")):
         calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
@@ -55,7 +55,7 @@ def test_every_report_is_printed_on_a_screen():
 
 @pytest.mark.parametrize("name", ["[/]", "[/red]", "[b]out[/b]", "a[0", "[red", ":x:", "[K]", "[m/s]"])
 def test_a_name_is_no_markup(name):
-    """Names of files, scenarios and devices come from outside."""
+    """Names of files, scenarios and devices are printed as they are, even if they look like markup."""
     table = Table("what", title=name)
     table.add_row(f"cell {name} end")
     lines = printed(table, 60).splitlines()
