@@ -1,10 +1,10 @@
-"""How often the bound of hw.identify is above the truth: random devices, encoder and forces rounded.
+"""Count how often the bound of hw.identify exceeds the true damping of random simulated devices.
 
-PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some minutes; --first 120 goes on from there)
+PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some minutes; continue with --first 120)
 
 Every case draws a device from its own seed: rigid, or compliant every fourth time; mass 0.1 to 0.5 kg, viscous friction
-0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (none at all in a fifth of them), encoder 1 to 20 um, standing anywhere
-within a step, half of them with white noise of 0.2 or 0.4 steps. The excitation is the command's own.
+0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (0 in a fifth of the cases), encoder steps 1 to 20 um with a random origin,
+in half of the cases with white noise of 0.2 or 0.4 steps. The excitation is that of the command without its swing.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from haptic_loop.hw.identify import Estimate, chirp, identify
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import load
 
-FORCE_STEP = 4e-4  # [N] of the wire
+FORCE_STEP = 4e-4  # [N] to which the protocol rounds forces
 NOISE = (0.0, 0.0, 0.2, 0.4)  # [encoder steps]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A device, and how it is looked at."""
+    """A device, its encoder, and the length of the record."""
 
     seed: int
     rigid: bool
     mass: float  # [kg]
     motor: float  # part of the mass, where there is a transmission
-    stiffness: float  # [N/m] of it
+    stiffness: float  # [N/m] of the transmission
     viscous: float  # [N s/m]
     coulomb: float  # [N]
     step: float  # [m]
     noise: float  # [steps]
-    seconds: float = 2.5  # of the chirp
+    seconds: float = 2.5  # duration of the chirp
 
 
 def case(seed: int) -> Case:
@@ -60,7 +60,7 @@ def case(seed: int) -> Case:
 
 
 def estimated(c: Case) -> Estimate:
-    """What is estimated from a record of it. Raises ValueError where nothing is."""
+    """Return the estimate from a simulated record. Raises ValueError if there is none."""
     base, draw = load("omega-pair"), np.random.default_rng((c.seed, 1))
     if c.rigid:
         device = RigidDevice(mass=c.mass, damping=c.viscous)
@@ -82,7 +82,7 @@ def estimated(c: Case) -> Estimate:
 
 
 def judged(seed: int) -> tuple[Case, Estimate | str, float]:
-    """The case, what came of it, and how long it took [s]."""
+    """Return the case, its estimate or the error message, and the time that it took [s]."""
     c, begin = case(seed), time.perf_counter()
     try:
         found: Estimate | str = estimated(c)
@@ -92,7 +92,7 @@ def judged(seed: int) -> tuple[Case, Estimate | str, float]:
 
 
 def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
-    """One line per case, then the figures."""
+    """Print one line per case, then the figures of all cases."""
     excess, scaled, none, longest = [], [], 0, 0.0
     for c, found, seconds in results:
         longest = max(longest, seconds)
@@ -114,7 +114,7 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
 
 
 def main() -> None:
-    """Cases --first to --first + --cases, two at a time."""
+    """Run --cases cases from --first on, --workers at a time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=120)
     parser.add_argument("--first", type=int, default=0)

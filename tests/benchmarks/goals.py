@@ -1,10 +1,10 @@
-"""Speed beside error, goal by goal, in one run.
+"""Measure speed and error, goal by goal, in one run.
 
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
 
-CPU seconds. Ratios are medians of rounds in which both sides alternate; commands are medians of three, each in a
-process of its own, beside the floor: the import of NumPy and MuJoCo in the same round. `--write` puts the tables of
-engines and cold into the pages: on an idle machine.
+Times are CPU seconds, for first lines wall seconds. Ratios are medians of rounds in which both sides alternate. A
+command runs in a new process, three times or, if long, once, beside the floor: the import of NumPy and MuJoCo.
+`--write` puts the table of cold into docs/accuracy.md; use it on an idle machine.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from haptic_loop.sim.stability import exact_growth
 ROOT = Path(__file__).parents[2]
 PAGES = {"cold": "docs/accuracy.md"}
 ROUNDS = 9
-FLOOR = "-c import numpy, mujoco"  # what every command that simulates has to wait for
+FLOOR = "-c import numpy, mujoco"  # every command that simulates needs these imports
 
 #: words of a command -> goal in floors; {} is a folder that all commands share
 COMMANDS = {
@@ -49,7 +49,7 @@ COMMANDS = {
     "sim.run --case I --out {} --json {}/r.json": 4.0,
 }
 MANY = "design --coupling optimal --out {}/many.json --json {}/r.json --scenario"  # four and eight devices
-#: commands of many seconds, once -> goal in floors
+#: commands of many seconds, which run once -> goal in floors
 LONG = {
     "sim.validate --humans 1000 --no-plot --out {} --json {}/r.json": 7.3,
     "sim.validate --humans 1000 --no-plot --traces all --out {} --json {}/r.json": None,
@@ -62,7 +62,7 @@ FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/o
 
 
 def engines() -> Iterator[Sequence[str]]:
-    """The default design with its limiter; goals: 3 x as fast as RK4 x 4, loop over raw 1.10, growth 1e-9 1/s."""
+    """Measure the default design with its limiter. Goals: 3 x as fast as RK4 x 4, loop / raw 1.10, growth 1e-9 1/s."""
     scenario = SCENES["default"]
     chosen = choose(scenario, "I", "spring-damper", "this-environment")
     simulation = assemble(scenario, chosen.coupling, assessed(scenario, "I", chosen).force_limits.rho)
@@ -90,7 +90,7 @@ def engines() -> Iterator[Sequence[str]]:
 
 
 def started(words: str, folder: str) -> subprocess.Popen[bytes]:
-    """The command in a process of its own, with bytecode and matplotlib's list of fonts as a user has them."""
+    """Start the command in a new process, with bytecode and matplotlib's list of fonts as a user has them."""
     environment = os.environ | {"MPLCONFIGDIR": matplotlib.get_cachedir(), "PYTHONPATH": str(ROOT)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     arguments = ["-c", words[3:]] if words.startswith("-c ") else ["-m", *words.format(*[folder] * 2).split()]
@@ -99,7 +99,7 @@ def started(words: str, folder: str) -> subprocess.Popen[bytes]:
 
 
 def cost(words: str, folder: str) -> float:
-    """CPU seconds of a command and what it starts."""
+    """Return the CPU seconds of a command and its child processes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     started(words, folder).communicate()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -107,7 +107,7 @@ def cost(words: str, folder: str) -> float:
 
 
 def first_line(words: str, folder: str) -> float:
-    """Seconds until a command has printed a line; of the floor, until it has ended."""
+    """Return the seconds until a command has printed a line, or until the floor has ended."""
     begin = time.perf_counter()
     process = started(words, folder)
     assert process.stdout is not None
@@ -118,7 +118,7 @@ def first_line(words: str, folder: str) -> float:
 
 
 def error(report: dict[str, Any]) -> str:
-    """What stands beside the speed: errors of a simulation, or how the requirement was proved."""
+    """Return the text beside the speed: errors of a simulation, or how the requirement was proved."""
     if "traces" in report:
         traced = report["traces"] and f", {report['traces']['witnessed']} traces by both engines"
         apart = f"growth rates {report['largest_difference_per_s']:.1e} 1/s apart"
@@ -135,7 +135,7 @@ def error(report: dict[str, Any]) -> str:
 def interleaved(
     commands: Mapping[str, float | None], spent: Callable[[str, str], float], rounds: int
 ) -> Iterator[Sequence[str]]:
-    """A row for each command: the median of its seconds, and of its ratios to the floor beside it."""
+    """Yield a row for each command: the medians of its seconds and of its ratios to the floor in the same round."""
     with tempfile.TemporaryDirectory() as folder:
         for words in [*commands] if rounds > 1 else []:
             spent(words, folder)
@@ -172,13 +172,13 @@ def first() -> Iterator[Sequence[str]]:
 
 
 def peers() -> Iterator[Sequence[str]]:
-    """Tools that are not installed are left out."""
+    """Run peers.py, which leaves out tools that are not installed."""
     subprocess.run([sys.executable, str(Path(__file__).with_name("peers.py"))], check=True)
     return iter(())
 
 
 def table(rows: Iterable[Sequence[str]]) -> str:
-    """As Markdown, printed line by line."""
+    """Return the rows as a Markdown table, and print it line by line."""
     lines = []
     for cells in rows:
         lines.append(f"| {' | '.join(cells)} |\n")
@@ -200,8 +200,8 @@ def write(name: str, made: str) -> None:
 if __name__ == "__main__":
     known = {f.__name__: f for f in (engines, cold, first, long, peers)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("goals", nargs="*", metavar="|".join(known), help="by default all")
-    parser.add_argument("--write", action="store_true", help="into the pages")
+    parser.add_argument("goals", nargs="*", metavar="|".join(known), help="goals to measure (default: all)")
+    parser.add_argument("--write", action="store_true", help="write the table of cold into its page")
     args = parser.parse_args()
     if strange := set(args.goals) - set(known):
         parser.error(f"goals are {', '.join(known)}, not {', '.join(strange)}")

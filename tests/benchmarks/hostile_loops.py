@@ -1,4 +1,4 @@
-"""Random loops at the ends of what devices and objects are: is each one answered, proved, and how close to the bound?
+"""Design couplings for random extreme loops: is each design proved, and how close is it to the bound?
 
     PYTHONPATH=. python tests/benchmarks/hostile_loops.py --count 20 --seed 1
 
@@ -22,7 +22,7 @@ from haptic_loop.design.optimal import design
 
 
 def hostile(rng: np.random.Generator) -> Loop:
-    """A loop with every figure drawn evenly, those with units in their logarithms."""
+    """Return a loop with evenly drawn figures; masses, stiffnesses and dampings are even in their logarithms."""
 
     def drawn(low: float, high: float) -> float:
         return float(f"{np.exp(rng.uniform(np.log(low), np.log(high))):.3g}")
@@ -52,17 +52,17 @@ def hostile(rng: np.random.Generator) -> Loop:
 
 
 def loops(count: int, seed: int) -> Iterator[tuple[int, Loop]]:
-    """So many, by their seeds."""
+    """Yield `count` loops with their seeds."""
     for number in range(seed, seed + count):
         yield number, hostile(np.random.default_rng(number))
 
 
 def main() -> None:
-    """Print a line per loop; exit with 1 where one is not answered or not proved."""
+    """Print a line per loop; the exit code is 1 if a design is not proved."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--bound", action="store_true", help="what any linear coupling can reach, too")
+    parser.add_argument("--bound", action="store_true", help="compute the bound for any linear coupling, too")
     args, missed = parser.parse_args(), 0
     for number, loop in loops(args.count, args.seed):
         started = time.process_time()

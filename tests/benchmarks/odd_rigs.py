@@ -1,9 +1,9 @@
-"""Sixty simulated rigs that are not ideal, and what hw.identify makes of them.
+"""Run hw.identify on sixty simulated rigs, most of which are not ideal.
 
 PYTHONPATH=. python tests/benchmarks/odd_rigs.py     (two minutes; --seed 1 draws other rigs)
 
-The plant is written here, by semi-implicit Euler in small steps, all rigs at once; nothing of the emulator is used.
-The true guarantee of each is its motor's viscous friction: all else is passive, or is not the device's (a hand).
+This file integrates the plants itself, by semi-implicit Euler in small steps, and does not use the emulator. The true
+guarantee of a rig is the viscous friction of its motor: all else is passive, or does not belong to the device.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
-#: what the fit of before, one mass and Coulomb friction by output error, made of these; "none" of all others
+#: results of an earlier fit (one mass with Coulomb friction, by output error); it gave none for all other rigs
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")
@@ -27,22 +27,22 @@ BASE = ("viscous", "mass", "motor", "spring", "step")
 
 @dataclass(frozen=True)
 class Rig:
-    """What a rig has besides its masses; zero is the ideal."""
+    """A rig with its imperfections: each is ideal at zero, or at infinity for `thin`."""
 
     name: str
-    viscous: float = 1.0  # [N s/m] the truth
+    viscous: float = 1.0  # [N s/m] the true guarantee
     mass: float = 0.25  # [kg]
-    motor: float = 0.3  # part of it
+    motor: float = 0.3  # the motor's part of the mass
     spring: float = 14500.0  # [N/m] of the transmission
     loss: float = 0.5  # [N s/m] of the transmission
     step: float = 5e-6  # [m] encoder
     coulomb: float = 0.0  # [N]
     slip: float = 0.002  # [m/s]
     static: float = 0.0  # [N] above Coulomb's
-    stribeck: float = 0.02  # [m/s] at which it is gone
-    thin: float = np.inf  # [m/s] at which viscous friction is down to a half
+    stribeck: float = 0.02  # [m/s] at which `static` is down to 1/e
+    thin: float = np.inf  # [m/s] at which the viscous coefficient is down to a half
     memory: float = 0.0  # [N s/m] dashpot of a Maxwell element
-    relax: float = 1.0  # [s] its time constant
+    relax: float = 1.0  # [s] time constant of the Maxwell element
     drag: float = 0.0  # [N s2/m2]
     bristle: float = 0.0  # [N/m] presliding (Dahl's law) in place of tanh
     constant: float = 0.0  # [N]
@@ -60,7 +60,7 @@ class Rig:
 
 
 def rigs(seed: int = 7) -> list[Rig]:
-    """Sixty: every imperfection by itself, with other devices, and together."""
+    """Return sixty rigs: each imperfection on the base device and on a random one, mixtures, and hands."""
     one: list[dict[str, float]] = [
         {},
         {"constant": 1e-3},
@@ -115,7 +115,7 @@ def rigs(seed: int = 7) -> list[Rig]:
 
 
 def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBSTEPS) -> Array:
-    """Encoder positions (ticks, rigs) [m] under the motors' forces `signal` (ticks,) [N]."""
+    """Return encoder positions (ticks, rigs) [m] under the motors' forces `signal` (ticks,) [N]."""
 
     def of(name: str) -> Array:
         return np.array([getattr(r, name) for r in many], dtype=float)
@@ -167,14 +167,14 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
 
 
 def excitation() -> Array:
-    """The command's own (ticks,) [N], in whole steps."""
+    """Return the excitation of the command (ticks,) [N], in whole force steps."""
     swing = Swing.of(scenario_of(), 0.5, 0.03)
     signal = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5, Swing(swing.force[:1], swing.hz)).signal[:, 0]
     return FORCE_STEP * np.round(signal / FORCE_STEP)
 
 
 def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
-    """What comes of a record, and how long it takes [s]."""
+    """Return the estimate from a record or the error message, and the time that it takes [s]."""
     begin = time.perf_counter()
     found: Estimate | str
     try:
@@ -185,7 +185,7 @@ def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
 
 
 def main() -> None:
-    """The table, and what the bounds are worth."""
+    """Print the estimate of each rig, and how close the bounds are."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--workers", type=int, default=2)

@@ -1,11 +1,10 @@
-"""The optimal coupling of the loops n and o of benchmarks/loops: what it reaches, in which time, and what none can do.
+"""Design the optimal coupling of the loops n and o of benchmarks/loops: its mismatch, its cost, and the bound.
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
-`before` is the rms mismatch of version 0.1's optimal couplings, for the nine loops that it was measured on. `to beat`
-is the figure, and the rendered stiffness g, that this design was asked for. The bound is worked out for as many devices
-as --bound says. Seconds are of the processor; `limited` is the mismatch of the
-coupling that covers limited forces, too.
+`before` is the rms mismatch of version 0.1's optimal couplings for nine loops. `to beat` is the goal for the rms
+mismatch and the rendered stiffness g. The bound is computed for loops of at most --bound devices. Seconds are CPU
+seconds; `limited` is the mismatch of the coupling that also covers limited forces.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ T = TypeVar("T")
 PATIENT = Options(seconds=600)  # so that a busy machine tries as many bases as an idle one
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
-#: by loop: rms mismatch [dB] of version 0.1 (or why there was none), figure [dB] and stiffness to beat
+#: by loop: rms mismatch [dB] of version 0.1 (or why there was none), mismatch [dB] and stiffness to beat
 BEFORE = {
     "n0": ("-29.50", "-33.69, .996"),
     "n1": ("-11.19", "-13.13, .88"),
@@ -45,8 +44,8 @@ BEFORE = {
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--bound", type=int, default=MOST, help="most devices for which the bound is worked out")
-    arguments.add_argument("--limiter", type=int, default=2, help="most devices for which the limiter is")
+    arguments.add_argument("--bound", type=int, default=MOST, help="most devices for the bound")
+    arguments.add_argument("--limiter", type=int, default=2, help="most devices for a design with limiter")
     arguments.add_argument("--only", default="", help="beginnings of names, separated by commas")
     chosen = arguments.parse_args()
     print(f"{'loop':28} {'before':>8} {'to beat':>13} {'now':>7} {'g':>6} {'bound':>7} {'s':>5} {'states':>6}", end=" ")
@@ -75,7 +74,7 @@ def _row(path: Path, most: int, limited: int) -> None:
 
 
 def _timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What it returns, and the processor time that it took [s]."""
+    """Return the result of `work`, and its CPU seconds."""
     started = time.process_time()
     return work(), time.process_time() - started
 

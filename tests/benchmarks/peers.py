@@ -1,14 +1,14 @@
-"""The same loop in other people's tools: position error, growth error, verdict and CPU time, in one run.
+"""Run the same loop in other tools: position error, growth error, verdict and CPU time.
 
 PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (pip install drake control)
 
 The default scenario with the published coupling of case I: same process, same force limits, same outside forces, same
-plant, one tool after the other in every round; the median of their CPU times counts. Growth is measured on the trace
-that the tool made, projected on the exact loop's dominant mode. A tool that is not installed is left out, and said so.
+plant, one tool after the other in every round; the median of their CPU times counts. Growth is measured on the tool's
+trace, projected on the exact loop's dominant mode. A tool that is not installed is listed as not measured.
 
-What each is given: Drake a MultibodyPlant of prismatic joints, springs as bushings, and the forces of a period as an
-applied generalised force, since its discrete controllers are Python systems, which cost more; python-control the
-sampled plant as a nonlinear discrete system, for only that can clip; scipy.signal the closed loop without clipping.
+Drake gets a MultibodyPlant of prismatic joints, springs as bushings, and the forces of a period as an applied
+generalised force, since its discrete controllers are Python systems, which cost more. python-control gets the sampled
+plant as a nonlinear discrete system, since only that can clip. scipy.signal gets the closed loop without clipping.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Peer = Callable[[Simulation, Array], States]  # from rest, under outside forces 
 
 
 def ours(engine: str, integrator: str | None = None, substeps: int | None = None) -> Peer:
-    """One of this package's engines."""
+    """Return one of this package's engines as a peer."""
 
     def peer(simulation: Simulation, w: Array) -> States:
         stepped = make_engine(simulation, engine, integrator, substeps)
@@ -44,7 +44,7 @@ def ours(engine: str, integrator: str | None = None, substeps: int | None = None
 
 
 def numpy_loop(simulation: Simulation, w: Array) -> States:
-    """The loop as one would write it down in an hour, with the sampled plant."""
+    """Run the loop as one would write it in an hour, with the sampled plant."""
     F, plant, limit = simulation.F, simulation.plant, simulation.process.force_limit
     z, s = np.zeros(F.order), np.zeros(plant.A.shape[0])
     zs, ss, fs = [], [], []
@@ -61,7 +61,7 @@ def numpy_loop(simulation: Simulation, w: Array) -> States:
 
 
 def scipy_dlsim(simulation: Simulation, w: Array) -> States:
-    """scipy.signal.dlsim of the closed loop: no force limits."""
+    """Run the closed loop, without force limits, in scipy.signal.dlsim."""
     from scipy.signal import dlsim, dlti
 
     F, plant = simulation.F, simulation.plant
@@ -73,7 +73,7 @@ def scipy_dlsim(simulation: Simulation, w: Array) -> States:
 
 
 def python_control(simulation: Simulation, w: Array) -> States:
-    """control.input_output_response of a nonlinear discrete system."""
+    """Run the loop as a nonlinear discrete system in control.input_output_response."""
     import control
 
     F, plant, limit = simulation.F, simulation.plant, simulation.process.force_limit
@@ -93,7 +93,7 @@ def python_control(simulation: Simulation, w: Array) -> States:
 
 
 def drake(step: str, substeps: int) -> Peer:
-    """pydrake's MultibodyPlant, continuous with fixed Runge-Kutta steps ("RK3") or "discrete"."""
+    """Return pydrake's MultibodyPlant as a peer, continuous with fixed Runge-Kutta steps ("RK3") or "discrete"."""
 
     def peer(simulation: Simulation, w: Array) -> States:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
@@ -126,7 +126,7 @@ def drake(step: str, substeps: int) -> Peer:
 
 
 def _drake_plant(simulation: Simulation, time_step: float):
-    """The compiled scene as bodies on prismatic joints along x; what acts between two of them is a bushing."""
+    """Return the compiled scene as bodies on prismatic joints along x, with a bushing for each tendon."""
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import LinearBushingRollPitchYaw, PrismaticJoint, PrismaticSpring, SpatialInertia
 
@@ -163,7 +163,7 @@ PEERS: dict[str, Peer] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The same loop in other people's tools.")
+    parser = argparse.ArgumentParser(description="Run the same loop in other tools.")
     parser.add_argument("--duration", type=float, default=15.0, metavar="SECONDS")
     parser.add_argument("--rounds", type=int, default=3, metavar="N")
     args = parser.parse_args()

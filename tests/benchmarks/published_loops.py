@@ -1,8 +1,8 @@
 """Write benchmarks/figures.csv: PYTHONPATH=. python tests/benchmarks/published_loops.py     (a quarter of an hour)
 
 The cheap columns are computed from each loop in a second. `designed` takes up to a minute for eight devices. The
-columns of the best coupling and of the bound are taken over from the file, where tests/benchmarks/optimal_loops.py
-prints them; those of the loops p are computed.
+columns of the best coupling and of the bound are kept from the file (tests/benchmarks/optimal_loops.py prints their
+figures), except that those of the loops p are computed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import worst_mode
 
 ROOT = Path(__file__).parents[2] / "benchmarks"
-#: columns that only long computations give, with their command in benchmarks/README.md
+#: columns that take long to compute; benchmarks/README.md names their commands
 EXPENSIVE = ("designed_rms_db", "best_rms_db", "best_stiffness_share", "bound_rms_db")
 
 
@@ -48,14 +48,14 @@ def cheap(path: Path) -> dict[str, float | None]:
 
 
 def _here(loop: Loop, coupling: Coupling) -> float:
-    """Return what this-environment requires over what there is, under any switching where delays switch."""
+    """Return required over available damping for this-environment, under any switching if delays switch."""
     if loop.varying_delay:
         return judged(loop, coupling, SWITCHING).ratio
     return requirement(loop, coupling, "this-environment").ratio
 
 
 def designed(path: Path) -> float | None:
-    """Return the mismatch [dB] of the designed spring-damper; None where no one is certified."""
+    """Return the mismatch [dB] of the designed spring-damper; None if no spring-damper is certified."""
     loop = load(path).loop("I")
     try:
         return transparency_of(loop, design_coupling(loop)).rms_mismatch_db
@@ -64,25 +64,25 @@ def designed(path: Path) -> float | None:
 
 
 def best(path: Path) -> dict[str, float | None]:
-    """Return the figures of the best certified coupling among all designs, and the bound where it is one."""
+    """Return the figures of the best certified coupling among all designs, and the bound if it applies."""
     loop, reached = load(path).loop("I"), []
     switching = {"switching": (loop.varying_delay.lo, loop.varying_delay.hi)} if loop.varying_delay else {}
     kinds = [("optimal", name) for name in KINDS["optimal"].conditions]
     for kind, condition in [*kinds, *(("spring-damper", name) for name in KINDS["spring-damper"].conditions)]:
         try:
             made = design_by_kind(loop, kind, condition, **switching)
-        except ValueError:  # such a coupling does not exist before walls, without bounds of devices, ..
+        except ValueError:  # this design does not cover walls, devices without bounds, ..
             continue
         if assess(loop, made, condition=SWITCHING if switching else made.asked).holds:
             seen = transparency_of(loop, made)
             reached.append((seen.rms_mismatch_db, seen.dc_ratio))
     rms, share = min(reached)
-    least = None if loop.known_devices else bound(loop).rms_db  # the bound knows no guaranteed transmission
+    least = None if loop.known_devices else bound(loop).rms_db  # the bound does not use guaranteed transmissions
     return {"best_rms_db": rms, "best_stiffness_share": share, "bound_rms_db": least}
 
 
 def written(value: float | None) -> str:
-    """Return a figure as the table has it: six digits, nothing where there is none."""
+    """Return a figure as the table shows it: six digits, or nothing for None."""
     return "" if value is None else f"{value:.6g}"
 
 

@@ -1,4 +1,4 @@
-"""What devices, delays, hands and seconds cost, beside what comes out: CPU seconds of one core.
+"""Measure CPU seconds of one core for many devices, delays, hands and seconds, beside the results.
 
 PYTHONPATH=.:tests python tests/benchmarks/scale.py [devices|commands|delays|hands|duration ..]
 """
@@ -28,7 +28,7 @@ from haptic_loop.sim.stability import exact_growth
 
 
 def star(n: int) -> str:
-    """So many unlike devices around one hub on a soft spring, with delays of 0, 1 and 2 samples in turn."""
+    """Return a scenario of n unlike devices around one hub on a soft spring, with delays of 0 to 2 samples in turn."""
     springs = [f'{{ between = ["c{i}", "hub"], stiffness = {300 + 20 * (i % 9)}, damping = 0.2 }}' for i in range(n)]
     device = '[[device]]\nkind = "rigid"\nmass = {}\ndamping = {}\n'
     text = [
@@ -43,7 +43,7 @@ def star(n: int) -> str:
 
 
 def limits(loop: Loop, design: Design) -> str:
-    """What limited forces need, by the best multiplier or the design's own, and whether exact arithmetic proves it."""
+    """Return what limited forces need, with the design's multiplier or else the best one, and whether it is proved."""
     try:
         return f"{1 / prove_limiter(loop, design.coupling, c=design.c).margin:.4f}, proved"
     except NotProved as refused:
@@ -57,7 +57,7 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def devices() -> None:
-    """The run is of 2 s; the audit is both conditions with their exact proofs, the designs are searches and sweeps."""
+    """Measure a run of 2 s, an audit by both conditions with exact proofs, designs, and a proof for limited forces."""
     for n in (2, 4, 8, 16, 32):
         scenario = parse(star(n))
         loop = scenario.loop("I")
@@ -74,7 +74,7 @@ def devices() -> None:
 
 
 def commands() -> None:
-    """Whole commands: a design and a run."""
+    """Measure the commands `design` and `sim.run`."""
     with TemporaryDirectory() as place:
         for n in (8, 16, 32):
             scenario = Path(place, f"star{n}.toml")
@@ -92,7 +92,7 @@ def commands() -> None:
 
 
 def delays() -> None:
-    """The run is of 2 s; the growth rate is that of the eigenvalues."""
+    """Measure a run of 2 s, and the growth rate by eigenvalues."""
     for theta in (2, 20, 100, 200, 400):
         scenario = load().replace(theta=(theta, theta), duration=2.0)
         coupling = SpringDamper([1000 / theta] * 2, [0.1, 0.1])
@@ -103,7 +103,7 @@ def delays() -> None:
 
 
 def hands() -> None:
-    """Verdicts by both engines, without traces and with 2 s of them."""
+    """Measure verdicts by both engines, without traces and with traces of 2 s."""
     for count in (1000, 10_000):
         for duration in (0.0, 2.0) if count == 1000 else (0.0,):
             question = Validation(load(), PUBLISHED["I"], 0, count, MIXED, "both", duration)
@@ -112,7 +112,7 @@ def hands() -> None:
 
 
 def duration() -> None:
-    """The memory is the most that the process has had so far."""
+    """Measure long runs; the memory is the peak of the process so far."""
     for seconds in (15, 150, 600):
         simulation = assemble(load().replace(duration=seconds), PUBLISHED["I"])
         _, used = cpu(lambda simulation=simulation: run(simulation))

@@ -1,9 +1,9 @@
 """PYTHONPATH=. python tests/benchmarks/still_holds.py [N]: is a hand that holds still ever taken for a dead encoder?
 
-N simulated holds of 1.2 s (default 10,000), by plain integration of a mass, a damper and a spring: nothing of the
-emulator. Drawn are the hand (0.05 to 2 kg beside a device of 0.2 to 0.5 kg, 2 to 60 N s/m, 100 to 3000 N/m), its tremor
-(8 to 12 Hz, up to 0.2 N), the device's dry friction (up to 0.3 N), the encoder (1 to 100 um, its origin anywhere within
-a step) and the force of a partner whom the hand resists: up to 6 N, at 0.3 to 8 Hz, or in steps.
+N (default 10,000) holds of 1.2 s are simulated by plain integration of a mass, a damper and a spring, without the
+emulator. Each draws the hand (0.05 to 2 kg beside a device of 0.2 to 0.5 kg, 2 to 60 N s/m, 100 to 3000 N/m), its
+tremor (8 to 12 Hz, up to 0.2 N), the device's dry friction (up to 0.3 N), the encoder (1 to 100 um, with a random
+origin), and the force of a partner whom the hand resists: up to 6 N, at 0.3 to 8 Hz, as a sine or in steps.
 """
 
 import sys
@@ -20,7 +20,7 @@ SLIP = 1e-4  # [m/s] speed at which dry friction is at 3/4
 
 
 def still_holds(holds: int, seed: int = 0) -> tuple[int, int]:
-    """How many of so many holds are stopped, and in how many the force changes by more than 1 N."""
+    """Return how many of the holds are stopped, and in how many the force changes by more than 1 N."""
     rng = np.random.default_rng(seed)
 
     def draw(low: float, high: float) -> np.ndarray:

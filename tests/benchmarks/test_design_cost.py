@@ -1,6 +1,6 @@
-"""What a design, its proof and a margin cost, beside what they reach.
+"""Measure the cost of a design, its proof and a margin, beside their results.
 
-make bench
+make bench    (or: python -m pytest tests/benchmarks/test_design_cost.py --benchmark-only -s)
 """
 
 import time
@@ -40,7 +40,7 @@ def test_inner_convex_approximation(benchmark):
 @pytest.mark.parametrize("case", ["I", "II"])
 @pytest.mark.parametrize("name", ASKED)
 def test_optimal(benchmark, case, name):
-    """The proof is part of the design."""
+    """The measured time includes the proof."""
     loop = load().loop(case)
     design = benchmark.pedantic(lambda: optimal.design(loop, ASKED[name]), rounds=3, warmup_rounds=1)
     found, seconds = design.figures, benchmark.stats.stats.median
@@ -78,7 +78,7 @@ def test_audit(benchmark):
 
 @pytest.mark.parametrize("devices", [1, 2, 4, 8])
 def test_audit_of_devices_with_three_axes(benchmark, devices):
-    """Full levels around one block; every device alone decides any-environment, so that the ratio does not change."""
+    """Devices with full levels touch one block. any-environment judges each device alone: its ratio stays the same."""
     level, tips = "[[1.5, 0.4, 0.1], [0.4, 1.2, -0.2], [0.1, -0.2, 1.2]]", [f"tip {i}" for i in range(devices)]
     springs = [f'{{ between = ["{tip}", "block"], stiffness = 300.0, damping = 0.5 }}' for tip in tips]
     text = f'name = "star"\nT = 1e-3\ntheta = {[1] * devices}\n'
@@ -91,4 +91,4 @@ def test_audit_of_devices_with_three_axes(benchmark, devices):
     ratios = {name: round(needs.ratio, 6) for name, needs in found.assessment.requirements.items()}
     print(f"\naudit of {m} channels ({devices} x 3): {time.process_time() - begin:.2f} CPU s; {ratios}")
     least = np.linalg.eigvalsh(loop.Delta()[:3, :3])[0]
-    assert ratios["any-environment"] == pytest.approx(0.8 / least, rel=1e-4)  # 0.8 N s/m for one axis, by a dense sweep
+    assert ratios["any-environment"] == pytest.approx(0.8 / least, rel=1e-4)  # 0.8 N s/m: a dense sweep for one axis

@@ -1,11 +1,11 @@
-"""Speed beside error: the exponential engine, four Runge-Kutta steps and the exact engine, alternating in one run.
+"""Measure speed and error of the exponential engine, four Runge-Kutta steps and the exact engine, in turn.
 
 make bench    (or: python -m pytest tests/benchmarks/test_engine_cost.py --benchmark-only -s)
 
-CPU time. What a loop is divided by moves the same plant by the calls that the engine makes, with the recorded inputs
-and nothing else: MjData made once, controls written and mj_step; of the exponential engine controls written,
-mj_forward, the product with h phi1(h J), and the state written back. The process, its limiter, outside forces and the
-record are the loop's.
+Times are CPU times. A loop's time is divided by that of the raw calls, which move the same plant with the recorded
+inputs. Raw calls make MjData once, and per tick write the controls and call mj_step; for the exponential engine they
+write the controls, call mj_forward, multiply by h phi1(h J), and write the state back. Only the loop has the process,
+its limiter, outside forces and the record.
 """
 
 import time
@@ -42,14 +42,14 @@ def cpu_seconds(call) -> float:
 
 
 def looped(simulation, engine, integrator=None, substeps=None):
-    """A run of the scenario, as sim.run makes it."""
+    """Run the scenario as sim.run does."""
     return run(simulation, make_engine(simulation, engine, integrator, substeps))
 
 
 def raw(simulation, integrator, substeps, record, view=np.asarray) -> float:
-    """CPU seconds of MuJoCo's calls of that run alone: its data made, then every tick.
+    """Return the CPU seconds of MuJoCo's calls alone: MjData, then every tick.
 
-    Numbers are copied between arrays, or, with `view` memoryview, in the least time that Python can.
+    Numbers are copied between arrays or, with `view` memoryview, in the least time that Python allows.
     """
     model = _discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
     move = make_engine(simulation, "mujoco", EXPONENTIAL, substeps)._access.move(simulation.scenario.T / substeps)
@@ -120,7 +120,7 @@ def test_speed_and_error_side_by_side(benchmark, scene):
 
 
 def test_what_a_force_evaluation_is_made_of(benchmark):
-    """Skipping the position stage saves a part of one call, and leaves spring forces of an old position behind."""
+    """Without its position stage, but after mj_tendon, a force evaluation is cheaper and gives equal accelerations."""
     simulation = assemble(load(), PUBLISHED["I"])
     model, calls = simulation.scene.model, 20_000
     data, position = mujoco.MjData(model), mujoco.mjtStage.mjSTAGE_POS
@@ -149,7 +149,7 @@ def test_what_a_force_evaluation_is_made_of(benchmark):
 
 
 def test_many_hands(benchmark):
-    """CPU time per simulation and tick, one thread, 125 hands as in a batch of sim.validate."""
+    """Measure CPU time per simulation and tick, in one thread, for 125 hands as in a batch of sim.validate."""
     scenario, nsim, ticks = load(), 125, 320
     simulation = assemble(scenario, PUBLISHED["I"])
     ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(nsim), 1)
@@ -181,12 +181,12 @@ def test_many_hands(benchmark):
             f"error {error:.1e} in {ticks} ticks",
             end="",
         )
-        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # lightly damped modes at 83 Hz: phase errors add up
+        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # phase errors of lightly damped modes at 83 Hz add up
     print()
 
 
 def test_how_long_a_period_may_be(benchmark):
-    """The map over 0.1 s of a plant whose fastest mode turns 497 rad in it: one step, against scipy's exponential."""
+    """One step maps 0.1 s, in which the fastest mode turns 497 rad, as exactly as the matrix exponential."""
     simulation = assemble(SCENES["transmission of 1.45e6 N/m"], PUBLISHED["I"])
     T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1
     step = benchmark.pedantic(

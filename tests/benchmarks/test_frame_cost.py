@@ -1,4 +1,4 @@
-"""What a frame and a device's tick cost, beside what they must get right.
+"""Measure the cost of a frame and of a device's tick, and check their results.
 
 make bench    (or: python -m pytest tests/benchmarks/test_frame_cost.py --benchmark-only -s)
 """
@@ -62,7 +62,7 @@ def test_decode_one_frame_a_call(benchmark, sample, axes):
 
 
 def test_device_tick(benchmark):
-    """A FORCE received and a tick with its STATE sent, armed: the emulator's cost per period."""
+    """An armed device receives a FORCE, ticks and sends a STATE: the emulator's cost per period."""
     info = Info(1, "bench", 1, 1_200_000, (1,) * 2, (1,) * 2, (1,) * 2, (24_000,) * 2, (8000,) * 2)
     device = Device(info)
     device.receive(encode(Config(1, 4, 4, 0, (24_000,) * 2, (48_000,) * 2)), 0)

@@ -1,4 +1,4 @@
-"""What the limiter costs while no force is limited, and how fast the exact engine is; test_engine_cost.py has the rest.
+"""Measure the cost of the limiter while no force is limited, and the speed of the exact engine.
 
 make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
 """
@@ -34,8 +34,9 @@ def test_exact_engine(benchmark):
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatch):
-    """The loop with the limiter beside the one that clips, in turns: the ratio of their least times. No tick asks for
-    the box problem, and only those do whose forces are limited.
+    """Compare the least times of a loop with the limiter and of one that clips, in turns.
+
+    The box problem is solved only in ticks whose forces are limited.
     """
     coupling, solved, solve = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), [], BoxProblem.solve
     monkeypatch.setattr(BoxProblem, "solve", lambda problem, q: [solved.append(1), solve(problem, q)][1])
@@ -54,12 +55,12 @@ def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatc
     tight = assemble(weak, coupling, (11.4167, 11.4167))
     slips = tight.process.law.slips(run(tight, engine).z).any(axis=1).sum()
     assert slips > 0
-    assert len(solved) - slips in (0, 1)  # the slip of the last tick is in no record
+    assert len(solved) - slips in (0, 1)  # the record lacks the slip of the last tick
 
 
 @pytest.mark.parametrize("devices", [1, 2, 8])
 def test_limiting_vectors(benchmark, devices):
-    """Three axes each, their slips coupled by a random matrix; every column is a tick of its own, at its limits."""
+    """Devices of three axes have slips that a random matrix couples; each column of q is a tick with limited forces."""
     rng, n, balls = np.random.default_rng(devices), 3 * devices, (3,) * devices
     root, skew = rng.normal(size=(n, n)), rng.normal(size=(n, n))
     M = 30 * (root @ root.T + np.eye(n) + skew - skew.T)

@@ -1,4 +1,4 @@
-"""What a verdict about a thousand humans costs, and how accurate it is.
+"""Measure the cost and the accuracy of verdicts about a thousand humans.
 
 make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
 """
@@ -52,7 +52,7 @@ def test_verdicts(benchmark, held_by, coupling, request):
 
 
 def test_batched_exact_engine(benchmark, held_by):
-    """CPU seconds for the whole loop: process, limits and plant of every simulation."""
+    """Measure CPU seconds of the whole loop: process, limits and plant of every simulation."""
     simulation, ticks, short = assemble(load(), PUBLISHED["I"]), 960, 32
     plants = hold(held_by.plants(), simulation.scenario.T)
     engine = ExactEngine(plants)
@@ -82,7 +82,7 @@ def test_batched_exact_engine(benchmark, held_by):
 
 @pytest.mark.parametrize("substeps", [2, 4])
 def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
-    """The loop around the batch against the batch's own steps, alternating, on all cores."""
+    """Compare the loop with the raw steps of its batch, in turns, on all cores."""
     simulation, ticks, short, nsim = assemble(load(), PUBLISHED["I"]), 160, 32, 200
     T, some = simulation.scenario.T, Variants(held_by.scene, {n: rows[:nsim] for n, rows in held_by.fields.items()})
     engine, bare = (MujocoBatchEngine(some, T, "RK4", substeps) for _ in range(2))
@@ -115,7 +115,7 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
 
 
 def test_how_tight_the_certificate_is(benchmark):
-    """The adversary against loops 1 to 20 % short of their required damping."""
+    """Let the adversary attack loops that are 1 to 20 % short of their required damping."""
     scenario = load()
     shortages = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
     loops = {"none": (scenario, NoCoupling()), "published": (scenario, PUBLISHED["I"])}

@@ -1,4 +1,4 @@
-"""What a tick of a MuJoCo world costs, for scenes of 1, 10 and 50 bodies, and how far its step is from the law.
+"""Measure a tick of MuJoCo worlds of 1, 10 and 50 bodies, and how far its step is from the contact law.
 
 make bench    (or: python -m pytest tests/benchmarks/test_world_cost.py --benchmark-only -s)
 """
@@ -17,7 +17,7 @@ T, G = 1e-3, 1500.0
 
 
 def pile(bodies: int) -> str:
-    """Boxes that slide in x and z, in columns of five on a table, between two fingers."""
+    """Return a scene of boxes that slide in x and z, in columns of five on a table, between two fingers."""
     parts = [
         f'<body pos="{0.062 * (i // 5)} 0 {0.02 + 0.04 * (i % 5)}"><joint type="slide" axis="1 0 0"/>'
         '<joint type="slide" axis="0 0 1"/><geom type="box" size="0.03 0.03 0.02" mass="0.1"/></body>'
@@ -32,7 +32,7 @@ def pile(bodies: int) -> str:
 
 @pytest.mark.parametrize("bodies", [1, 10, 50])
 def test_a_tick_of_a_scene(benchmark, tmp_path, bodies):
-    """CPU microseconds of a tick and of `mj_step` alone, best of many, and the error of pressed contacts."""
+    """Measure CPU microseconds of a tick and of `mj_step` alone, best of many, and the error of pressed contacts."""
     path = tmp_path / "scene.xml"
     path.write_text(pile(bodies))
     port = World(path, [Contact("left"), Contact("right")], [np.eye(1) * G] * 2, T).port()

@@ -1,10 +1,10 @@
-"""PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: what a tick costs the host, beside the bare loop.
+"""PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure a tick of the host, beside the bare loop.
 
-Whole: the bridge's own loop at full gain over a pseudo-terminal, from the STATE that waits there, through every check
-and record, to the FORCE that was written and the next wait. Bare: a STATE is decoded, the controller steps, a FORCE is
-encoded. Blocks of 200 ticks by turns, at the same place in the loop. Times are those of the processor, in Python and in
-the system's calls (that of writing is told apart), without what other processes have of it. The device is the emulated
-one: it ticks while the host waits, and so leaves the caches to it as cold as another process would.
+A whole tick is one of the bridge's loop at full gain over a pseudo-terminal: from the waiting STATE, through every
+check and record, to the written FORCE and the next wait. A bare tick decodes a STATE, steps the controller, and encodes
+a FORCE. Blocks of 200 whole and 200 bare ticks alternate. Times are CPU times of this thread with its system calls; the
+time of writing is also printed. The emulated device ticks while the host waits, and so leaves caches as cold as another
+process would.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.checks.faults import _lively
 from tests.pseudo_terminal import Terminal
 
 BLOCK = 200
-PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a thread of the kernel's moves
+PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a kernel thread moves
 
 
 class _Bench(SerialPort):
@@ -87,11 +87,11 @@ class _Bench(SerialPort):
 
 
 def tick_cost(ticks: int) -> dict[str, list[float]]:
-    """Times [us] of `ticks` whole ticks at full gain, of as many bare ones, and of writing a FORCE."""
+    """Return times [us] of about `ticks` whole ticks at full gain, `ticks` bare ones, and of writing a FORCE."""
     with _Bench() as port:
         session = port.session
         live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
-        live.clock = lambda: port.clock  # that of the ticks: what is measured here takes longer than they do
+        live.clock = lambda: port.clock  # the emulated device's: a tick takes longer here than T
         session.start(0)
         gc.collect()
         gc.freeze()

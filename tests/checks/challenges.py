@@ -1,13 +1,13 @@
-"""Each guarantee beyond the plain linear loop, put to the test at its edge: `make validate`.
+"""Attack each guarantee beyond the plain linear loop at its edge: `make validate`.
 
-A loop is drawn, and its devices get a little more or much less damping than its guarantee asks for. Then two
-adversaries try to take energy out of it, from rest. One moves the devices as it likes: waves, noise, and at every tick
-the step that takes the most, with limits so low that forces are limited a good part of the time. The other draws
-lossless hands with a push, keeps the ones that move on most, and varies them. A guarantee says that the energy balance
+A loop is drawn, and its devices get a little more or much less damping than its guarantee requires. Then two
+adversaries try to take energy out of the loop, from rest. One moves the devices as it likes: waves, noise, and at every
+tick the step that takes the most, with limits so low that forces are often limited. The other draws pushed lossless
+hands, keeps those whose motion grows most, and varies them. A guarantee says that the energy balance
 
         sum f'dx + dx' Delta dx/T + w'|dx|  >=  -given
 
-holds at every tick, w being declared Coulomb friction where that pays, and `given` what a budget may give.
+holds at every tick, where w is the declared Coulomb friction, if any, and `given` the energy that a budget may give.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from haptic_loop.sim.passivity_layer import EnergyNet, netted
 from haptic_loop.sim.run import assemble, run_blocks
 from haptic_loop.sim.scenario import Scenario
 
-ENOUGH = 1.02  # times what a guarantee asks for
-_GIVEN = 0.005  # [J] of the budget
+ENOUGH = 1.02  # times the damping or friction that a guarantee requires
+_GIVEN = 0.005  # [J] that a budget may give
 _PUSHED = 24  # motions at once
-_GROWN = 1.5  # times its speed in the first quarter of a run, in the last
-_ROUNDING = 1e-10  # of the energy that flows
+_GROWN = 1.5  # a hand grows if its rms speed in the last quarter of a run is this many times the first's
+_ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
 
 @dataclass(frozen=True)
@@ -46,31 +46,31 @@ class _Challenge:
 
     guarantee: str
     loop: int  # the number of the draw
-    factor: float  # of what the guarantee asks for
+    factor: float  # times what the guarantee requires
     motions: int  # tried
-    took: int  # motions that took more than they may
-    least_J: float  # the lowest energy balance of all, motions and hands, with what may be given added
-    hands: int  # tried, as many in each generation
-    grew: int  # hands that moved faster and faster, or took more than they may
-    limited: float  # the share of ticks that were limited, or in contact, in the motions that were limited most
+    took: int  # motions that took more energy than the guarantee allows
+    least_J: float  # the lowest energy balance plus `given` of all motions and hands
+    hands: int  # hands tried in each generation
+    grew: int  # hands that grew, or took more energy than the guarantee allows
+    limited: float  # share of ticks with limited forces or contact, largest over the three values of greed
     holds: bool  # nothing was taken, or nothing is claimed
 
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A loop and the devices that hold it, at so many times what its guarantee asks for."""
+    """A loop, and devices with a multiple of the damping or friction that its guarantee requires."""
 
-    process: Callable[[int, int], Process]  # (simulations, ticks) -> without limits of the actuators
+    process: Callable[[int, int], Process]  # (simulations, ticks) -> process without actuator limits
     delta: Array  # (m,) [N s/m] of the devices
     T: float
     size: float  # [m] of a step of the motions
     friction: Array | float = 0.0  # (m,) [N]
     given: float = 0.0  # [J]
     start: float = 0.0  # [m] where motions begin
-    push: float = 1.0  # of the speeds at which hands are let go
+    push: float = 1.0  # factor on the speeds at which hands are let go
 
     def limited(self, buffer: StepBuffer, ticks: int) -> float:
-        """The share of the ticks in which forces were limited, or a wall touched."""
+        """Return the share of the ticks in which forces were limited, or a wall was touched."""
         if buffer.net:
             done = buffer.net.figures()
             return done.limited_ticks / done.ticks
@@ -82,7 +82,7 @@ class _Case:
 def challenges(
     seed: int, loops: int = 3, hands: int = 60, seconds: float = 6.0, names: Sequence[str] | None = None
 ) -> Iterator[_Challenge]:
-    """Every guarantee at ENOUGH and at too little, on so many random loops."""
+    """Yield each guarantee on `loops` random loops, at ENOUGH and at too little of what it requires."""
     for name, (make, too_little) in GUARANTEES.items():
         if names is not None and name not in names:
             continue
@@ -113,7 +113,7 @@ def _challenge(
 
 
 def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int = 700) -> Array:
-    """Waves and noise of three sizes, (ticks, m, _PUSHED); where greed takes over, nothing after a while."""
+    """Return waves and noise of three sizes (ticks, m, _PUSHED), which with greed end after 150 ticks."""
     w, phase = np.exp(rng.uniform(-5, 1.1, (1, 1, _PUSHED))), rng.uniform(0, 6, (1, m, _PUSHED))
     wave = np.sin(w * np.arange(ticks)[:, None, None] + phase) + 0.3 * rng.normal(size=(ticks, m, _PUSHED))
     until = ticks if greed == 0 else 150
@@ -122,9 +122,9 @@ def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: 
 
 
 def _moved(case: _Case, pushed: Array, greed: float) -> tuple[Array, float]:
-    """(the lowest balance of each motion with what may be given, 0 at rest; the largest share of limited ticks).
+    """Return the lowest balance of each motion plus `given`, at most 0, and the share of limited ticks.
 
-    To `pushed` comes the step that takes the most in this tick, -f/(2 D), times `greed`.
+    Each step is `pushed` plus `greed` times the step that takes the most energy in this tick, -f/(2 D).
     """
     ticks, _, nsim = pushed.shape
     process, D = case.process(nsim, ticks + 1), case.delta[:, None] / case.T
@@ -144,14 +144,14 @@ def _moved(case: _Case, pushed: Array, greed: float) -> tuple[Array, float]:
 
 
 def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> tuple[int, float]:
-    """(hands that grew or took more than they may, the lowest balance) over three generations of lossless hands."""
+    """Return (hands that grew or took too much, the lowest balance) over three generations of lossless hands."""
     m, grew, lowest = len(case.delta), 0, 0.0
     mass = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (hands, m, 2)))
     stiff = np.exp(rng.uniform(np.log(30.0), np.log(1e4), (hands, m, 2)))
     speed = case.push * rng.choice([0.03, 0.3, 1.0], hands) * rng.choice([-1.0, 1.0], (m, hands))
     for _ in range(3):
         ratio, least = _let_go(case, mass, stiff, speed, seconds)
-        # a budget lets a motion die as slowly as its share of the damping asks: only what was taken counts
+        # with a budget motions may decay slowly, so only the energy that was taken counts
         bad = (least < 0) | (ratio > (np.inf if case.given else _GROWN))
         grew, lowest = grew + int(bad.sum()), min(lowest, float(least.min()))
         order = np.argsort(-np.where(least < 0, np.inf, ratio))[: max(1, hands // 6)]
@@ -162,7 +162,7 @@ def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> 
 
 
 def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float) -> tuple[Array, Array]:
-    """(rms speed of the last quarter over the first, the lowest balance with what may be given) of each hand."""
+    """Return each hand's rms speed of the last quarter over that of the first, and its lowest balance plus `given`."""
     hands, ticks = len(mass), round(seconds / case.T)
     links = np.stack([mass, np.zeros_like(mass), stiff], axis=-1)
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in case.delta)
@@ -199,12 +199,12 @@ _PARTS = 6  # of a tick, in each of which friction acts anew
 
 
 class _Rubbing:
-    """Devices with Coulomb friction, in parts of a tick: a force of at most that stops the device, or brakes it."""
+    """An engine with Coulomb friction, which in each part of a tick stops a device or, if too weak, brakes it."""
 
     def __init__(self, plants: HeldPlant, friction: Array) -> None:
         self._A, self._B, self._most = plants.A, plants.B[..., -len(friction) :], friction.T[..., None]
         states, m = plants.A.shape[-1], len(friction)
-        self._speeds = slice(states // 2, states // 2 + m)  # of the devices; a force moves its own device alone
+        self._speeds = slice(states // 2, states // 2 + m)  # of the devices; a force accelerates only its own device
         self._gain = np.diagonal(self._B[:, self._speeds], axis1=1, axis2=2)[..., None]
 
     def start(self, buffer: StepBuffer) -> None:
@@ -246,7 +246,7 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
     """any-environment, a limiter without lag, and walls with dampers that make and break contact.
 
-    Of a few environments the one that comes nearest to what the worst environment asks.
+    The environment is the one of eight that needs most of the damping that any-environment requires.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:
@@ -291,9 +291,9 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _friction(rng: np.random.Generator, factor: float) -> _Case:
-    """Encoders of 10 um; the friction is the claim, and the damping what the loop needs with ideal ones.
+    """Encoders of 10 um; the claim is about friction; the damping is what the loop needs with ideal ones.
 
-    Hands are let go at a millimetre a second and less, where steps matter."""
+    Hands are let go at a millimetre a second and less, where encoder steps matter."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop).required)
@@ -304,14 +304,14 @@ def _friction(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _scenario(loop: Loop, delta: Array) -> Scenario:
-    """The loop as a scenario with rigid devices of this damping and a hand at each."""
+    """Return the loop as a scenario with rigid devices of this damping and a hand at each."""
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
     people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
     loop_of = {"T": loop.T, "theta": loop.theta, "psi": loop.psi, "environment": loop.network}
     return Scenario(name="drawn", device=devices, human=people, **loop_of)
 
 
-#: guarantee -> how a case of it is made, and how much is far too little of what it asks for
+#: guarantee -> function that makes a case, and the share of its requirement that is far too little
 GUARANTEES: dict[str, tuple[Callable[[np.random.Generator, float], _Case], float]] = {
     "limited, any environment": (_anywhere, 0.25),
     "limited forces": (_limits, 0.5),

@@ -1,4 +1,4 @@
-"""Whether memory stays flat over an hour of a session, in virtual time, and over 100,000 hands."""
+"""Check that memory stays flat over an hour of a session, in virtual time, and over 100,000 hands."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.checks.faults import person
 
 @dataclass(frozen=True)
 class _Endured:
-    """How long work ended, and the most memory that its process had [MiB]."""
+    """The result of long work, and the peak memory of its process [MiB]."""
 
     what: str
     result: str
@@ -37,11 +37,11 @@ class _Endured:
     holds: bool
 
 
-_Mark = Callable[[float], None]  # is told what share of the work is done
+_Mark = Callable[[float], None]  # called with the share of the work that is done
 
 
 def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
-    """A session of the default loop in virtual time, armed for `seconds`; whether it ended as planned, and how."""
+    """Run a session in virtual time, armed for `seconds`; return whether it ended as planned, and how."""
     scenario = load()
     made = certified_couplings(scenario, "I", None, None, 1, spare=0)
     session, emulator = session_for(scenario, LinkSettings()), Emulator(scenario)
@@ -55,7 +55,7 @@ def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
 
 
 def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
-    """Random hands on the default loop with its usual coupling, by eigenvalues; whether all are stable."""
+    """Judge random hands on the default loop by eigenvalues; return whether all are stable, and the numbers."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
     found = validate(question, progress=lambda done, total: mark(done / total))
@@ -65,8 +65,8 @@ def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
 
 _Work = Callable[[_Mark], tuple[bool, str]]
 
-#: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
-#: tick, a crowd 150 bytes of a hand, twice while its batches are joined
+#: work, and by how much its peak memory may rise after a tenth of it [MiB]: a session keeps no ticks; a crowd keeps 150
+#: bytes per hand, twice while its batches are joined
 _LONG: tuple[tuple[str, _Work, float], ...] = (
     ("an hour of a session", _long_session, 8.0),
     ("100,000 hands", _many_hands, 32.0),
@@ -74,8 +74,8 @@ _LONG: tuple[tuple[str, _Work, float], ...] = (
 
 
 def endurance(_seed: int) -> Iterator[_Endured]:
-    """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
-    context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
+    """Yield for each long work, in a separate process, whether memory stays flat; the seed has no effect."""
+    context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all earlier checks
     for what, work, allowed in _LONG:
         here, there = context.Pipe(duplex=False)
         worker = context.Process(target=_alone, args=(work, allowed, there), daemon=True)
@@ -91,13 +91,13 @@ def endurance(_seed: int) -> Iterator[_Endured]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Run in a process of its own, which ends when the waiting one does."""
+    """Do the work in this separate process, which ends when its parent ends."""
     _as_worker()
     there.send(_endure(work, allowed))
 
 
 def _endure(work: _Work, allowed: float) -> _Endured:
-    """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
+    """Do the work, and measure this process's peak memory after a tenth and at the end [MiB]."""
     peaks: list[float] = []
 
     def mark(share: float) -> None:
@@ -111,7 +111,7 @@ def _endure(work: _Work, allowed: float) -> _Endured:
 
 
 def _peak() -> float:
-    """Most memory that this process had [MiB]. Linux's getrusage counts that of the parent before exec, too."""
+    """Return the peak memory of this process [MiB]; Linux's getrusage would include the parent's before exec."""
     if (status := Path("/proc/self/status")).exists():
         return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)

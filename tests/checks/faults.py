@@ -1,7 +1,7 @@
-"""Every fault of a link, a device, a controller or a person that we could think of, in virtual time.
+"""Rehearse every fault of a link, a device, a controller or a person that we could think of, in virtual time.
 
-Each case is a whole session of bridge and emulated device: what happens, what it must end in, and how soon. Time to
-zero force counts from the fault to the tick from which on no motor does anything.
+Each case is a whole session of bridge and emulated device: the fault, the stage that it must end in, and how soon. The
+time to zero force is counted from the fault to the first tick after which no motor has a force.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from haptic_loop.hw.rehearsal import Plan, Rehearsal
 from haptic_loop.hw.session import Said, Session
 from haptic_loop.sim.scenario import Scenario, load
 
-_WHEN = 0.6336  # [s] after arming: the gain is 1 after 0.52 s, the person moves after 0.49 s
-_LASTS = 0.9336  # [s] after arming that a case is watched
+_WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
+_LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
@@ -49,21 +49,21 @@ class Fault:
     within: float | None = None  # [ms] from the fault to zero force; None: forces go on
     action: _Call | None = None  # done at WHEN
     host_stall: float = 0.0  # [s] at WHEN
-    info: Callable[[Info], Info] | None = None  # a device that says something else of itself
+    info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
     baud: int | None = None
-    continuous: tuple[float, ...] = ()  # [N] that the motors stand for ever
+    continuous: tuple[float, ...] = ()  # [N] that the motors can hold for ever
     coupling: str | None = None
-    designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
+    designed: bool = False  # the coupling is designed for the measured delay, not beforehand
     counted: tuple[str, ...] = ()  # counters that must not be zero
     first_tick: int = 0
     free: bool = False  # nobody holds the handles, and the session knows it
-    deadman: bool = False  # forces act only while the device's own is held
+    deadman: bool = False  # forces act only while the dead-man switch at the device is held
     period: float = 1.0  # of the device's clock, in T
     lasts: float = _LASTS  # [s] after arming
 
 
 def _spoiled(force: float | None) -> _Call:
-    """A controller that from now on asks for `force` [N]; one that raises where that is None."""
+    """Return an action after which the controller returns `force` [N], or raises if `force` is None."""
 
     def call(session: Session, now: int) -> Said:
         def step(x: Sequence[float]) -> Sequence[float]:
@@ -79,19 +79,19 @@ def _spoiled(force: float | None) -> _Call:
 
 
 def person(what: str) -> _Call:
-    """What a person asks for: stop or estop."""
+    """Return the action of a person: stop or estop."""
     return lambda session, now: getattr(session, what)("asked to", now)
 
 
 def at(text: str) -> tuple[str, ...]:
-    """The fault `text`, beginning at WHEN."""
+    """Return the faults in `text`, which begin at _WHEN."""
     return tuple(f"{part}@{_WHEN}" for part in text.split())
 
 
 def _signed(
     name: str, kind: str, value: float, cause: str, within: float | None, when: str = f"@{_WHEN}", **more: Any
 ) -> list[Fault]:
-    """One case for each axis and each sign of `value`."""
+    """Return one case for each axis and each sign of `value`."""
     cases = []
     for axis in (1, 2):
         for sign in ("", "-"):
@@ -331,7 +331,7 @@ CASES = (
 )
 
 
-_MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
+_MEASURED = 100  # number of answers whose age is measured; the delay does not vary
 
 
 @dataclass(frozen=True)
@@ -343,9 +343,9 @@ class _FaultOutcome:
     cause: str
     peak_force_n: float  # of any motor
     peak_speed: float  # [m/s] of any handle
-    zero_force_ms: float | None  # from the fault on; None: not asked, or forces go on
+    zero_force_ms: float | None  # from the fault on; None: not required, or forces go on
     allowed_ms: float | None
-    wrong: tuple[str, ...]  # empty where it went as it must
+    wrong: tuple[str, ...]  # empty if all went as required
 
     @property
     def holds(self) -> bool:
@@ -353,14 +353,14 @@ class _FaultOutcome:
 
 
 def rehearse_faults() -> list[_FaultOutcome]:
-    """Every case with the default scenario and lively people, in virtual time; some seconds in all."""
+    """Run every case with the default scenario and lively people, in virtual time; some seconds in all."""
     scenario = _lively(load())
     made = certified_couplings(scenario, "I", None, None, 1, spare=1)
     return [_rehearse_case(case, scenario, made)[1] for case in CASES]
 
 
 def _lively(scenario: Scenario) -> Scenario:
-    """People who move at full amplitude soon after arming, so that a fault finds a force to take away."""
+    """Let people move at full amplitude soon after arming, so that forces act when a fault comes."""
     people = tuple(
         msgspec.structs.replace(h, voluntary=h.voluntary and msgspec.structs.replace(h.voluntary, ease=0.1, phase=0.8))
         for h in scenario.human
@@ -371,7 +371,7 @@ def _lively(scenario: Scenario) -> Scenario:
 def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """One case, with nobody at the handles if `free`. `made` are couplings for a link of one tick, and softer ones."""
+    """Run one case, with free handles if `free`. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
     cap = tuple(d.force_limit for d in scenario.device)
     session = Session(
@@ -416,7 +416,7 @@ def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) 
 
 
 def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
-    """What went wrong in a case."""
+    """Return what went wrong in a case."""
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:
         wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")

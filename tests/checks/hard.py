@@ -1,4 +1,7 @@
-"""Numerically hard loops, each with a setting of the engine that fails and the one that holds."""
+"""Numerically hard loops, each with an integrator setting that fails and one that holds.
+
+The rule is `default_substeps`, which picks the substeps of an integrator.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from haptic_loop.sim.run import Simulation, assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth
 
-CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
+CLOSE = 1e-2  # [1/s] largest error of the growth rate with the substeps that the rule picks
 #: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
 GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
 RK4, _EULER = ("RK4", 1), ("Euler", 1)
@@ -27,54 +30,54 @@ _Setting = tuple[str, int]  # integrator, substeps
 
 @dataclass(frozen=True)
 class _Hard:
-    """A loop that asks much of an integrator."""
+    """A loop that is hard to integrate."""
 
     name: str
     scenario: Scenario
-    fails: _Setting | None  # a setting that does not hold, None where all of TRIED do
+    fails: _Setting | None  # a setting that does not hold; None if all of _TRIED hold
     how: str  # what is wrong with it: "refused", "verdict", "growth" or "position"
     coupling: Coupling = PUBLISHED["I"]
-    substeps: int | None = None  # of RK4, which hold; default: what the rule picks
+    substeps: int | None = None  # RK4 substeps that hold; None: those that the rule picks
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What was measured of a hard loop."""
+    """The measurements of a hard loop."""
 
     name: str
     exact: float  # [1/s] growth of the exact loop
     fails: _Setting | None
-    fault: str | None  # what was wrong with it; None where it failed as little as the rest of TRIED
-    off: float | None  # by how much, None where it was refused
+    fault: str | None  # what was wrong with `fails`, or None
+    off: float | None  # by how much `fails` is wrong; None also if it was refused
     rule: int  # RK4 substeps that the rule picks
     substeps: int  # RK4 substeps that hold
-    error: float  # [1/s] their growth rate against the exact one
-    holds: bool  # whether all of this is as it should be
+    error: float  # [1/s] growth rate with `substeps` less the exact one
+    holds: bool  # whether `fails` fails, `substeps` hold, and the rule is right
 
 
 @cache
 def nominal() -> Scenario:
-    """The default scenario for a second: where every hard loop starts from."""
+    """Return the default scenario for one second, of which hard loops are variants."""
     return load().replace(duration=1.0)
 
 
 def devices(**changes: float) -> Scenario:
-    """The nominal loop with other devices."""
+    """Return the nominal loop with other devices."""
     return nominal().replace(device=(CompliantDevice(**changes),) * 2)
 
 
 def hands(mass: float, damping: float, stiffness: float) -> Scenario:
-    """The nominal loop in other hands."""
+    """Return the nominal loop with other hands."""
     return nominal().replace(human=(Human((Link(mass, damping, stiffness),)),) * 2)
 
 
 def light(damping: float) -> Scenario:
-    """A handle of 1 g that nobody's mass is added to."""
+    """Return the nominal loop with handles of 1 g and hands without mass."""
     return devices(handle_mass=1e-3).replace(human=(Human((Link(0.0, damping, 200.0),)),) * 2)
 
 
 def cases() -> tuple[_Hard, ...]:
-    """All hard loops."""
+    """Return all hard loops."""
     return (
         _Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
         _Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
@@ -92,7 +95,7 @@ def cases() -> tuple[_Hard, ...]:
 
 
 def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]:
-    """What is wrong with a setting, and by how much: nothing where it holds."""
+    """Return what is wrong with a setting, and by how much; empty if the setting holds."""
     try:
         _check_substeps(loop, integrator, substeps)
     except InputError:
@@ -108,12 +111,12 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
 
 
 def hard_loops(seed: int) -> Iterator[_Row]:
-    """What was measured of all of them; nothing is drawn."""
+    """Yield the measurements of all hard loops; the seed has no effect."""
     return map(measure, cases())
 
 
 def measure(hard: _Hard) -> _Row:
-    """The settings that fail and hold against the exact loop. Raises InputError where the rule finds none."""
+    """Compare the settings that fail and hold with the exact loop. Raises InputError if the rule finds none."""
     loop = assemble(hard.scenario, hard.coupling)
     rule, exact = default_substeps(loop, "RK4"), exact_growth(loop)
     substeps = hard.substeps or rule

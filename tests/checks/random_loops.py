@@ -1,8 +1,8 @@
-"""Loops drawn at random, against three laws: `make validate`.
+"""Check three laws on random loops: `make validate`.
 
-An exact proof succeeds where the sweep asks for less damping than there is, and nowhere else. The verdict that is read
-from a simulated trace is never the opposite of the eigenvalues'; where nothing excites the mode that decides, it says
-so. A trace of a crowd votes on a slow loop only where it decides, and then as the eigenvalues do.
+An exact proof succeeds if the sweep requires less damping than is available, and only then. The verdict of a simulated
+trace never contradicts the eigenvalues; if nothing excites the deciding mode, the verdict says so. On a slow loop a
+trace of a crowd counts only if its rate is larger than its error, and then agrees with the eigenvalues.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import _NOT_EXCITED, disagree, stability_of
 
-_TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
+_TOO_CLOSE = 1e-4  # share of the damping: a proof needs a margin
 _HANDS = Population()
 
 
 def _random_network(rng: np.random.Generator) -> Network:
-    """One to three contacts, up to three nodes between: springs, dampers or both anywhere, masses, ground, or none."""
+    """Return one to three contacts and up to three inner nodes, joined at random, with or without masses and ground."""
     tips = [f"tip {i}" for i in range(rng.integers(1, 4))]
     names = tips + [f"node {i}" for i in range(rng.integers(0, 4))]
     everywhere, springs = names + (["ground"] if rng.random() < 0.6 else []), {}
@@ -45,14 +45,14 @@ def _random_network(rng: np.random.Generator) -> Network:
 
 
 def _delayed(rng: np.random.Generator) -> Loop:
-    """A random network behind random delays, its devices' damping left at 1 N s/m."""
+    """Return a random network behind random delays; the dampings are 1 N s/m."""
     while True:
         try:
             network = _random_network(rng)
             m = len(network.contacts)
             theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
             return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
-        except ValueError:  # nothing holds one of its nodes
+        except ValueError:  # no element holds one of the nodes
             continue
 
 
@@ -63,7 +63,7 @@ def _coupling(rng: np.random.Generator, m: int) -> Coupling:
 
 @dataclass(frozen=True)
 class _Proof:
-    """One network, with half as much to one and a half times the damping that its loop asks for."""
+    """One network whose devices have 0.5 to 1.5 times the required damping."""
 
     number: int
     required: float  # over the available damping
@@ -76,7 +76,7 @@ class _Proof:
 
 
 def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
-    """Whether this-environment is proved, for so many random networks, and whether the sweep says that it should be."""
+    """Yield, for `count` random networks, whether this-environment is proved and what the sweep requires."""
     rng = np.random.default_rng(seed)
     for number in range(count):
         loop = _delayed(rng)
@@ -94,7 +94,7 @@ def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
 
 @dataclass(frozen=True)
 class _TraceVerdict:
-    """What one run says of its stability, and what its eigenvalues say."""
+    """The verdict of one run and that of its eigenvalues."""
 
     number: int
     engine: str
@@ -107,7 +107,7 @@ class _TraceVerdict:
 
 
 def _scenario(rng: np.random.Generator) -> Scenario:
-    """Random hands on random devices around a random network; in a third all devices, hands and motions are alike."""
+    """Return a random scenario; in one of three all delays, devices, hands and motions are alike."""
     loop = _delayed(rng)
     m, alike = loop.channels, rng.random() < 1 / 3
     device, human = [], []
@@ -137,7 +137,7 @@ def _scenario(rng: np.random.Generator) -> Scenario:
 
 
 def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
-    """Whether so many runs, half of them MuJoCo's, tell of their stability what their eigenvalues tell."""
+    """Yield for `count` runs, half of them in MuJoCo, whether their verdicts agree with the eigenvalues."""
     rng, number = np.random.default_rng(seed), 0
     while number < count:
         scenario, engine = _scenario(rng), str(rng.choice(["exact", "mujoco"]))
@@ -145,7 +145,7 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
         try:
             simulation = assemble(scenario, coupling)
             trace = run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
-        except InputError:  # no number of steps does, which is said
+        except InputError:  # no number of substeps is enough
             continue
         part = stability_of(simulation, trace)
         growth, exact = part.growth_rate_per_s, part.exact_growth_rate_per_s
@@ -157,17 +157,17 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
 
 @dataclass(frozen=True)
 class _Slow:
-    """Fifty hands on one network that decays in seconds: their traces of 2 s beside the eigenvalues."""
+    """Traces of 2 s of fifty hands on one network that decays in seconds, beside the eigenvalues."""
 
     network: int
     decided: int  # traces whose rate is larger than its error
-    contradicted: int  # of these
+    contradicted: int  # traces of these that contradict the eigenvalues
     worst: float  # |rate - eigenvalue's| over the error that the trace states
     holds: bool
 
 
 def slow(seed: int, count: int = 2000) -> Iterator[_Slow]:
-    """Whether no trace contradicts the eigenvalues of `count` loops of three devices with a mass between springs."""
+    """Yield whether traces contradict the eigenvalues, for `count` loops of three devices around a mass."""
     for number in range(count // 50):
         rng = np.random.default_rng((seed, number))
         stiffness, damping = np.exp(rng.uniform(2.5, 7.0, 3)), rng.choice([0.0, 0.3], 3) * rng.random(3)

@@ -1,4 +1,4 @@
-"""Every check that a verdict rests on, at full length: `make validate`. `-s` shows the rows. About ten minutes."""
+"""Run every check of verdicts at full length: `make validate`, about ten minutes. `-s` shows the rows."""
 
 import shlex
 from importlib import import_module

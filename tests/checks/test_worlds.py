@@ -1,4 +1,4 @@
-"""Every packaged MuJoCo world with 100 pairs of hands, and 120,000 contacts against the lemma."""
+"""Check every packaged MuJoCo world with 100 pairs of hands, and the lemma with 120,000 contacts."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PAIRS, TICKS = 50, 500
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
-    """Delays 0 to 3: energy of the hands by the textbook; the shell acts on no tick, or on one in a thousand."""
+    """For delays of 0 to 3, hands gain at most W0 and the released energy; the shell acts on at most 0.1 % of ticks."""
     rng, acted, worst = np.random.default_rng(7), 0, -np.inf
     for run in range(PAIRS):
         loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))
@@ -33,7 +33,7 @@ def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_fifty_pairs_without_gravity_gain_nothing(name, lossless):
-    """Energy of hands, devices and scene, whose springs' energy counts as released, against what they began with."""
+    """Hands, devices and bodies of the scene gain at most W0 and the energy that springs released."""
     rng = np.random.default_rng(8)
     for run in range(PAIRS):
         loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))

@@ -1,6 +1,6 @@
-"""How tight the condition is: the search for the worst hand against loops that lack some of the damping required.
+"""Measure how tight the condition is: search the worst hand for loops that lack some of the required damping.
 
-`make validate` runs it.
+`make validate` runs the search.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ def attempts(
     seed: int = 0,
     generations: int = 150,
 ) -> list[_Attack]:
-    """Every loop at every shortage: devices get (1 - short) times the damping that their condition requires.
+    """Attack every loop at every shortage: devices get (1 - short) times the damping that their condition requires.
 
-    That is known-device where the devices have guaranteed bounds, and this-environment elsewhere. A negative shortage
-    gives the devices more than required: there the search must fail.
+    The condition is known-device if the devices have guaranteed bounds, otherwise this-environment. With a negative
+    shortage, which gives the devices more damping than required, the search must fail.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
@@ -77,9 +77,9 @@ def shortages(
     theta: tuple[int, int] | None = None,
     name: str = DEFAULT,
 ) -> Iterator[Shortage]:
-    """The search against the loop of a scenario with these couplings, by name, at these shortages.
+    """Attack the loop of a scenario with each of the named couplings at each shortage.
 
-    Where it succeeds close to the required damping, the condition is tight.
+    If an attack succeeds close to the required damping, the condition is tight.
     """
     scenario = load(name).replace(theta=theta) if theta else load(name)
     for kind in couplings:
@@ -92,7 +92,7 @@ def shortages(
             yield Shortage(attempt.name, attempt.short, *found, *about)
 
 
-#: from a seed: at short delays, and at long ones
+#: functions of a seed: short delays, known devices, and long delays
 usual = partial(shortages, couplings=("none", "spring-damper"), short=(0, 0.01, 0.02, 0.05, 0.1, 0.2), generations=25)
 known = partial(
     shortages,

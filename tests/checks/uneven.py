@@ -1,11 +1,10 @@
-"""Uneven ticks against the condition: random loops, lossless hands, periods and latencies drawn or chosen by an enemy.
+"""Test this-environment under uneven ticks, whose periods and latencies are drawn or chosen by an adversary.
 
-Each loop has one or two light devices in front of a random network behind a random spring-damper, and devices of a
-given share of the damping that this-environment requires for periods up to T_max, or for forces that latch late. 40
-pairs of lossless hands start from random speeds, everything else at rest. At every tick the period and the latencies
-are drawn, or they are those that leave hands and devices most mechanical energy. With 1.02 times the requirement that
-energy may never exceed the energy at the start, and sum f'dx + dx'D dx/T never be negative, at any tick; with half of
-it some hand of some loop should grow.
+Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what
+this-environment requires for periods up to T_max, for forces that latch late, or for both. 40 sets of lossless hands
+start with random speeds, everything else at rest. The adversary chooses the tick that leaves hands and devices most
+mechanical energy. With 1.02 times the required damping this energy may never exceed that at the start, and sum f'dx +
+dx'D dx/T may never be negative; with half of it some hand of some loop should grow.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from haptic_loop.sim.stability import close
 T, _LONG = 1e-3, 1.6e-3  # [s]
 HANDS, _TICKS = 40, 4000
 ENOUGH, _SHORT = 1.02, 0.5  # times the required damping
-_GROWN = 100.0  # times the energy at the start
+_GROWN = 100.0  # times the energy at the start: the hand grows
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class _UnevenTicks:
 
     loop: str
     ticks: str
-    drawn: bool  # else the worst tick for the hands is chosen
+    drawn: bool  # otherwise the adversary chooses each tick
     required: float  # [N s/m] of the first device
     energy: float  # largest mechanical energy over that at the start, with ENOUGH
     balance: float  # least sum f'dx + dissipation over the sum of its magnitudes, with ENOUGH
@@ -51,7 +50,7 @@ class _UnevenTicks:
 
 
 def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_UnevenTicks]:
-    """Random loops under periods up to T_max, latencies, and both."""
+    """Yield the results of random loops under periods up to T_max, latencies, and both."""
     for index in range(loops):
         rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
         kind = ("periods", "latency", "both")[index % 3]
@@ -70,7 +69,7 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_Un
 
 
 def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
-    """A random loop that has a required damping, and its coupling."""
+    """Return a random loop that has a required damping, and its coupling."""
     while True:
         m = int(rng.integers(1, 3))
         names = tuple(f"contact {i + 1}" for i in range(m))
@@ -99,7 +98,10 @@ def _run(
     ticks: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
-    """Of each pair of hands (masses and stiffnesses, device included): largest and last energy, least balance."""
+    """Return the largest and the last energy, over the first, and the least balance of each set of `hands`.
+
+    `hands` are masses, devices included, and stiffnesses, both (hands, m).
+    """
     mass, stiff = hands
     n, m = mass.shape
     A, B = np.zeros((n, 2 * m, 2 * m)), np.zeros((n, 2 * m, m))
@@ -132,7 +134,7 @@ def _run(
         middle = np.einsum("nij,nj->ni", seen[which, everyone], np.hstack([xi[:, : 3 * m], force]))
         a, b = middle - x, after[:, :m] - middle
         work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
-        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # of the energy at the start
+        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # 1 / energy at the start
         balance, size = balance + unit * (work + spent), size + unit * (np.abs(work) + spent)
         least = np.minimum(least, balance / np.maximum(size, 1e-300))
         xi = after

@@ -1,12 +1,12 @@
-"""Every way of bad input that we know of, through the commands as a user runs them, in forks of one process.
+"""Run the commands with every kind of bad input that we know of, in forks of one process.
 
-    python tests/tools/hostile.py [WORD]     the cases whose name holds WORD; 0: none is answered badly
-    python tests/tools/hostile.py --short    of cases that pair a command or a field with a value, one in two or three
-    python tests/tools/hostile.py --signals  Ctrl-C and SIGTERM at random moments of a run in their place
+    python tests/tools/hostile.py [WORD]     run the cases whose name contains WORD; exit code 0 if all end well
+    python tests/tools/hostile.py --short    run one in two or three of the pairs of a command or a field with a value
+    python tests/tools/hostile.py --signals  send Ctrl-C or SIGTERM at random moments of a run instead
 
-A case is answered well where the command ends in time with the expected code and, unless it succeeded, one line on
-standard error in which no character steers the terminal; where every file that was there is as it was; where no half
-file is left. A traceback is never an answer.
+A case is answered well if the command ends in time with the expected code and, unless it succeeded, one line on
+standard error without control characters, if every file that was there is unchanged, and if no half-written file is
+left. A traceback is never an answer.
 """
 
 import gc
@@ -31,7 +31,7 @@ from pathlib import Path
 
 import hostile_files
 import hostile_words
-import matplotlib.figure  # noqa: F401 - once, before the forks
+import matplotlib.figure  # noqa: F401 - imported once, before the forks
 import numpy as np
 from hostile_cases import BUT, SHORT, Case, furnish, npz, put
 
@@ -39,9 +39,9 @@ from haptic_loop.cli import options
 from haptic_loop.cli.main import execute
 from haptic_loop.sim import plots
 
-SECONDS = 20  # of processor time that a case may take
+SECONDS = 20  # CPU seconds that a case may take
 RIGID = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))
-LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the least work
+LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the quickest commands
 
 
 def streams() -> Iterator[Case]:
@@ -86,11 +86,11 @@ def streams() -> Iterator[Case]:
 
 
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")
-TOGETHER = 100  # cases that one process answers: a process of its own costs more than most of them
+TOGETHER = 100  # cases per process: starting a process costs more than most cases
 
 
 def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
-    """What is wrong with how each case ends; one that ends its process is judged by that, and another goes on."""
+    """Yield what is wrong with the end of each case. After a case that ends its process a new process runs the rest."""
     good = {str(path.relative_to(model)): content(path) for path in model.rglob("*")}
     while cases:
         places = [Path(tempfile.mkdtemp(dir=folder)) for _ in cases]
@@ -116,7 +116,7 @@ def furnished(model: Path, place: Path) -> None:
 
 
 def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str]:
-    """What is wrong with a case that has ended: its code, what it says, and the files that it found."""
+    """Return what is wrong with a case that has ended: its exit code, its message, or changed files."""
     err, files = (place / "err").read_text(errors="surrogateescape"), place / "files"
     expected = good | (json.loads((place / "changed").read_text()) if (place / "changed").exists() else {})
     closed = "stderr closed" in case.name or "stdall" in case.name
@@ -142,7 +142,7 @@ def content(path: Path) -> str:
 
 
 def run(case: Case, place: Path) -> int:
-    """In the child: the case with its own streams and files, and the code that it ends with."""
+    """Run a case in the child with its own streams and files, and return its exit code."""
     code, files, surroundings = 99, place / "files", dict(os.environ)
     try:
         os.chdir(files)
@@ -156,7 +156,7 @@ def run(case: Case, place: Path) -> int:
         used = resource.getrusage(resource.RUSAGE_SELF)
         resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + SECONDS, resource.RLIM_INFINITY))
         sys.setrecursionlimit(1000)
-        warnings.simplefilter("default", append=True)  # what was said in another case is said again
+        warnings.simplefilter("default", append=True)  # show a warning again in each case
         if case.before:
             before = {str(path.relative_to(files)): content(path) for path in files.rglob("*")}
             put(place / "changed", "{}")
@@ -184,10 +184,10 @@ MOMENTS = 30
 
 
 def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
-    """MOMENTS of a run in which Ctrl-C comes, half as many for SIGTERM: what came, and what is wrong with its end."""
+    """Yield what is wrong with the end of a run after Ctrl-C at MOMENTS moments, and after SIGTERM at half as many."""
     words = ("run", "--duration", "2", "--out", "new")
     rng, whole, missed, code = np.random.default_rng(7), 0.0, 0, 99
-    signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # the first one measures how long
+    signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # the first run measures the duration
     for number, sent in enumerate(signals):
         place = folder / f"signal-{number}"
         furnished(model, place / "files")
@@ -208,20 +208,20 @@ def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
         err = (place / "err").read_text()
         ends = {0: (0, ("",)), signal.SIGINT: (130, ("", "interrupted\n")), signal.SIGTERM: (143, ("terminated\n",))}
         right, lines = ends[sent]
-        late = sent and code == 0 and (place / "files" / "new" / "report.json").exists()  # it came after the end
+        late = sent and code == 0 and (place / "files" / "new" / "report.json").exists()  # the signal came too late
         missed += bool(late)
         wrong = [] if late or (code == right and err in lines) else [f"code {code}, {err[-400:]!r}"]
-        wrong += ["it comes after the end for the tenth time"] if missed == 10 else []
+        wrong += ["the signal came after the end for the tenth time"] if missed == 10 else []
         wrong += [f"{path.name} is left" for path in place.rglob(".*.*")]
         yield f"signal {sent} after {moment:.3f} of {whole:.2f} s", wrong
 
 
 def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
-    """The cases whose name holds the word, and what is wrong with the end of each."""
+    """Yield the cases whose name contains the word, and what is wrong with the end of each."""
     found = [case for part in (hostile_words, hostile_files) for case in part.cases() if word in case.name]
     for first in range(0, len(found), TOGETHER):
         yield from answered(found[first : first + TOGETHER], folder, model)
-    for case in streams():  # each changes the process itself: its streams, its memory
+    for case in streams():  # each changes the streams or the memory of its process
         if word in case.name:
             yield from answered([case], folder, model)
 

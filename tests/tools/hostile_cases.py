@@ -1,4 +1,4 @@
-"""What a hostile case is, the good files that it finds, and how they are spoilt."""
+"""Cases of bad input, the good files in their folders, and functions that spoil these files."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Case:
     name: str
     words: tuple[str, ...]
     codes: tuple[int, ...] = (BUT,)
-    says: str = ""  # a regular expression that standard error holds
-    before: Callable[[], object] | None = None  # in the child, within the case's folder
+    says: str = ""  # a regular expression that matches standard error
+    before: Callable[[], object] | None = None  # runs in the child, in the case's folder
 
 
-QUICK = {  # what a command needs beside the option in question
+QUICK = {  # options that a command needs beside the tested one
     "run": ("--no-plot", "--duration", "0.1"),
     "validate": ("--humans", "2", "--duration", "0", "--no-plot"),
     "zwidth": ("--grid", "4", "--points", "0", "--humans", "2", "--no-plot"),
@@ -60,7 +60,7 @@ TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 
 
 def furnish(folder: Path) -> None:
-    """A good file of each kind, and things that are no files."""
+    """Write a good file of each kind, a pipe, a folder, and links."""
     scenario = load()
     loop, data = scenario.loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
     (folder / "s.toml").write_text(TEXT)
@@ -77,7 +77,7 @@ def furnish(folder: Path) -> None:
 
 
 def npz(path, **changed):
-    """A trace of two channels, some of its arrays replaced or (None) left out."""
+    """Write a trace of two channels with some arrays replaced, or left out if None."""
     n, t = 400, 1.2e-3 * np.arange(400)
     x = 1e-3 * np.sin(2 * np.pi * 60 * t)[:, None] * [1.0, 0.5]
     arrays = {"t": t, "x": x, "f": 100 * x, "x_handle": x, "v_handle": x, "w": np.zeros((n, 0))} | changed
@@ -87,13 +87,13 @@ def npz(path, **changed):
 
 
 def toml(old: str, new: str) -> Callable[[], None]:
-    """s.toml with some text replaced."""
+    """Return a function that replaces a text in s.toml."""
     assert old in TEXT, old
     return lambda: put("s.toml", TEXT.replace(old, new, 1)) and None
 
 
 def stored(path: str, value: object) -> Callable[[], None]:
-    """c.json with one entry replaced; the path of names and numbers is joined by dots."""
+    """Return a function that replaces one entry of c.json; dots join the names and numbers of its path."""
 
     def change() -> None:
         whole = json.loads(Path("c.json").read_text())

@@ -1,4 +1,4 @@
-"""Files that are none, that overflow or claim what they have not: scenarios, people, delays, couplings, traces."""
+"""Files that are malformed, overflow, or claim false proofs: scenarios, hands, delays, couplings, traces."""
 
 from __future__ import annotations
 
@@ -77,14 +77,14 @@ NO_NETWORKS = {
 
 
 def scenarios() -> Iterator[Case]:
-    """Texts that are no scenario, or one that cannot be."""
+    """Yield texts that are no scenario, or an impossible one."""
     for name, text in NO_SCENARIOS.items():
         yield Case(f"scenario: {name}", ("run", *QUICK["run"], "--scenario", "s.toml"), before=written("s.toml", text))
     numbers = ("1e300", "1e999", "-1.0", "nan", "-inf", '"x"', "[]", "true")
     closing = {"theta = [1, ": "]", "psi = [0, ": "]", "masses = { mass = ": " }", "damping = ": " },"}
     for (old, new), number in pairs(FIELDS, numbers, 3):
         if (old, number) == ("force = 1.0", "-1.0"):
-            continue  # a pull
+            continue  # a negative force is allowed
         field = old.split(" ")[0].removesuffix("es")
         text = f"{new}{number}{closing.get(new, '')}"
         words = ("audit", *QUICK["audit"], "--scenario", "s.toml")
@@ -156,7 +156,7 @@ NO_PEOPLE = {
 
 
 def humans_and_delays() -> Iterator[Case]:
-    """Files of humans, in TOML and as scripts, and of recorded delays."""
+    """Yield bad files of humans, in TOML and as scripts, and of recorded delays."""
     for file, texts in NO_PEOPLE.items():
         option = "--pattern" if file == "p.txt" else "--human"
         for name, text in texts.items():
@@ -229,14 +229,14 @@ CLAIMS = [
 
 
 def couplings() -> Iterator[Case]:
-    """Stored couplings that are none, that overflow, or that claim what they do not have."""
+    """Yield stored couplings that are malformed, overflow, or claim proofs that they do not have."""
     for command, (name, text) in pairs(("check", "export", "audit"), NO_COUPLINGS.items()):
         way = ("--coupling", "c.json") if command == "audit" else ("c.json",)
         yield Case(f"{command}: {name}", (command, *way), says=r"c\.json", before=written("c.json", text))
     twice = lambda: put("c.json", Path("c.json").read_text().replace('"K"', '"K": [1.0, 1.0], "K"', 1))  # noqa: E731
     yield Case("check: K twice", ("check", "c.json"), says="twice", before=twice)
     for command, (path, value) in pairs(("check", "export"), ENTRIES):
-        codes = (BUT, 1)  # 1: it can be read, and is not proved
+        codes = (BUT, 1)  # 1: the file can be read, but is not proved
         yield Case(f"{command}: {path} = {str(value)[:30]}", (command, "c.json"), codes, before=stored(path, value))
     for path, value in CLAIMS:
         name = f"check: {path} = {str(value)[:30]}"
@@ -244,7 +244,7 @@ def couplings() -> Iterator[Case]:
 
 
 def packed(**entries: bytes) -> Callable[[], None]:
-    """t.npz with entries as they are."""
+    """Return a function that writes t.npz with these raw entries."""
 
     def change() -> None:
         with zipfile.ZipFile("t.npz", "w", zipfile.ZIP_DEFLATED) as archive:
@@ -265,7 +265,7 @@ def flipped(content: bytes) -> bytes:
 
 
 def bomb() -> None:
-    """A small archive whose directory says that it unpacks to ten gigabytes."""
+    """Write a small archive whose directory says that it unpacks to four gigabytes."""
     with zipfile.ZipFile("t.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("t.npy", header("(3,)", rest=bytes(24)))
     content = bytearray(Path("t.npz").read_bytes())
@@ -327,7 +327,7 @@ NO_ARCHIVES = {
 
 
 def traces() -> Iterator[Case]:
-    """Traces that are none, that declare more than they hold, and data that no session measured."""
+    """Yield malformed traces, traces that declare more than they hold, and data that no session could measure."""
     for (name, arrays), command in pairs(CHANGED.items(), ("trace", "replay")):
         change = lambda arrays=arrays: npz("t.npz", **arrays)  # noqa: E731
         fine = (BUT, 0) if command == "trace" and name in ("meta is a number", "one shorter") else (BUT,)
@@ -338,7 +338,7 @@ def traces() -> Iterator[Case]:
         yield Case(f"{command}: {name}", (command, "t.npz"), says=r"t\.npz", before=change)
 
 
-#: what a typesetter, a terminal or a format reads as its own
+#: names that a typesetter, a terminal or a format string would interpret
 STEERING = (
     "$x^",
     "$\\frac$",
@@ -355,7 +355,7 @@ STEERING = (
 
 
 def names_in_pictures() -> Iterator[Case]:
-    """Names with everything that a typesetter reads as its own."""
+    """Yield files and scenarios with names that a typesetter would interpret."""
     for name in STEERING:
         file = f"t{name}.npz".replace("/", "|")
         copied = lambda file=file: shutil.copy("t.npz", file)  # noqa: E731
@@ -366,7 +366,7 @@ def names_in_pictures() -> Iterator[Case]:
 
 
 def cases() -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases of this file."""
     yield from scenarios()
     yield from humans_and_delays()
     yield from couplings()

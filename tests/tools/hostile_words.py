@@ -1,4 +1,4 @@
-"""Command lines that nobody should write: odd words and paths, outputs over inputs, options that do not go together."""
+"""Bad command lines: odd words and paths, outputs over inputs, options that exclude each other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NUMERIC = {
 
 
 def numeric_options() -> Iterator[Case]:
-    """Words that are no numbers, or no numbers within any limits."""
+    """Yield numeric options with words that are not numbers, or are outside of all limits."""
     for command, names in NUMERIC.items():
         for i, name in enumerate(names.split()):
             every = command in ("run", "bridge") and not SHORT
@@ -66,7 +66,7 @@ NO_FILES = {
 
 
 def odd_paths() -> Iterator[Case]:
-    """What cannot be read, and what cannot be written."""
+    """Yield inputs that cannot be read, and outputs that cannot be written."""
     for (command, option), (kind, path) in pairs(INPUTS, NO_FILES.items()):
         rest = tuple(word for word in QUICK[command] if option or not word.startswith(("c.json", "t.npz")))
         if option == "--coupling" and not path.startswith(("/", "dir", "fifo", "loop", "s.toml")):
@@ -83,7 +83,7 @@ def odd_paths() -> Iterator[Case]:
     path = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
     for (command, option), kind in pairs(outputs, kinds):
         if kind == "no folder" and (command, option) in {("run", "--out"), ("bridge", "--out")}:
-            continue  # a folder is made
+            continue  # the command makes the folder
         if kind == "folder" and option == "--out" and command in ("run", "bridge"):
             continue
         suffix = ".gif" if option == "--video" and kind not in ("folder", "circle") else ""
@@ -126,7 +126,7 @@ BOTH = [
 
 
 def overwritten() -> Iterator[Case]:
-    """Outputs that are inputs, or each other, by whatever name."""
+    """Yield outputs that are also inputs or other outputs, under any name."""
     for words in BOTH:
         yield Case(" ".join(words), words, says="also|read")
 
@@ -142,7 +142,7 @@ def overwritten() -> Iterator[Case]:
 
 
 NONE = ("--case", "none")
-#: options that would have to be ignored, and lists with nothing between their commas; what the line names
+#: options that would be ignored, and lists with empty entries; each with the words of its error line
 SILENT = [
     (("run", *QUICK["run"], *NONE, "--coupling", "zzz"), "--coupling"),
     (("validate", *QUICK["validate"], *NONE, "--coupling", "zzz"), "--coupling"),
@@ -216,7 +216,7 @@ SILENT = [
 
 
 def silence() -> Iterator[Case]:
-    """Options that would have to be ignored, and lists with nothing between their commas."""
+    """Yield options that would be ignored, and lists with empty entries."""
     for words, says in SILENT:
         yield Case(" ".join(words), words, says=says)
     yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)
@@ -232,7 +232,7 @@ def feather() -> None:
     )
 
 
-#: every one is refused, whatever its command would do else
+#: by command: options that are refused before any work
 REFUSED = {
     "run": """--error 0 | --error -1 | --error 1e-400 | --error inf | --error 1e-6 --engine exact
         --error 1e-6 --integrator RK4 | --error 1e-6 --substeps 4 | --energy-budget -1 | --energy-budget 1,0.5
@@ -280,7 +280,7 @@ humans = [Hand()] * 2
 """
 _GOOD = "return Human((Link(.3, 3., 200.),)).port()"
 _DRAWS = HUMANS + "class P:\n    def draw(self, rng, n): {}\npopulation = P()\n"
-#: how the file says it, and whether it may be taken for one of people
+#: name -> text of a Python file of hands, most of which fail or do harm
 PEOPLE = {
     "ends": "raise SystemExit(0)",
     "interrupts": "raise KeyboardInterrupt",
@@ -307,7 +307,7 @@ PEOPLE = {
 
 
 def combined() -> Iterator[Case]:
-    """Options that cannot be, options that do not go together, and people of Python who do harm."""
+    """Yield impossible options, options that exclude each other, and harmful Python files of hands."""
     asked = [
         (command, words.strip(), (BUT,), HUMANS)
         for command, lines in REFUSED.items()
@@ -321,7 +321,7 @@ def combined() -> Iterator[Case]:
 
 
 def cases() -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases of this file."""
     yield from numeric_options()
     yield from odd_paths()
     yield from overwritten()

@@ -1,7 +1,7 @@
 """Run the numerical tests under every linear-algebra kernel of this processor, and print a table of the results.
 
-A kernel is a build of OpenBLAS for one kind of processor. Kernels add in different orders and round differently: no
-test may pass on one of them only. Two more settings round differently, too: NumPy without the instruction sets that it
+A kernel is a build of OpenBLAS for one kind of processor. Kernels add in different orders and round differently, and
+tests must pass with all of them. Two more settings round differently: NumPy without the instruction sets that it
 chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
@@ -9,7 +9,7 @@ chooses at run time, and OpenBLAS with eight threads instead of one.
     python tests/tools/kernels.py --only HASWELL  this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
-What pytest prints stands in build/kernels/SETTING.txt. The exit code is 1 if a test fails under any setting.
+The output of pytest is written to build/kernels/SETTING.txt. The exit code is 1 if a test fails under any setting.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ print(json.dumps([blas, have, [name for name in __cpu_dispatch__ if name in have
 
 
 def asked(**variables: str) -> tuple[list[str], list[str], list[str]]:
-    """(kernels in use, features of the processor, those of them that NumPy chooses at run time)."""
+    """Return (kernels in use, features of the processor, those features that NumPy chooses at run time)."""
     out = subprocess.run([sys.executable, "-c", _ASK], env={**os.environ, **variables}, capture_output=True, check=True)
     return tuple(json.loads(out.stdout))
 
 
 def settings() -> dict[str, dict[str, str]]:
-    """Name to environment variables, of every setting that this processor can run, the native kernel first.
+    """Return name -> environment variables of every setting that this processor can run, the native kernel first.
 
-    OpenBLAS may have one build for several names, or none for a name: it then takes another without a word. A
-    name of the same kernel as one before is left out.
+    OpenBLAS may have one build for several names, or none for a name; it then silently uses another build. Names
+    whose kernel is already listed are left out.
     """
     blas, have, dispatched = asked()
     every: dict[str, dict[str, str]] = {"native": {}}
@@ -71,14 +71,14 @@ def settings() -> dict[str, dict[str, str]]:
                 there[name], every[kernel] = kernel, {"OPENBLAS_CORETYPE": kernel}
     if dispatched:
         every["NumPy baseline"] = {"NPY_DISABLE_CPU_FEATURES": " ".join(dispatched)}
-    # threads that wait sleep after 2^4 cycles instead of 2^26, which they would take from those that work
+    # idle threads sleep after 2^4 cycles; with the usual 2^26 they would take cycles from working threads
     every["8 threads"] = {"OPENBLAS_NUM_THREADS": "8", "OPENBLAS_THREAD_TIMEOUT": "4"}
     print(f"the native kernel is {' and '.join(sorted(set(blas)))}", flush=True)
     return every
 
 
 def foreign(every: dict[str, dict[str, str]]) -> str:
-    """A kernel that is not the native one: consecutive commits take them in turn. "native" if there is no other.
+    """Return a kernel other than the native one, in turn for consecutive commits; "native" if there is no other.
 
     PRESCOTT, the kernel of processors before 2008, takes a fifth longer and is left to the run of every setting.
     """
@@ -88,7 +88,7 @@ def foreign(every: dict[str, dict[str, str]]) -> str:
 
 
 def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int, int, float]:
-    """(passed, failed, skipped, seconds) of the numerical tests under a setting; the lines of failures are printed."""
+    """Run the numerical tests under a setting, print failures, and return (passed, failed, skipped, seconds)."""
     OUT.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     parallel = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"]
@@ -113,7 +113,7 @@ def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int
 
 def main() -> int:
     for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"):
-        os.environ.pop(name, None)  # the native setting is what the processor chooses, whatever the caller has set
+        os.environ.pop(name, None)  # in the native setting OpenBLAS and NumPy choose, whatever the caller has set
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="SETTING")
     parser.add_argument("--one", action="store_true", help="one foreign kernel")

@@ -1,10 +1,10 @@
 """make mutate: report small mistakes in the code that verdicts rest on which no test notices.
 
-The command makes small mistakes, one at a time, in the functions of the modules of TABLE: it turns a comparison or a
-sign, changes a number, leaves out a refusal, writes `max` for `min`. Then it runs the tests that call the changed
+The command makes small mistakes, one at a time, in the functions of the modules of TABLE: it reverses a comparison or a
+sign, changes a number, leaves out a refusal, or writes `max` for `min`. Then it runs the tests that call the changed
 function, the fastest first, until one fails: the mutant is killed. A process that has collected the tests is forked for
-each mutant. The seed alone decides which mistakes are drawn. mutate.survivors.md explains mutants that may survive; any
-other survivor, or a score below GOAL, fails the run.
+each mutant. The seed decides which mistakes are drawn. mutate.survivors.md explains mutants that may survive; any other
+survivor, or a score below GOAL, fails the run.
 
     python tests/tools/mutate.py [--only design/exact.py] [--count 40] [--seed 0] [--jobs 2]
 """
@@ -36,7 +36,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 JUDGED = Path(__file__).with_name("mutate.survivors.md")
 GOAL = 0.95
-#: module -> the files of tests that are about it
+#: module -> its test files
 TABLE = {
     "design/exact.py": "design/test_exact design/test_exact_blocks",
     "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
@@ -181,7 +181,7 @@ class _Replace(ast.NodeTransformer):
 
 
 def _install(mutant: Mutant) -> None:
-    """Give the function of this process the code with the mistake."""
+    """Put the code with the mistake into the function that this process has imported."""
     tree, node, new = next(rest for other, *rest in _mistakes(mutant.module) if other == mutant)
     code = compile(ast.fix_missing_locations(_Replace(node, new).visit(tree)), str(ROOT / mutant.module), "exec")
     found: Any = importlib.import_module("haptic_loop." + mutant.module.removesuffix(".py").replace("/", "."))

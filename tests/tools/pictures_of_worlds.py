@@ -1,4 +1,4 @@
-"""python tests/tools/pictures_of_worlds.py FILE.png: the packaged worlds while hands move, for docs/worlds.md."""
+"""python tests/tools/pictures_of_worlds.py FILE.png: draw the packaged worlds while hands move, for docs/worlds.md."""
 
 import math
 import sys
@@ -11,12 +11,12 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.view.session import LiveLoop, Menu, first_loop
 from haptic_loop.sim.view.stage import pictures_for
 
-AT = {"cube": 1.5, "ball": 1.2, "peg": 2.0, "door": 1.5, "stack": 1.5}  # [s] of each scenario
+AT = {"cube": 1.5, "ball": 1.2, "peg": 2.0, "door": 1.5, "stack": 1.5}  # [s] when each scenario is drawn
 SIZE = 300, 225
 
 
 def main(file: str) -> None:
-    """Draw them side by side."""
+    """Draw the worlds side by side."""
     whole = Image.new("RGB", (len(AT) * SIZE[0], SIZE[1]), "white")
     for i, (name, seconds) in enumerate(AT.items()):
         loop = first_loop(Menu("I"), load(f"world-{name}"), "moving-average")

@@ -1,9 +1,9 @@
 """python tests/tools/regenerate.py: run the commands of README and docs, and write their output where a block asks.
 
-`--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, of
-what is measured all but times: exit code 1 where that is something else.
+`--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output, except for
+measured times, with that on the pages. The exit code is 1 if they differ.
 
-    <!-- output: certified|binds -->      lines with one of these words (a regular expression); all without ": .."
+    <!-- output: certified|binds -->      the lines that match this regular expression; without ": .." all lines
     ```console
     $ python -m design.audit ..
     ```
@@ -14,7 +14,7 @@ what is measured all but times: exit code 1 where that is something else.
 
 A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
 `<!-- picture: FROM TO -->` keeps a picture that a command has drawn.
-tests/project/test_docs.py runs the same steps and compares, but for what is measured.
+tests/project/test_docs.py runs the same steps and compares all but measured output.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Step(NamedTuple):
 
 
 def steps(text: str) -> Iterator[Step]:
-    """What a reader of the page does, in order."""
+    """Yield the steps that a reader of the page takes, in order."""
     for kind, body in BLOCK.findall(text):
         if name := re.match(r"# (\S+\.(?:toml|py))\n", body):
             yield Step("file", body, name[1])
@@ -65,7 +65,7 @@ def steps(text: str) -> Iterator[Step]:
 
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """A documented command, in a terminal of 100 columns."""
+    """Run a documented command in a terminal of 100 columns."""
     here = ("examples/", "tests/")
     words = [str(ROOT / w) if w.startswith(here) else w for w in shlex.split(command, comments=True)]
     shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
@@ -76,13 +76,13 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def kept(output: str, pattern: str | None) -> str:
-    """The lines of a command's output that a page shows."""
+    """Return the lines of a command's output that a page shows."""
     lines = (line.rstrip() for line in output.splitlines())
     return "".join(f"{line}\n" for line in lines if re.search(pattern or "", line))
 
 
 def renewed(text: str, printed: dict[str, str]) -> str:
-    """The page with what its commands have printed."""
+    """Return the page with the output of its commands."""
 
     def shown(block: re.Match[str]) -> str:
         return block[1] + kept(printed[block[3]], block[2]) if block[3] in printed else block[0]
@@ -93,17 +93,17 @@ def renewed(text: str, printed: dict[str, str]) -> str:
 
 
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
-#: what a machine decides: seconds, speeds, what costs what, and the last column of a table, of times or of rounding
+#: figures that depend on the machine: seconds, speeds, costs, and the last column of a table (times, rounding)
 _TIMES = re.compile(
     r"[\d.]+(?= s\b| x real time| simulated seconds per)|(?<=raw steps )[\d.]+|(?<=clipped )[\d.]+|[^│]*│$"
 )
-_ROUNDING = 1e-6  # an error smaller than this may be rounding, which is another one on another machine
+_ROUNDING = 1e-6  # a smaller error may be rounding, which depends on the machine
 
 
 def same_line(shown: str, line: str, measured: bool = False) -> bool:
-    """The same words, and numbers that differ by two units in the last place shown, or two thousandths, at most.
+    """Return whether the words are equal, and the numbers to two units in the last place shown or two thousandths.
 
-    Where it is measured, times do not count, and errors (`1.2e-05`) are the same within a factor of two.
+    In measured output times do not count, and errors (`1.2e-05`) may differ by a factor of two.
     """
     if measured:
         shown, line = _TIMES.sub("", shown), _TIMES.sub("", line)
@@ -124,7 +124,7 @@ def _close(shown: str, number: str, measured: bool) -> bool:
 
 
 def check() -> int:
-    """Run what is slow or measured and say which lines of which pages are something else now."""
+    """Run the slow and the measured commands, and print the lines of pages that differ from their output."""
     found, printed = 0, {}
     with TemporaryDirectory() as place:
         for page in PAGES:
@@ -151,11 +151,11 @@ def check() -> int:
 
 
 def main() -> int:
-    """Run every page that shows output, and rewrite those whose output is another."""
+    """Run the commands of every page that shows output, and rewrite the pages whose output has changed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
     parser.add_argument(
-        "pages", nargs="*", metavar="PAGE", help="renew these alone, by name or path, without what is measured"
+        "pages", nargs="*", metavar="PAGE", help="pages to renew, by name or path, except for measured output"
     )
     args = parser.parse_args()
     if args.check:

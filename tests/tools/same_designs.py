@@ -30,14 +30,14 @@ DESIGNS = {
 
 
 def begun(words: tuple[str, ...], out: Path, core: int | None = None) -> subprocess.Popen[bytes]:
-    """Start a design that stores its coupling in `out`, on one core if `core` says which."""
+    """Start a design that stores its coupling in `out`, on the core `core` unless None."""
     command = [sys.executable, "-m", "design", *words, "--out", str(out)]
     pinned = None if core is None else (lambda: os.sched_setaffinity(0, {core}))
     return subprocess.Popen(command, cwd=ROOT, preexec_fn=pinned, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
 def stored(process: subprocess.Popen[bytes], out: Path) -> bytes:
-    """The file of a design, once it has ended. Raises RuntimeError if it stored none."""
+    """Wait for a design, and return its file. Raises RuntimeError if it stored none."""
     _, error = process.communicate()
     if not out.exists():
         raise RuntimeError(f"{' '.join(map(str, process.args))}\n{error.decode()}")
@@ -46,7 +46,7 @@ def stored(process: subprocess.Popen[bytes], out: Path) -> bytes:
 
 @contextmanager
 def busy(count: int) -> Iterator[None]:
-    """Keep this many processes busy, which end with the block."""
+    """Keep `count` processes busy until the block ends."""
     with ExitStack() as stack:
         for _ in range(count):
             process = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
@@ -55,10 +55,10 @@ def busy(count: int) -> Iterator[None]:
 
 
 def files(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
-    """What the design stores under each condition of the machine."""
+    """Return the file that the design stores under each condition of the machine."""
 
     def made(*names: str, core: int | None = None) -> dict[str, bytes]:
-        """Of as many processes at once, the last one on one core if `core` says which."""
+        """Return the files of one process per name, all at once, the last on the core `core` unless None."""
         outs = [folder / f"{name}.json" for name in names]
         cores = [*[None] * (len(names) - 1), core]
         begins = [begun(words, out, core) for out, core in zip(outs, cores, strict=True)]
