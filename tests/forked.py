@@ -109,7 +109,7 @@ def _remembering(folder: Path, make):
 
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
-    """Return the arguments of a call except the loop, with defaults, in words that equal calls share."""
+    """Return the arguments of a call, with defaults but without loop and functions, in words that equal calls share."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT

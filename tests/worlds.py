@@ -1,4 +1,4 @@
-"""Loops, couplings and formulas that many tests share: the default pair and formulas written out by hand."""
+"""What many tests share: the default pair, couplings for it, formulas written out by hand, and a serial line."""
 
 from __future__ import annotations
 

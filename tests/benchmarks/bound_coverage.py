@@ -44,7 +44,7 @@ class Case:
 
 
 def case(seed: int) -> Case:
-    """The random case of a seed."""
+    """Return the random case of a seed."""
     draw = np.random.default_rng(seed)
     return Case(
         seed,

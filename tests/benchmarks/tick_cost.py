@@ -91,7 +91,7 @@ def tick_cost(ticks: int) -> dict[str, list[float]]:
     with _Bench() as port:
         session = port.session
         live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
-        live.clock = lambda: port.clock  # the emulated device's: a tick takes longer here than T
+        live.clock = lambda: port.clock  # the emulated device's, since ticks take longer here than T
         session.start(0)
         gc.collect()
         gc.freeze()

@@ -47,13 +47,13 @@ class _Challenge:
     guarantee: str
     loop: int  # the number of the draw
     factor: float  # times what the guarantee requires
-    motions: int  # tried
+    motions: int  # motions tried
     took: int  # motions that took more energy than the guarantee allows
     least_J: float  # the lowest energy balance plus `given` of all motions and hands
     hands: int  # hands tried in each generation
     grew: int  # hands that grew, or took more energy than the guarantee allows
     limited: float  # share of ticks with limited forces or contact, largest over the three values of greed
-    holds: bool  # nothing was taken, or nothing is claimed
+    holds: bool  # no adversary succeeded, or nothing is guaranteed (factor < 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
         return np.nan_to_num(np.sqrt(last / first), nan=np.inf), np.nan_to_num(least, nan=-np.inf)
 
 
-_PARTS = 6  # of a tick, in each of which friction acts anew
+_PARTS = 6  # parts of a tick; friction acts anew in each
 
 
 class _Rubbing:
@@ -225,7 +225,7 @@ class _Rubbing:
 
 
 def _pair(rng: np.random.Generator, stiffest: float = 9000.0) -> tuple[Loop, SpringDamper]:
-    """Two devices, a mass between them, and delays of up to three samples; no damping is declared yet."""
+    """Return a loop of two devices, a mass and delays of up to three samples, and a coupling; delta is not set yet."""
     K, B = np.exp(rng.uniform(np.log(500), np.log(stiffest), 2)), rng.uniform(0, 2, 2)
     one, two, ground = rng.uniform(100, 1500, 3).tolist()
     springs = Spring(("a", "m"), one, 0.5), Spring(("m", "b"), two, 0.5), Spring(("m", GROUND), ground / 2, 0.1)
@@ -233,7 +233,7 @@ def _pair(rng: np.random.Generator, stiffest: float = 9000.0) -> tuple[Loop, Spr
     return Loop(1.2e-3, theta, (0, 0), theta, (1.0, 1.0), network), SpringDamper(K, B)
 
 
-_FREE = np.full(2, np.inf), np.zeros(2)  # limits of the actuators and steps of the encoders that do nothing
+_FREE = np.full(2, np.inf), np.zeros(2)  # actuator limits and encoder steps without effect
 
 
 def _limits(rng: np.random.Generator, factor: float) -> _Case:

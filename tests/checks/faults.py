@@ -29,11 +29,11 @@ _T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
 _AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick
-_STOP = 8 * _T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
-_WATCHDOG = 12 * _T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
-_TESTED = 2 * (12.0 + 120.0)  # the last test of two motors
-_DEAD = 300.0  # a force has to change by more than 1 N first
-_SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, looked at every millisecond, then a STOP
+_STOP = 8 * _T_MS  # the frame that shows the fault, the STOP, 5 ticks of ramp
+_WATCHDOG = 12 * _T_MS  # theta, 4 ticks with a held force, 5 of ramp, one to notice
+_TESTED = 2 * (12.0 + 120.0)  # the final test of two motors
+_DEAD = 300.0  # the fault shows only after a force has changed by more than 1 N
+_SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, checked every millisecond, then a STOP
 
 _Call = Callable[[Session, int], Said]
 
@@ -47,8 +47,8 @@ class Fault:
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from the fault to zero force; None: forces go on
-    action: _Call | None = None  # done at WHEN
-    host_stall: float = 0.0  # [s] at WHEN
+    action: _Call | None = None  # done at _WHEN
+    host_stall: float = 0.0  # [s] that the host freezes at _WHEN
     info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
     baud: int | None = None
     continuous: tuple[float, ...] = ()  # [N] that the motors can hold for ever
@@ -107,7 +107,7 @@ _LATE = at("down:jitter=0.0007")
 CASES = (
     Fault("nothing", A),
     Fault("ticks wrap around", A, first_tick=65000),
-    # the line, a little
+    # mild faults of the line
     Fault("5 % of STATEs lost", A, faults=at("up:drop=0.05"), counted=("gaps", "misses")),
     Fault("5 % of FORCEs lost", A, faults=at("down:drop=0.05"), counted=("misses",)),
     Fault("bits of STATEs flipped", A, faults=at("up:flip=0.05"), counted=("gaps", "host_errors")),
@@ -123,7 +123,7 @@ CASES = (
     Fault("device freezes for 4 ms", A, faults=at("stall=0.004")),
     Fault("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
     Fault("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
-    # the line, too much
+    # severe faults of the line
     Fault("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
     Fault("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
     Fault("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
@@ -200,7 +200,7 @@ CASES = (
         "@0.48",
         lasts=2.2,
     ),
-    # what the test at arming is for
+    # faults that the test at arming must find
     *(
         Fault(f"{what} of axis {axis} before", G.STOPPED, f"{axis} {cause}", (f"axis{axis}:{fault}",), _AT_ONCE)
         for axis in (1, 2)
@@ -218,7 +218,7 @@ CASES = (
         for drift in (f"axis{axis}:drift=0.05@0",)
         for what, fault, cause in (("reversed encoder", "reverse", "wrong sign"), ("dead motor", "motor=0", "follow"))
     ),
-    # what the test at the end is for
+    # faults that the test at the end must find
     *(
         Fault(f"{what} of axis {axis} dies, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}@0.6",), **_ENDED)
         for axis in (1, 2)

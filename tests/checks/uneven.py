@@ -134,7 +134,7 @@ def _run(
         middle = np.einsum("nij,nj->ni", seen[which, everyone], np.hstack([xi[:, : 3 * m], force]))
         a, b = middle - x, after[:, :m] - middle
         work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
-        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # 1 / energy at the start
+        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # makes energies shares of that at the start
         balance, size = balance + unit * (work + spent), size + unit * (np.abs(work) + spent)
         least = np.minimum(least, balance / np.maximum(size, 1e-300))
         xi = after

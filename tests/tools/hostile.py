@@ -45,7 +45,7 @@ LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  
 
 
 def streams() -> Iterator[Case]:
-    """Standard streams that are closed, full or ASCII, and little memory."""
+    """Yield cases with closed, full or ASCII standard streams, with little memory, and with a wrong backend."""
 
     def closed(*numbers: int) -> Callable[[], None]:
         def change() -> None:

@@ -6,7 +6,7 @@ chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
     python tests/tools/kernels.py --one           one foreign kernel; the next commit takes the next (for CI)
-    python tests/tools/kernels.py --only HASWELL  this setting
+    python tests/tools/kernels.py --only HASWELL  only this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
 The output of pytest is written to build/kernels/SETTING.txt. The exit code is 1 if a test fails under any setting.

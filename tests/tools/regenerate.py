@@ -3,7 +3,7 @@
 `--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output, except for
 measured times, with that on the pages. The exit code is 1 if they differ.
 
-    <!-- output: certified|binds -->      the lines that match this regular expression; without ": .." all lines
+    <!-- output: certified|binds -->      lines that match this regular expression; <!-- output --> shows all lines
     ```console
     $ python -m design.audit ..
     ```
