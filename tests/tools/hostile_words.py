@@ -232,7 +232,7 @@ def feather() -> None:
     )
 
 
-#: by command: options that are refused before any work
+#: by command: options that are refused
 REFUSED = {
     "run": """--error 0 | --error -1 | --error 1e-400 | --error inf | --error 1e-6 --engine exact
         --error 1e-6 --integrator RK4 | --error 1e-6 --substeps 4 | --energy-budget -1 | --energy-budget 1,0.5
