@@ -122,9 +122,11 @@ def _parser() -> options.Parser:
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|FILE.py:NAME", help=stored)
     parser.add_condition(
-        "the condition that must hold; the report judges this-environment and any-environment, too", to=coupling
+        "the report judges this-environment and any-environment; the condition that must hold (default "
+        "this-environment, or known-device for known devices)",
+        to=coupling,
     )
-    device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
+    device = "use its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"from the catalogue: {device}; other options override it")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     parser.add_loop()
@@ -346,7 +348,7 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
     """Yield the changes that certify the coupling, the least required damping first, or that there are none."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
-        yield "What helps: no change of delay, damper or period alone was found to certify; a design finds other gains."
+        yield "What helps: no change of delay, damper or period alone was found to suffice; a design finds other gains."
     for each in enough:
         needs = f"{each.condition} then needs {listed(each.required_damping)} N s/m, certified"
         yield f"What helps: {each.change} ({needs})."

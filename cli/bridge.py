@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated hands never let go.
+    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated handles are held.
     session = session_for(scenario, settings, **limits)
     below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
     scenario = session.scenario
@@ -123,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_condition()
     latch = (
-        "when forces act: at whole ticks (default), or on arrival (force-dimension: always), by the measured latency"
+        "when forces act: at whole ticks (default), or on arrival with a certified latency (force-dimension: always)"
     )
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     parser.add_energy_budget()

@@ -50,9 +50,9 @@ def _parser() -> options.Parser:
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("the condition of designs that name none; your own condition judges all couplings")
+    parser.add_condition("of designs without :CONDITION (default: the coupling's); your own judges all couplings")
     parser.add_output(picture=True)
-    parser.only("with --coupling: the runs of every coupling draw nothing", lambda args: args.coupling, "seed")
+    parser.only("with --coupling: the runs of every coupling use no seed", lambda args: args.coupling, "seed")
     return parser
 
 
@@ -214,7 +214,7 @@ def _guarantees(report: Comparison) -> render.Table:
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
-    title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
+    title = f"{damping} (available: {_list(available)} N s/m) · {report.scenario}, case {report.case}"
     scale = available[0] if alike else 1.0
     cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
     for i, condition in enumerate(report.conditions):

@@ -74,9 +74,9 @@ def _parser() -> options.Parser:
     default = "default spring-damper; moving-average in a world"
     kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own ({default})"
     parser.add_argument("--coupling", metavar="NAME", help=kinds)
-    around = "stiffnesses and masses vary by PERCENT: certify the vertices, search between them, like [ranges]"
+    around = "vary stiffnesses and masses by PERCENT like a scenario's [ranges]: certify vertices, search between them"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
-    parser.add_condition("what to certify")
+    parser.add_condition("what to certify (default: the coupling's)")
     ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
     varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
@@ -84,7 +84,7 @@ def _parser() -> options.Parser:
     parser.add_varying_delay(varying)
     limiter = (
         "fail unless this-environment (optimal: or known-device) is proved for limited forces, too "
-        "(default: a spring-damper tries)"
+        "(default: only a spring-damper tries it)"
     )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
@@ -103,7 +103,7 @@ def _add_optimal_options(parser: options.Parser, title: str) -> None:
     parser.add_band(to=group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the design only reduces the force there)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
-    limit = "stop enlarging the basis and searching the ranges after S seconds (default: no time limit)"
+    limit = "stop enlarging the basis and searching the ranges after about S seconds (default: no time limit)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
 
 
@@ -130,7 +130,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
-            raise InputError("--varying-delay is for spring-damper or optimal, by this-environment or known-device")
+            raise InputError("--varying-delay is for spring-damper or optimal, with this-environment or known-device")
         span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
         with options.refused("--varying-delay: "):
             loop = loop.switching(span)
@@ -138,7 +138,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 
 def _for_switching(args: argparse.Namespace) -> bool:
-    """Return whether the design takes varying delays into account; other designs are only judged under them."""
+    """Return whether the design takes varying delays into account; --varying-delay is refused for others."""
     kind = kind_of(args.coupling)
     condition = named(args.condition or kind.conditions[0])
     return "switching" in kind.options and (condition.extensible or condition is KNOWN_DEVICE)

@@ -127,7 +127,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     single = "compute in single precision, for processors without double; its error is printed"
     parser.add_argument("--float", action="store_true", help=single)
-    parser.add_condition("the condition of the file's certificate, if it is your own")
+    parser.add_condition("the condition of the file's certificate, needed only if it is your own")
     parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)", seed=False)
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
     parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")

@@ -3,8 +3,7 @@
 By default two sittings are recorded, with --port at different places of the handles. Nobody may hold them; if a hand
 damps a handle in one sitting, the other sitting reveals it. The excitation is played in a bridge session with limits of
 force and speed; the force cap is the excitation's largest force. With --transmission two sittings with clamped handles
-follow. They bound the mass of the motor and the transmission (hw/transmission.py), because the known-device conditions
-use these bounds.
+follow. They bound the mass of the motor and the transmission (hw/transmission.py), for the known-device conditions.
 """
 
 from __future__ import annotations
@@ -153,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)
     count = "sittings; each records every axis with the handles at another place, and two must agree (default 2)"
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
-    stay = "leave the handles where they are between sittings (an emulator has nobody to move them)"
+    stay = "leave the handles where they are between sittings (for an emulator, whose handles nobody moves)"
     add("--same-place", action="store_true", help=stay)
     known = "two more sittings with clamped handles bound motor mass and transmission, for known-device"
     add("--transmission", action="store_true", help=known)
@@ -183,7 +182,7 @@ def _sitting(
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r = scenario.lever  # the options state figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # A device that is lighter than declared is stopped.
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # This stops a device that is lighter than declared.
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
@@ -196,7 +195,7 @@ def _sitting(
 
     if args.port and number > 1:
         told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
-        told += "; then press a" if not args.arm else "" if args.same_place else ": it begins 5 s later"
+        told += "; then press a" if not args.arm else "" if args.same_place else ": the sitting begins 5 s later"
         if clamped is not None:
             told = "clamp every handle to the bench; then press a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission

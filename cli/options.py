@@ -163,7 +163,7 @@ class Parser(argparse.ArgumentParser):
             metavar="MASS,K_MAX,B_MIN,B_MAX",
             help=f"{known}; once for all devices, or once per device",
         )
-        late = "time from a tick until its force latches [s], below T: 0 to S, or LO:HI; per device or for all"
+        late = "time from tick to latch of a force [s], below T: LO:HI, or S for 0:S; one for all, or one per device"
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
@@ -172,9 +172,9 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
 
-    def add_condition(self, what: str = "the condition of the certificate", to: _Group | None = None) -> None:
+    def add_condition(self, what: str = "what to certify (default: the coupling's)", to: _Group | None = None) -> None:
         """Add --condition."""
-        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
+        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
@@ -463,7 +463,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device), each=each)
         for name, value in values.items()
     }
-    if args.environment is not None:  # E(T) of a user's own class is computed for the T of the same `replace`.
+    if args.environment is not None:  # `replace` computes E(T) of a user's own class for the new T.
         changes["environment"] = own_environment(args.environment)
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)
@@ -529,7 +529,7 @@ def name_of(file: str) -> str:
     return f"{path.stem}-{sha256(str(path.parent.resolve()).encode()).hexdigest()[:6]}"
 
 
-_LONGEST = 80  # most characters of a coupling or a condition in a file name; file systems allow 255 in all
+_LONGEST = 80  # most characters of couplings or a condition in a file name, without a digest; file systems allow 255
 
 
 def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:

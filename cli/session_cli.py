@@ -182,7 +182,7 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
 
 
 def _baud(args: argparse.Namespace) -> int | None:
-    """Return the speed of the UART in the line, or None without a UART.
+    """Return the baud rate of the UART in the link, or None without a UART.
 
     A pseudo-terminal has no UART. /dev/ttyACM0 may be native USB or a USB chip before a UART; a UART is assumed.
     """
@@ -240,7 +240,7 @@ def hold_session(
 ) -> _Held:
     """Run a session from opening the port to its end, or in virtual time with an emulated device.
 
-    `alone` is the scenario of an emulated device that nobody holds; `coulomb` [N] is its dry friction.
+    `alone` is the emulated device's scenario if it is not that of the options; `coulomb` [N] is its dry friction.
     """
     with ExitStack() as stack:
         incidents = IncidentLog(out / "incidents.jsonl")

@@ -165,7 +165,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """Search for the worst humans; with --environments ranges at the worst point. Ctrl-C ends the search."""
+    """Search for the worst humans, with --environments ranges at the ranges' worst point. Ctrl-C ends the search."""
     from haptic_loop.sim.adversary import search, search_population
 
     here = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name

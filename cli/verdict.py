@@ -183,8 +183,8 @@ def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
     yield "ranges, between", str(part["search"])
     inside = part["inside"]
     if inside["worst_ratio"] is not None:
-        most = f"at most {inside['worst_ratio']:.4f}" if math.isfinite(inside["worst_ratio"]) else _NEVER
-        drawn = f"{inside['certified']} of {inside['samples']} random samples certified, {most} of the damping"
+        most = f"at most {inside['worst_ratio']:.4f} of the damping" if math.isfinite(inside["worst_ratio"]) else _NEVER
+        drawn = f"{inside['certified']} of {inside['samples']} random samples certified, {most}"
         yield "ranges, inside", drawn
     if exact and not ranges.proved:
         yield "ranges", f"[red]not guaranteed[/]: {ranges.reason}"

@@ -160,7 +160,7 @@ def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(with_file=True))
     parser = options.Parser(
         "sim.view",
-        f"Feel the loop in a window, or film it.\n\nKeys: {keys}.",
+        f"Feel the loop in a window, or film it.\n\nKeys: {keys}; given is --coupling FILE.json.",
         *_EXAMPLES,
         first="scenario coupling condition reference video script",
     )
@@ -168,14 +168,14 @@ def _parser() -> options.Parser:
     parser.add_loop()
     what = f"the first coupling: {', '.join(_names())} or FILE.json; designed is spring-damper"
     add("--coupling", metavar="NAME|FILE", help=what)
-    parser.add_condition("the condition of designs")
+    parser.add_condition("the condition of designs (default: the coupling's)")
     parser.add_limiter()
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events with their times [s] (default of a video without world, --coupling or --case none: '{_SCRIPT}')",
+        help=f"events SECONDS:EVENT, as '{_SCRIPT}', the default of a video without world, --coupling and --case none",
     )
-    until = "length (default: in a world the scenario's; else a window until closed, a video until after its script)"
+    until = "length (default: until the window is closed, or 3 s after a video's script; in a world the scenario's)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
     parser.add_json()
     add = parser.add_argument_group("without a display").add_argument

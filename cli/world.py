@@ -233,7 +233,7 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         worst_excess_J=worst.excess_J,
         wall_s=time.perf_counter() - began,
     )
-    whom = f"of {len(hands)} sets of hands none" if holds else f"hands {worst.number} ({worst.kind})"
+    whom = f"none of {len(hands)} sets of hands" if holds else f"set {worst.number} ({worst.kind})"
     title = f"{report.guarantee} Measured: {whom} was given more than W0 and the released energy."
     _publish(args, report, title, _hands_rows(report, hands), out)
     return options.exit_code(holds)
@@ -256,7 +256,7 @@ def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[st
 
 
 def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Mapping[str, Any]) -> int:
-    """Design a coupling for a world and store it. Return 0 if it is certified for any environment, 1 if not.
+    """Design a coupling for a world and store it. Return 0 if runs with it have a guarantee, 1 if not.
 
     `further` are the options of the design by argument name.
     """

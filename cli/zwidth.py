@@ -29,7 +29,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
 _FINEST = 1e-5  # [m] least amplitude of an oscillation, the resolution of a desk device's encoders
-_PRESS = 3.0  # [N] steady force of a hand in maps of couplings; soft environments would yield to it
+_PRESS = 3.0  # [N] steady force of a hand; maps of environments have none, because soft ones would yield to it
 
 
 def main(argv: list[str]) -> int:
@@ -87,8 +87,8 @@ def _parser() -> options.Parser:
     fixed = "keep this coupling and vary K and B of the environment's contact springs"
     names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
-    parser.add_condition("the condition of the fixed coupling's design; your own is drawn in every map", to=of_map)
-    rows = "rows and columns (default 60; 24 with --coupling, and before walls)"
+    parser.add_condition("your own is drawn in every map; others need --coupling (default: the coupling's)", to=of_map)
+    rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T, or from the contact springs", "[N s/m]; default from delta"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
@@ -266,8 +266,8 @@ def _about(conditions: Sequence[str]) -> str:
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
-        f"{line}. For this-environment, the population and MuJoCo the coupling's model is the cell's environment, "
-        f"for {zwidth.MODEL_KEPT} that of the coupling's design."
+        f"{line}. The coupling's model is the cell's environment for this-environment, the population and MuJoCo; "
+        f"for {zwidth.MODEL_KEPT} it is the environment of the coupling's design."
     )
 
 
