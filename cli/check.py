@@ -127,7 +127,7 @@ def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) 
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
-    """Repeat the search between the vertices of the ranges if the file guarantees for ranges; else return None."""
+    """Repeat the search between the vertices of the ranges if the file's guarantee is for ranges; else return None."""
     if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
     loop, coupling = stored.loop, stored.built()

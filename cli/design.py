@@ -91,7 +91,7 @@ def _parser() -> options.Parser:
     parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order (Remark 5)")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    _add_optimal_options(parser, "optimal: the filter of the environment's forces with the least transparency error")
+    _add_optimal_options(parser, "optimal (--band: spring-damper, too): the force filter of least transparency error")
     parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>].json)")
     return parser
 

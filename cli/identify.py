@@ -143,7 +143,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--force", type=number(0.05, 6.0), default=1.0, metavar="NEWTON", help="amplitude of the chirp (default 1)")
     band = "frequencies of the chirp [Hz] (default 3,200)"
     add("--band", type=options.pair, default=(3.0, 200.0), metavar="LOW,HIGH", help=band)
-    add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of the chirp (default 2.5)")
+    add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of each chirp (default 2.5)")
     rub = "dry friction of an emulated device (default 0)"
     add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
     fast = "largest speed of a slow swing; the bound holds up to it (default 0.5)"

@@ -455,7 +455,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     speak(scenario.unit)
     if (args.reference or args.case == "II") and (args.lam or scenario.lam is not None):
         option = f"--reference {args.reference}" if args.reference else "--case II"
-        raise InputError(f"{option} with {'--lam' if args.lam else 'lam of the scenario'}: both are the reference")
+        raise InputError(f"{option} with {'--lam' if args.lam else 'lam of the scenario'}: both set the reference")
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     each = "channel" if scenario.channels == len(scenario.device) else "device"
     values = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
