@@ -103,7 +103,7 @@ def main(argv: list[str]) -> int:
         claim,
     )
     title = f"{block.name} as C99"
-    proof = "the proof in its file was repeated" if verdict.proved else f"not proved: {verdict.reason}"
+    proof = "the stored proof was repeated" if verdict.proved else f"not proved: {verdict.reason}"
     written = f"Wrote {path}: {block.name} as C99; {proof}."
     torques = held_torques(stored.loop)
     lines = [f"Held torques: {torques}."] if torques else []

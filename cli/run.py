@@ -240,7 +240,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield (
         "force error",
-        f"{apart}, before clipping (after it with a limiter or switching delays)"
+        f"{apart}, before clipping; with a limiter or switching delays, after it"
         if apart
         else f"- ({report.ideal_force.reason})",
     )
