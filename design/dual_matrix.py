@@ -1,7 +1,7 @@
-"""The matrix of a dual point, with a lower bound of its eigenvalues on the whole circle, not only at samples.
+"""The matrix D of the dual problem in design.bound, with a lower bound of its eigenvalues on the whole circle.
 
-D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 (see `bound`), scaled by root(delta) from both sides. H is
-piecewise linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and a = 1/z - 1 this gives
+D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 is scaled by root(delta) from both sides. H is piecewise
+linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and a = 1/z - 1 this gives
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
@@ -53,9 +53,9 @@ class DualMatrix:
 
     @classmethod
     def of(cls, points: Array, heights: Complex, scale: Array, sums: Array) -> DualMatrix:
-        """Return D for a piecewise linear H with these heights (n, m, m) at the points, zero at both ends.
+        """Return D for the piecewise linear H with these heights (n, m, m) at the points.
 
-        `scale` (m, m) is 4/T root(delta_i delta_j).
+        The first and the last height must be 0. `scale` (m, m) is 4/T root(delta_i delta_j).
         """
         width, ends = np.diff(points)[:, None, None], ((1, 1), (0, 0), (0, 0))
         slope = np.pad(scale / (2 * np.pi) * np.diff(heights, axis=0) / width, ends)
@@ -144,7 +144,7 @@ class DualMatrix:
         return (1 + 1e-9) * norm  # The sums have no negative terms, so their relative rounding is far below 1e-9.
 
     def _interpolation(self, left: Array, right: Array) -> Array:
-        """Return bounds on the errors of the entries of g, (k, m^2); left and right are (k, 1)."""
+        """Return bounds (k, m^2) on the interpolation errors of the entries of g; left and right are (k, 1)."""
         c, x, middle, length = self.bends.reshape(len(self.bends), -1), self.points, (left + right) / 2, right - left
         below = np.maximum(np.maximum(x - right, left - x), 0.0)
         above = np.maximum(np.minimum(x + left, 2 * np.pi - x - right), 0.0)

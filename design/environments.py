@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block` for multipliers of which those of `hands` are times s; it is affine in s and all values."""
+        """Return `block`, affine in s and `multiplier`, in which the values of `hands` are multiplied by s."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -229,7 +229,7 @@ class _Search:
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio over multipliers in their bounds, best one found), starting at `values`."""
+        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`)."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
@@ -273,7 +273,7 @@ class _Search:
     def _values(self, x: Array) -> tuple[float, ...]:
         """Return the multiplier for the unknowns x, of which the last is s.
 
-        The values are rounded to _DIGITS digits. Those of the hands' side are then divided by s and made `allowed`.
+        The values are rounded to _DIGITS digits. `allowed` scales those of the hands' side after their division by s.
         """
         values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
@@ -418,8 +418,8 @@ class ThisEnvironment(Multiplied):
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         """Return the reason why a static map is asymmetric or negative, or None.
 
-        With walls, channels and walls differ in units. So asymmetry is compared with the sizes of both its channels or
-        walls, and a negative eigenvalue with the largest size of all channels, or of all walls.
+        Channels and walls differ in units. So the asymmetry of an entry is compared with the sizes of its row and its
+        column, and a negative eigenvalue with the largest size of all channels, or of all walls.
         """
         if not loop.environment.walls:
             return super().unsound_static(G, loop, demand)
@@ -521,7 +521,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device: `held`, or to six digits that of beta and the available damping (s = 1)."""
+        """Return rho [N/m] per device: `held`, or the rho of beta and the available damping, rounded to six digits."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -597,9 +597,9 @@ _MOST_STATES = 30  # most states of E-hat for which a storage matrix is searched
 def least_multiplier(loop: Loop) -> Array:
     """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    Delta_D and delta are times T/T_max. Up to _MOST_STATES states the sum of Phi_i/delta_i is least among the Phi below
-    `most`. Raises Infeasible, with the damping that would be needed, if not even a Phi that need not be diagonal is
-    below Delta_D, and DesignFailed if no diagonal one is found.
+    Delta_D and delta are multiplied by T/T_max. Up to _MOST_STATES states the sum of Phi_i/delta_i is least among the
+    Phi below `most`. Raises Infeasible, with the damping that would be needed, if no Phi, diagonal or not, is below
+    Delta_D, and DesignFailed if no diagonal Phi is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
@@ -713,7 +713,7 @@ class _AnyEnvironment(Multiplied):
         return compose_any(V, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the Phi of `least_phi`, None) or, if none is needed or found, (None, the reason if not covered)."""
+        """Return (the Phi of `least_phi`, None), (None, None) if no Phi is needed, or (None, reason for no Phi)."""
         if (reason := self.beyond(loop)) or not any(loop.psi):
             return None, reason
         try:

@@ -76,11 +76,11 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and for each of their bits
+_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and more for each of their bits
 
 
-#: largest number of products of integers that Python multiplies; FLINT is no faster for them (21 states), and its
-#: import takes 0.05 s
+#: largest number of integer products that are computed without FLINT, which is no faster for them (21 states) and takes
+#: 0.05 s to import
 _FEW = 20_000
 
 
@@ -301,11 +301,11 @@ def _whitening(W: Array) -> _Integers | None:
 _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; our own files have a few hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
-_LEAST_MOVED = 1e-10  # least variance of a normalised direction of states, relative to the largest
+_LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative to the largest, are raised to this
 _LEFT = 0.02  # residual of the Riccati equation, relative to its drive, below which Newton's steps end
 _UNIT = 2.0**-53  # unit roundoff of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
-_MOST_UNITS = 2.0**50
+_MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of the KYP matrix is below this many u.
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
 
@@ -454,9 +454,10 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (a change of coordinates, P in the new coordinates), without a change unless `white`.
+    """Return (a change of coordinates, P in the new coordinates).
 
-    With `white`, white noise at the inputs makes the new states independent. Raises LinAlgError.
+    With `white`, white noise at the inputs makes the new states independent; without it the change is the identity.
+    Raises LinAlgError.
     """
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
@@ -523,8 +524,9 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    Newton's steps, RICCATI_STEPS at most, reduce the residual that rounding has left below _LEFT times the drive. They
-    need extended precision, because lightly damped modes have a small margin. Raises LinAlgError without a solution.
+    At most RICCATI_STEPS of Newton's steps reduce the residual, left by rounding, to less than _LEFT times the drive.
+    They need extended precision, because lightly damped modes have a small margin. Raises LinAlgError without a
+    solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)
@@ -580,7 +582,7 @@ def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
 
 
 def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> Matrix:
-    """Return integers over 2^power, with rows and columns divided by 2^half each."""
+    """Return numbers/2^power, with row i and column i divided by 2^half[i] for all i."""
     most = int(max(half))
     for i, row in enumerate(numbers):
         for j in range(len(row)):

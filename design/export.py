@@ -47,7 +47,7 @@ _TICKS = 64  # length of a test vector, longer than the fast modes and the usual
 _MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, if rounding allows it
-_BALL_ROUNDING = 16  # allowed rounding of a block's residual, in units in the last place of its largest row of terms
+_BALL_ROUNDING = 16  # allowed rounding of a block's residual, in epsilons times the largest row sum of absolute terms
 _MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
@@ -96,7 +96,7 @@ def coupling_block(stored: Stored) -> ExportedBlock:
     """Return V(z), which maps forces to displacements. Raises ValueError for a coupling that has no V around Psi E."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
-        reason = "this coupling is no V in feedback around the environment; --process exports the process with it"
+        reason = "this coupling is not a V in feedback around the environment; export its process with --process"
         raise ValueError(reason)
     about = ("d = V f: the deflection of the coupling. In its loop the environment sees u = x - d, and f = Psi E u.",)
     return ExportedBlock("coupling", _with_a_state(V), _FORCE, _DEFLECTION, about)
@@ -140,7 +140,7 @@ def _limited_block(
 ) -> ExportedBlock:
     rho = lag(stored.loop, stored.certificate)
     if rho is None:
-        raise ValueError("its certificate covers no limited forces: design it anew, or leave out --force-limit")
+        raise ValueError("the certificate covers no limited forces: design the coupling anew, or omit --force-limit")
     limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho, balls=balls)
     limited = "Lengths of a device's force vector" if balls else "Forces"
     about = (
@@ -341,7 +341,7 @@ def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
 
 
 def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Solve f = q - M e for (e, f) line by line as the C function of _BALLS_DEFINED, in the precision of q."""
+    """Solve f = q - M e for (e, f) line by line like the C function in _BALLS_DEFINED, in the precision of q."""
     at, first, last, ends, M, resolvent, tau, limit = problem
     m, real = len(q), type(q[0])
     zero, one, two = real(0), real(1), real(2)
@@ -424,7 +424,7 @@ def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
 
 
 def _ball_rounding(single: bool) -> float:
-    """Return the allowed rounding error of a block's residual, relative to the largest sum of a row's terms' sizes."""
+    """Return the allowed rounding error of a block's residual, relative to the largest row sum of absolute terms."""
     return _BALL_ROUNDING * float(np.finfo(np.float32 if single else np.float64).eps)
 
 

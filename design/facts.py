@@ -59,7 +59,7 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return delta T/T_max (m,) [N s/m]: at a constant period T it counts like delta in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m], which counts at a constant period T like delta in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T_k: the force map is the same at every tick.
@@ -262,7 +262,7 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return the block from inputs to [dx; dp; added force steps; delayed inputs], and the numbers of the last."""
+        """Return (block from inputs to [dx; dp; added force steps; delayed inputs], numbers of the delayed inputs)."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -270,7 +270,7 @@ class Collected(Generic[Block]):
         return _of_weights(entries, second + len(late), self.size, self.T), late
 
     def build(self, G: Block | None) -> tuple[Array, Block, Any]:
-        """Return (residue at z = 1 (n, n), block without its pole and the damping, matrix of the damping).
+        """Return (residue at z = 1 (n, n), block without this pole and without the damping, damping matrix).
 
         For a Sampled G the residue is 0 and the block keeps its pole; its Hermitian part on the circle is the same. G
         maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
@@ -364,7 +364,7 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 class Unknowns:
     """The numbers of one multiplier.
 
-    A search keeps each number, for the hands' side s times it, between `least` and `most` times its unit.
+    A search keeps each number between `least` and `most` times its unit; for the hands' side, s times each number.
     """
 
     name: str  # name of the multiplier in files
@@ -533,7 +533,7 @@ def _ranges(loop: Loop) -> list[tuple[float, float]]:
 
 
 def _separate(loop: Loop, d: int) -> tuple[float, float]:
-    """Return the diagonal Q, 1/t2 and 1/(T_max - t1) [1/s] rounded down; (0, 0) for a constant latency."""
+    """Return q11 = 1/t2 and q22 = 1/(T_max - t1) [1/s] of a diagonal Q, rounded down; 0 for a constant latency."""
     if d not in _varies(loop):
         return 0.0, 0.0
     (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
@@ -568,10 +568,11 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
 
 
 class PeriodCost(NamedTuple):
-    """Least energy L of a period of a known device, with c0, c2 and q of design.known_device; (m,) each.
+    """A lower bound L of the energy of a period of a known device; (m,) each.
 
     L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the ends of the
-    period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m.
+    period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m. The formulas
+    are those of a constant period T, with c0, c2 and q of design.known_device.
     """
 
     move: Any  # c0/(T - q)
@@ -630,7 +631,7 @@ class Fact(ABC):
 
 
 class Walls(Fact):
-    """Walls that make and break contact, with the multipliers a, c, d, m of each wall's law.
+    """Walls that make and break contact, with the multipliers a, a + c, d, m of each wall's law.
 
     Every wall has the input u, the step of the depth h. A wall with a damper has one more input s >= 0, which is
     positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
@@ -750,7 +751,7 @@ class Limited(Fact):
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
     """Extend the damping's form to matrices Delta.
 
-    The entry q delta_i of inputs a and b of axis i gives the entry q Delta_ij of a of axis i and b of axis j.
+    If the entry for the inputs a and b of axis i is q delta_i, that for a of axis i and b of axis j is q Delta_ij.
     """
     if loop.levels is None:
         return form
@@ -810,7 +811,7 @@ def compose(
 
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
-    """Add the form of the hands' side. If `scaled`, its multipliers contain s, so their terms become constant terms."""
+    """Add the hands' side's form. If `scaled`, `values` holds s times its multipliers, so their terms are constant."""
 
     def form(values: Values) -> Any:
         return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)

@@ -61,7 +61,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 
 
 _PEAKS = 3  # highest local maxima of a row that are refined
-_POINTS, _ROUNDS = 17, 8  # A round narrows a bracket by (_POINTS - 1)/2, so eight locate a smooth peak to rounding.
+_POINTS, _ROUNDS = 17, 8  # A round divides a bracket by (_POINTS - 1)/2; eight rounds find a smooth peak to rounding.
 
 _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
 
@@ -115,7 +115,7 @@ _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomsp
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
     """Return the frequencies (k,) common to n systems, and those (n, j) around the poles (n, p) of each system.
 
-    `delay` [samples] is the longest delay of the loop; it causes as many lobes in the response.
+    `delay` [samples] is the longest delay of the loop; a delay of n samples causes n lobes in the response.
     """
     even = np.linspace(_LOWEST, np.pi, max(_EVEN, _PER_LOBE * (delay + 1)))
     common = np.unique(np.concatenate([_BELOW, even, np.geomspace(_LOWEST, np.pi, _EVEN)]))
@@ -187,8 +187,8 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     the same states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
     |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
 
-    The difference of both responses would be less useful: it is large as soon as a sharp peak moves by its own width,
-    and even a Schur form of badly scaled states moves the peak so far.
+    The difference between the responses of G and `meant` would be less useful: it is large as soon as a sharp peak
+    moves by its own width, and even a Schur form of badly scaled states moves the peak so far.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (

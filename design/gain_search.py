@@ -33,7 +33,7 @@ from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, rms_mismatch
 
-#: share of the damping that the sampled condition leaves for frequencies between samples, 1.5 times that of designs
+#: share of the damping that the condition at sampled frequencies leaves unused, for violations between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
@@ -188,10 +188,10 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`, in delta/T.
+        """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`.
 
-        With delay in the environment `stability` follows as a last entry, because the loop can then be unstable
-        although the sampled condition holds.
+        With delay in the environment `stability` is appended, because the loop can then be unstable although the
+        sampled condition holds.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
@@ -240,8 +240,8 @@ class SampledLoop:
     def _least(self, x: Array) -> tuple[Array, Complex]:
         """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
 
-        The Schur complement is that of the lower right part, which is diagonal and positive. v is the eigenvector,
-        continued by the entries of the lower rows with which the block's form takes the least value.
+        The eigenvalue is in units of delta/T. The Schur complement is that of the lower right part, which is diagonal
+        and positive. v is the eigenvector, followed by the entries of the lower rows that minimise the block's form.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -274,8 +274,8 @@ def _slsqp(
 ) -> Array:
     """Return x (n,) after at most `most` steps of SLSQP: least objective where constraint(x) (m,) >= 0.
 
-    In SciPy 1.17 this is the loop of `minimize` over the compiled routine, whose state and workspace are private to a
-    release. The import of its Python code would take 0.2 s. Other releases get the public function.
+    With SciPy 1.17 the compiled routine is called in a loop like that of `minimize`, because the import of
+    scipy.optimize takes 0.2 s. Its state and workspace differ between releases, so others use `minimize` itself.
     """
     import scipy  # slow to load
 
@@ -480,8 +480,8 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop, and each search from a start has a copy. For more than FEW channels the first optimum is
-    returned, because steps are expensive and the start hardly matters; sort the starts with `likeliest_first` before.
+    `sampled` makes the loop, and the search from each start uses a copy. For more than FEW channels the first optimum
+    is returned, because steps are expensive and the start hardly matters; `likeliest_first` sorts the starts.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None

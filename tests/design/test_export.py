@@ -202,7 +202,7 @@ def test_a_vector_without_solution_is_zero(space, monkeypatch):
 
 def test_force_limits_that_no_certificate_covers_are_refused(place, limited_files):
     folder = limited_files[0]
-    with pytest.raises(InputError, match="its certificate covers no limited forces"):
+    with pytest.raises(InputError, match="the certificate covers no limited forces"):
         main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
     with pytest.raises(InputError, match="--force-limit is only with --process"):
         main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
