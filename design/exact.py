@@ -200,7 +200,7 @@ def _halves(S: Matrix) -> list[int]:
 
 
 def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
-    """Return a symmetric S with scaled rows and columns, in units of 2^-bits."""
+    """Return S with row and column i divided by 2^half[i], rounded to integers in units of 2^-bits."""
     n = S.shape[0]
     rounded = np.empty((n, n), dtype=object)
     for i, row in enumerate(S.num.tolist()):

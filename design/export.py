@@ -46,7 +46,7 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 _TICKS = 64  # length of a test vector, longer than the fast modes and the usual delays of a loop
 _MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
-_RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, if rounding allows it
+_RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, unless rounding is larger
 _BALL_ROUNDING = 16  # allowed rounding of a block's residual, in epsilons times the largest row sum of absolute terms
 _MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared

@@ -67,7 +67,7 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 
 
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
-    """Return the suprema (n,) of n functions on the grid of `common` (k,) and each one's `own` (n, p) frequencies.
+    """Return the suprema (n,) of n functions; the grid is `common` (k,) and each function's `own` (n, p) frequencies.
 
     The highest peaks are refined between the frequencies. A function with a value that is not finite gives inf.
     """
@@ -142,9 +142,7 @@ def too_long(G: Lti, sweeps: int = 1) -> str | None:
         return None
     states = f"{G.inner_order} states and {G.inputs} channels"
     fewer = "a smaller psi, or fewer channels or masses"
-    return (
-        f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g}: what helps is {fewer}"
-    )
+    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g}: use {fewer}"
 
 
 def sweeping() -> AbstractContextManager[None]:

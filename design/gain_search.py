@@ -389,8 +389,8 @@ class LimiterLoop(SampledLoop):
 class KnownDeviceLoop(SampledLoop):
     """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each device).
 
-    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch) and the values
-    l11, l21 and l22 of `device_rows`. It is the Schur complement of the speeds' rows in the block of known-device.
+    The condition is He[F/(z-1)] + l11 - M* M/(4 l22) > 0 with M = -beta F/z + l21 (not the mismatch), where
+    `device_rows` returns l11, l21, l22. The left side is the Schur complement of the speeds' rows in known-device.
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
