@@ -1,4 +1,4 @@
-"""Energy budgets: what no passive hand can be given, whatever computes the force; and when they never act."""
+"""Energy budgets bound what a passive hand receives, whatever computes the force, and never act in certified loops."""
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ DELTA = np.array([1.37, 0.9])
 
 
 def springs(hands, rng):
-    """A stiff wall with negative damping, turned askew so that it delivers energy on every closed path."""
+    """Return the forces of an unsymmetric stiffness with negative damping, which deliver energy."""
     K = np.array([[6000.0, 2500.0], [-2500.0, 3000.0]])
     old = hands.x
 
@@ -35,7 +35,7 @@ def springs(hands, rng):
 
 
 def network(hands, rng):
-    """A random recurrent network of saturating units."""
+    """Return the forces of a random recurrent network of saturating units."""
     A, B, C = rng.normal(size=(30, 30)) / 4, rng.normal(size=(30, 4)) * [300, 300, 5, 5], rng.normal(size=(2, 30)) * 4
     h = rng.normal(size=(30, 1)) * np.ones((1, hands.s.shape[0]))
 
@@ -48,18 +48,18 @@ def network(hands, rng):
 
 
 def thief(hands, rng):
-    """Knows the velocity, and always pushes along it with all that there is."""
+    """Return forces of 12 N that always push along the velocity."""
     return lambda: -12.0 * np.sign(hands.v + 1e-12)
 
 
 class Line:
-    """Varying delays and losses: the newest packet that arrived, dropped once it is older than hi + hold."""
+    """A link with varying delays and losses. It applies the newest packet, or 0 if this is older than hi + hold."""
 
     def __init__(self, rng, lo, hi, hold, loss, nsim):
         self.rng, self.lo, self.hi, self.hold, self.loss = rng, np.array(lo), np.array(hi), hold, loss
         self.ticks = 0
-        self.newest, self.force = np.full((2, nsim), -1), np.zeros((2, nsim))  # packet that arrived last
-        self.packets = []  # those that may yet arrive, the oldest first
+        self.newest, self.force = np.full((2, nsim), -1), np.zeros((2, nsim))  # newest arrived packet
+        self.packets = []  # (tick, force, arrival) of recent packets
 
     def carry(self, f):
         k, self.ticks = self.ticks, self.ticks + 1
@@ -92,12 +92,12 @@ def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
         most = max(most, received.max())
     assert budget.limited.min() > 0
     if controller is thief and lossless and start < 0.1:
-        assert most > 0.5 * W0  # the bound is no formality
+        assert most > 0.5 * W0  # some hand receives more than half of the bound
 
 
 @pytest.mark.validate
 def test_the_budget_holds_on_stiffer_springs():
-    """The optimal coupling of the default scenario on springs 2.5 times stiffer, compliant devices, lossless hands."""
+    """The default scenario's optimal coupling meets springs 2.5 times stiffer, compliant devices and lossless hands."""
     scenario, nsim = load(), 30
     coupling = design_coupling(scenario.loop("I"), "optimal", "this-environment").coupling
     springs = tuple(msgspec.structs.replace(s, stiffness=2.5 * s.stiffness) for s in FIGURE_4.springs)
@@ -126,7 +126,7 @@ def test_the_budget_holds_on_stiffer_springs():
         late[limited] = np.abs(s[:, s.shape[1] // 2 :]).max(axis=1)
     assert np.median(late[False]) > 2
     assert late[True].max() < 0.5
-    mass = links[..., 0].sum(axis=(1, 2)) + 0.5  # of hands and devices, all at 0.1 m/s
+    mass = links[..., 0].sum(axis=(1, 2)) + 0.5  # [kg] of hands and devices, which start at 0.1 m/s
     assert (dissipated <= mass * 0.1**2 / 2 * T / 0.05).all()
 
 
@@ -163,7 +163,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
 
 @pytest.mark.parametrize("told", [pytest.param("constant", marks=pytest.mark.slow), "late"])
 def test_coarse_encoders_keep_the_guarantee(told):
-    """Steps of 0.5 mm, and a controller that steals through them: not to know the steps costs more than the budget."""
+    """If the budget ignores steps of 0.5 mm and the delays are constant, a hand receives more than twice W0."""
     W0, q, most = 0.05, 5e-4, {}
     for known in (q, 0.0):
         rng = np.random.default_rng(17)
@@ -189,7 +189,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
 
 
 def test_reserve_and_scale_match_brute_force():
-    """Against the definition, from all packets ever sent: sum over ticks of the worst packet of an allowed age."""
+    """By definition the reserve sums over the next ticks the largest loss of a packet of an allowed age."""
     rng = np.random.default_rng(9)
     cases = (((0, 0), (0, 0), 0, 0), ((1, 2), (1, 2), 0, 0), ((0, 1), (4, 2), 0, 0), ((1, 0), (2, 3), 2, 1e-5))
     for lo, hi, hold, step in cases:
@@ -223,7 +223,7 @@ def test_reserve_and_scale_match_brute_force():
 
 
 def motions(rng, ticks, nsim):
-    """Motions from rest of every kind: walks, waves of all frequencies, jumps; (ticks, 2, nsim) [m]."""
+    """Return motions (ticks, 2, nsim) [m] from rest: random walks, waves of many frequencies, and jumps."""
     t = np.arange(ticks)[:, None, None]
     walk = rng.normal(size=(ticks, 2, nsim)).cumsum(axis=0) * 1e-3
     walk = np.where(rng.random((1, 1, nsim)) < 0.5, walk, rng.normal(size=walk.shape) * 0.01)
@@ -234,7 +234,7 @@ def motions(rng, ticks, nsim):
 
 
 def acted_on(F, x, theta, delta, **options):
-    """(nsim,) ticks in which the budget acts on the forces of F, which are not yet delayed, for given motions."""
+    """Return the numbers (nsim,) of ticks in which the budget limits the undelayed forces of F for motions x."""
     budget, z = EnergyBudget(delta, F.T, Packets(theta), nsim=x.shape[2], **options), np.zeros((F.order, x.shape[2]))
     for k, now in enumerate(x):
         budget.limit(F.C @ z + F.D @ now, now - x[k - 1])
@@ -252,7 +252,7 @@ def test_any_environment_loops_are_never_limited():
     )
     for net in (FIGURE_4, stiff):
         E = environment(net, T)
-        options = {"start": 1e-12}  # of rounding
+        options = {"start": 1e-12}  # [J] covers rounding
         assert acted_on(coupling.around(E), x, (1, 2), scenario.delta, **options).max() == 0
     beyond = SpringDamper(1.5 * coupling.K, 1.5 * coupling.B)
     assert acted_on(beyond.around(environment(stiff, T)), x, (1, 2), scenario.delta, **options).max() > 0
@@ -271,7 +271,7 @@ def test_delayed_springs_within_bounds_are_never_limited(theta):
 
 
 def test_a_cap_below_stored_energy_limits_most_ticks():
-    """1000 N/m over 2 cm store 0.2 J."""
+    """A spring of 1000 N/m stores 0.2 J at 2 cm."""
     x = 0.02 * np.sin(2 * np.pi * 1.0 * T * np.arange(2500))[:, None, None]
     spring = Lti.constant([[1000.0]], T)
     share = {cap: acted_on(spring, x, (0,), [1.37], cap=cap)[0] / len(x) for cap in (0.05, 0.25)}
@@ -329,13 +329,13 @@ def test_budgets_that_cannot_be(changed, message):
 
 
 def active_environment():
-    """The default network with -4 N s/m between its mass and ground."""
+    """Return E(z) of the default network with -4 N s/m between its mass and ground."""
     M, D, K = FIGURE_4.matrices()
     return Networks(FIGURE_4.contacts, (M, D - 4.0 * np.diag([0, 0, 1.0]), K)).E(T)
 
 
 def test_the_shell_makes_an_active_mass_passive():
-    """What the port of the environment gives never exceeds W0, with any motion; and the scale is the largest."""
+    """The energy from the environment's port never exceeds W0, and no larger scale of the force is possible."""
     rng, W0, nsim = np.random.default_rng(13), 0.01, 40
     E = active_environment()
     V = SpringDamper([879.0, 552.0], [0.39, 0.52]).compliance(T)
@@ -359,14 +359,14 @@ def test_the_shell_makes_an_active_mass_passive():
 
 
 def certified(delta, theta=(1, 2)):
-    """A spring-damper for any environment."""
+    """Return the spring-damper that is designed for any environment."""
     loop = load().replace(delta=tuple(delta), theta=theta).loop("I")
     return design_coupling(loop, "spring-damper", "any-environment").coupling
 
 
 @pytest.mark.slow
 def test_hands_behind_the_shell_get_its_budget():
-    """The certificate for any environment, with a mass of negative damping, and with one that talks nonsense."""
+    """Behind a coupling for any environment, hands receive at most W0 from an active mass or from random forces."""
     E = active_environment()
     V = certified(DELTA).compliance(T)
     solve, most = np.linalg.inv(np.eye(2) + E.D @ V.D), {}

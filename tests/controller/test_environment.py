@@ -1,4 +1,4 @@
-"""Backward-Euler networks against closed forms, and the laws every passive network keeps."""
+"""Backward-Euler networks equal closed forms and obey the laws of every passive network."""
 
 from fractions import Fraction
 
@@ -59,7 +59,7 @@ OBLIQUE = (0.6, 0.8)
 
 @pytest.mark.parametrize("period", [T, Fraction(12, 10000)])
 def test_one_diagonal_spring_leaves_its_perpendicular_free(period):
-    """A damper in series with m s^2 + k along the spring, and with m s^2 across it."""
+    """The damper is in series with m s^2 + k along the spring, and with m s^2 across it."""
     springs = (Spring(("hand", "body"), 0.0, 5.0), Spring(("body", GROUND), 2000.0, along=OBLIQUE))
     E = environment(Network(PLANE["hand"], springs, {"body": 0.1}, points=PLANE), period).floats()
     damper, along, across = 5 * S, 0.1 * S**2 + 2000, 0.1 * S**2
@@ -70,7 +70,7 @@ def test_one_diagonal_spring_leaves_its_perpendicular_free(period):
 
 
 def test_oblique_wall_touches_free_body():
-    """The displacement across the wall is that of m s^2 + B s along the normal, under the wall's force."""
+    """Along its normal n the wall obeys (m s^2 + B s) y = B s n'x - p, with the wall's force p."""
     wall = Wall(("body", GROUND), 1000.0, normal=OBLIQUE)
     network = Network(PLANE["hand"], (Spring(("hand", "body"), 0.0, 5.0),), {"body": 0.1}, (wall,), points=PLANE)
     y = walled_environment(network, T).at(Z)[:, 2, :]
@@ -102,7 +102,7 @@ def test_oblique_networks_are_their_dynamic_stiffness(seed):
 
 
 def test_directions_equal_up_to_rounding_are_refused():
-    """Three directions of a plane, which span space only by the rounding of their lengths."""
+    """Three directions in one plane span space only by the rounding of their lengths."""
     points = {"hand": ("h.x", "h.y", "h.z"), "body": ("b.x", "b.y", "b.z")}
     springs = [Spring(("body", GROUND), 2000.0, along=d) for d in ((1.0, 2.0, 3.0), (2.0, 1.0, 1.0), (3.0, 3.0, 4.0))]
     springs.append(Spring(("hand", "body"), 0.0, 5.0))
@@ -125,7 +125,7 @@ def random_network(rng) -> Network:
 
 
 def test_many_networks_are_each_as_alone():
-    """As a stack of systems, and sampled from the dynamic stiffness; one of them has less to remember."""
+    """Stacked and sampled networks equal single ones, although one of the two has fewer states alone."""
     other = (Spring(("contact 1", "mass"), 90.0, 0.0), Spring(("mass", "contact 2"), 5e3, 7.0))
     networks = [FIGURE_4, Network(FIGURE_4.contacts, other, FIGURE_4.masses)]
     matrices = tuple(np.stack(parts) for parts in zip(*(network.matrices() for network in networks), strict=True))

@@ -1,4 +1,4 @@
-"""The limiter's tick: the box problem, one channel by hand, walls beside limits, and what it gives back."""
+"""The limiter solves a box problem in each tick, with delays and walls, and is passive without lag (rho = 0)."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def unlimited(network: Network, theta) -> Process:
 
 
 def passive(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Positive definite but not symmetric: all principal minors are positive."""
+    """Return a positive definite, unsymmetric matrix: all its principal minors are positive."""
     root, turn = rng.normal(size=(2, n, n))
     return np.diag(rng.uniform(0.01, 1, n)) + root @ root.T + turn - turn.T
 
 
 def check(problem: BoxProblem, q: np.ndarray) -> None:
-    """The definition, to 1e-11 of what is subtracted."""
+    """Check the solution by its definition, with a residual of at most 1e-11 of its terms."""
     v, f = problem.solve(q)
     low, high = problem.lower[:, None], problem.upper[:, None]
     scale = 1e-11 * (np.abs(q) + np.abs(problem.M) @ np.abs(v))
@@ -48,7 +48,7 @@ def test_the_forces_solve_the_box_problem(n):
     for _ in range(10):
         upper = rng.uniform(0.5, 3, n)
         check(BoxProblem(passive(n, rng), -upper, upper), rng.normal(size=(n, 60)) * 4)
-    lower = np.where(np.arange(n) % 2, -np.inf, -1.0)  # one-sided ones among them, as of walls
+    lower = np.where(np.arange(n) % 2, -np.inf, -1.0)  # some limits are one-sided, as for walls
     check(BoxProblem(passive(n, rng), lower, np.ones(n)), rng.normal(size=(n, 60)) * 4)
 
 
@@ -62,7 +62,7 @@ def test_pivoting_finds_what_the_list_finds(n):
 
 
 def test_a_force_that_moves_another_one_way_only():
-    """One entry beside the diagonal: what the second slips takes from the first."""
+    """The slip of the second force changes the first force, but not conversely."""
     v, f = BoxProblem(np.array([[1.0, 0.5], [0.0, 1.0]]), -np.ones(2), np.ones(2)).solve(np.array([[0.5], [2.0]]))
     np.testing.assert_allclose([v[:, 0], f[:, 0]], [[0.0, 1.0], [0.0, 1.0]], atol=1e-12)
 
@@ -79,12 +79,12 @@ def test_two_channels_by_hand():
 
 
 def test_four_contacts_that_nothing_holds():
-    """A chain of springs without ground: its stiffness matrix is singular, the forces are unique all the same."""
+    """The stiffness matrix of a chain of springs without ground is singular, but the forces are unique."""
     K = 1000.0 * np.array([[1, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1.0]])
     problem = BoxProblem(K, -np.ones(4), np.array([1.0, 2.0, 3.0, 1.0]))
     q = K @ np.random.default_rng(0).normal(size=(4, 200)) * 1e-2
     e, f = problem.solve(q)
-    assert np.abs(f.sum(axis=0)).max() < 1e-6  # action and reaction; pivoting grounds by 1e-10
+    assert np.abs(f.sum(axis=0)).max() < 1e-6  # the forces balance, but pivoting regularises M by 1e-10
     np.testing.assert_allclose(q - K @ e, f, atol=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_a_spring_by_hand():
 
 
 def test_with_lag_a_limited_spring_can_give_energy():
-    """Without delay and under any-environment the lag must be 0: this cycle gives 0.0051 J for ever with rho = 0.05."""
+    """With rho = 0.05 this cycle gives 0.0051 J per turn beyond the damping's dx^2/2; with rho = 0 it gives none."""
     x = np.tile([-1.048, -0.998, 1.028, 1.049, 1.069, 0.996], 20)
     taken = []
     for rho in (0.05, 0.0):
@@ -139,7 +139,7 @@ def test_out_of_reach_nothing_changes(network):
 @pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
 @pytest.mark.parametrize("theta", [(0, 0), (1, 2)])
 def test_the_limited_loop_obeys_its_definition(network, theta):
-    """f_e within the box and e in its normal cone; the linear loop driven by x - e sends f_e + rho (e - e_-)."""
+    """f_e is in the box and e in its normal cone; the linear loop, driven by x - e, sends f_e + rho (e - e_-)."""
     x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
     limiter = loop_of(network, theta, (0, 0)).law(STIFF, limit, rho)
     buffer = drive(closed(limiter), x)
@@ -148,7 +148,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
     f_e = np.stack([buffer.f[theta[i] : 600 - n + theta[i], i] for i in range(2)], axis=1)
     e = e[: 600 - n]
     assert (np.abs(f_e) <= limit[:, None]).all()
-    np.testing.assert_array_equal(f_e * e, limit[:, None] * np.abs(e))  # exactly at the limit where it slips
+    np.testing.assert_array_equal(f_e * e, limit[:, None] * np.abs(e))  # a slipping force equals its limit
     assert 0.1 < (e != 0).mean() < 0.9
     linear = unlimited(network, (0, 0))
     slips = np.diff(np.concatenate([np.zeros((1, 2, 4)), e]), axis=0)
@@ -167,17 +167,17 @@ def test_many_simulations_are_as_many_runs_of_one():
 @pytest.mark.parametrize("weakest", [np.inf, 2.0], ids=["limiter", "actuators"])
 @pytest.mark.parametrize("channels", [1, 2, 4])
 def test_a_tick_alone_is_one_of_many(channels, weakest):
-    """Each channel meets both of its limits."""
+    """In the second simulation each channel reaches both of its limits."""
     names, limit = tuple("abcd"[:channels]), np.linspace(2.6, 2.9, channels)
     network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
     coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
     theta = tuple(i % 2 for i in range(channels))
     limiter = loop_of(network, theta, (0,) * channels).law(coupling, limit, (5.0,) * channels)
-    actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first one's may be weaker than its limiter
+    actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first may be weaker than its limiter
     process = Process(limiter, actuators, np.zeros(channels))
     phases = np.arange(400)[:, None] / 15 + np.arange(channels)
     slow = 5e-3 * np.sin(phases)
-    x = np.stack([1e-3 * slow, slow], axis=-1)  # the first is never limited: who looks at it alone misses the second
+    x = np.stack([1e-3 * slow, slow], axis=-1)  # only the second simulation is limited
     together, alone = StepBuffer(process, 400, channels, nsim=2), StepBuffer(process, 400, channels)
     for buffer, moved in ((together, x), (alone, x[:, :, 1:])):
         for k, row in enumerate(moved):
@@ -193,7 +193,7 @@ def test_a_tick_alone_is_one_of_many(channels, weakest):
 @pytest.mark.parametrize("walls", [0, 1, 2])
 @pytest.mark.parametrize("limited", [False, True])
 def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
-    """Walls and springs that differ from law to law, states that press into them and forces beyond their limits."""
+    """Walls and springs differ between the laws, states press into the walls, and forces exceed their limits."""
     laws = []
     for k in range(6):
         some = tuple(Wall(w.between, w.stiffness * (1 + k), 2.0 + k, w.gap / (1 + k)) for w in WALLED.walls[:walls])
@@ -203,7 +203,7 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
     order, made = laws[0].open.order, laws[0].together(laws)
     for before in 3e-3 * np.random.default_rng(0).normal(size=(40, order + 2, 6)):
         if walls:
-            before[order - walls : order] = np.abs(before[order - walls : order])  # how deep they were pressed
+            before[order - walls : order] = np.abs(before[order - walls : order])  # depths
         together, alone = np.empty((order + 2, 6)), np.empty((order + 2, 1))
         made(before, together)
         for k, law in enumerate(laws):
@@ -212,7 +212,7 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
 
 
 def test_a_slip_bends_the_tick_that_computes_the_force():
-    """Growth is measured on linear ticks: a slip ends them, not the force, which acts theta ticks later."""
+    """The tick of a slip is not linear; the limited force acts theta ticks later."""
     limiter = loop_of(FIGURE_4, (2, 3), (0, 0)).law(STIFF, (3.0, 1.5), (5.0, 2.0))
     buffer = drive(closed(limiter), wander(60, 2, 11))
     slipped = limiter.limited(buffer.z, buffer.f[:60], LIMITS)
@@ -227,7 +227,7 @@ def test_a_slip_bends_the_tick_that_computes_the_force():
 
 @pytest.mark.parametrize("i", [0, 1])
 def test_a_wall_and_every_limit_at_once(i):
-    """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
+    """If all forces exceed their limits in one tick while a wall pushes, each is sent at its limit."""
     network = Network(WALLED.contacts, WALLED.springs, WALLED.masses, WALLED.walls[i : i + 1])
     limiter = loop_of(network, (0, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0))
     signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])
@@ -250,7 +250,7 @@ def test_the_first_limited_tick_is_found(channel, sign):
     sent, other = (buffer.after[:, limiter.sent_rows[i], 0] for i in (channel, 1 - channel))
     assert buffer.linear_until(10) == 10
     sent[4] = sign * LIMITS[channel]
-    assert buffer.linear_until(10) == 10, "at the limit nothing bends yet"
+    assert buffer.linear_until(10) == 10, "a force at its limit is still linear"
     assert buffer.linear_until(10, 0.5) == 4
     sent[6] = sign * LIMITS[channel] * (1 + 1e-9)
     assert (buffer.linear_until(10), buffer.linear_until(6)) == (6, 6)
@@ -261,7 +261,7 @@ def test_the_first_limited_tick_is_found(channel, sign):
 
 
 def test_limiter_and_environment_are_passive_without_lag():
-    """sum f_e (u_k - u_{k-1}) with u = x - V f_e, walls and limits included, never falls below its start."""
+    """The sum of f_e (x_k - x_{k-1}) is never negative, with walls, limits and V = 0."""
     x = wander(2000, 2, 10)
     f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:2000]
     energy = np.cumsum((f * np.diff(x, axis=0, prepend=0.0)).sum(axis=1), axis=0)
@@ -270,7 +270,7 @@ def test_limiter_and_environment_are_passive_without_lag():
 
 
 def test_clipped_cycles_give_energy_limited_ones_none():
-    """Two hands around a circle of 4 cm: clipping each force by itself gives 0.616 J a turn whatever the speed."""
+    """On a circle of radius 4 cm, clipping each force by itself gives two hands 0.616 J per turn at any speed."""
     coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
     limit = np.array(LIMITS)[:, None]
     linear = Process(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling), np.full(2, np.inf), np.zeros(2))
@@ -283,13 +283,13 @@ def test_clipped_cycles_give_energy_limited_ones_none():
         clipped = np.clip(drive(linear, x).f[: 2 * ticks], -limit, limit)
         assert (clipped[-ticks - 1 : -1] * dx).sum() == pytest.approx(-0.616, abs=0.005)
         f = drive(closed(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling, LIMITS, rho)), x).f[: 2 * ticks]
-        assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # delay and friction of the environment
+        assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # from delay and the network's damping
         assert (np.abs(f).max(axis=0) <= limit).all()
 
 
 @pytest.mark.parametrize("x", [(0.001, -0.002), (0.03, -0.02), (0.05, 0.05)])
 def test_at_rest_is_where_held_displacements_lead(x):
-    """Within the limits the linear state; beyond them the slip that the loop itself settles to."""
+    """The loop keeps the state `at_rest` at held displacements, within the limits and beyond them."""
     limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
     z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 6000, 2)
     held.x[:, :, 0] = x

@@ -1,4 +1,4 @@
-"""Identities of the block algebra, against dense frequency responses and python-control."""
+"""The block algebra agrees with dense frequency responses and with python-control."""
 
 from fractions import Fraction
 
@@ -38,7 +38,7 @@ def test_response_is_the_definition(blocks):
 
 
 def test_response_agrees_with_python_control(blocks):
-    import control  # takes a second, and every worker collects this file
+    import control  # the import takes a second, and every worker collects this file
 
     G = blocks[0]
     other = control.ss(G.A, G.B, G.C, G.D, G.T)
@@ -60,7 +60,7 @@ def test_algebra_is_pointwise(blocks):
 
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_sampled_responses_obey_the_same_algebra(m):
-    """Of one system, and of two whose responses are sampled at points of their own."""
+    """A system is sampled at one row of points, and at two rows as in a stack of two systems."""
     rng = np.random.default_rng(m)
     G, H = (random_lti(rng, 4, m, m) for _ in range(2))
     for z in (Z[None], np.stack([Z, Z[::-1] * np.exp(0.001j)])):
@@ -77,7 +77,7 @@ def test_sampled_responses_obey_the_same_algebra(m):
 
 
 def test_a_sampled_split_keeps_digits_near_one():
-    """He[K/(z-1)] = -K/2 on the whole circle; 1 - cos w from z itself is off by 1e-16/w^2."""
+    """He[K/(z-1)] = -K/2 on the whole circle, but 1 - cos w computed from z has the relative error 1e-16/w^2."""
     z = np.exp(1j * np.geomspace(1e-8, 3, 50))[None]
     split = Sampled.of(Lti.constant([[800.0]], 1e-3), z).over_z_minus_one()[1]
     np.testing.assert_allclose(split.G.real, -400.0, rtol=1e-15)
@@ -89,7 +89,7 @@ def test_quotient_at_one(blocks):
 
 
 def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
-    """Of blocks whose G(1) is symmetric; exactly (3 + 1/z has G(1) = 4, and leaves -1/z - 2)."""
+    """G(1) must be symmetric. In exact arithmetic, 3 + 1/z has G(1) = 4 and leaves -2 - 1/z."""
     G = blocks[0] + (blocks[0].dc().T - blocks[0].dc()) / 2
     at_one, regular = G.over_z_minus_one()
     whole, rest = G.at(Z) / (Z - 1)[:, None, None], regular.at(Z)
@@ -107,7 +107,7 @@ def test_a_delay_line_is_a_power_of_z(steps):
 
 
 def test_output_delays_are_powers_of_z(blocks):
-    """Behind a block, before it, in a loop, branching, and in a ring of delays that no input reaches."""
+    """The delays are behind a block, before it, in a loop, in branches, and in a ring that no input reaches."""
     G = blocks[0]
     T, loop = G.T, delay((3, 0), G.T) @ G @ delay((1, 4), G.T)
     ring = np.zeros((8, 8))
@@ -119,11 +119,11 @@ def test_output_delays_are_powers_of_z(blocks):
         z = 1.1 * Z[:, None, None]
         close(block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D)
         assert block.poles().size == block.order
-    assert loop._lines[0].size == G.order + 5 + 1  # of three samples behind it two are powers of z
+    assert loop._lines[0].size == G.order + 5 + 1  # 2 of 3 output delays copy the first
 
 
 def _stiff():
-    """Modes of 0.1 Hz to 400 Hz that hardly decay, with positions in m and velocities in units of 1e6."""
+    """Return lightly damped modes of 0.1 to 400 Hz whose states have units from 1e-6 to 1e6."""
     radii, angles = 1 - np.geomspace(1e-6, 1e-2, 4), 2 * np.pi * 1e-3 * np.geomspace(0.1, 400, 4)
     A = np.zeros((8, 8))
     for i, (r, a) in enumerate(zip(radii, angles, strict=True)):
@@ -140,14 +140,14 @@ def _stiff():
 
 
 def _inner_delays():
-    """Three samples in a loop and ten before it: poles at 0 without eigenvectors of their own."""
+    """Return a block with delays in a loop and before it, whose poles at 0 are defective."""
     rng = np.random.default_rng(4)
     G, H = random_lti(rng, 4, 2, 2), random_lti(rng, 3, 2, 2)
     return G.feedback(0.05 * H @ delay((3, 1), G.T)) @ delay((4, 10), G.T)
 
 
 def _double_pole():
-    """Two equal blocks in series, whose poles repeat without a second eigenvector."""
+    """Return two equal blocks in series, whose double poles have one eigenvector each."""
     G = random_lti(np.random.default_rng(5), 5, 2, 2)
     return G @ G
 
@@ -157,7 +157,7 @@ def test_stiff_and_defective_responses_match_plain_solves(make, summed):
     """Poles and taps are summed only where their error is bounded; the Schur form serves everywhere else."""
     G = make()
     assert (G._terms is not None) == summed
-    w = np.concatenate([Z, np.exp(1j * np.abs(np.angle(G.poles())))])  # also where each pole resounds
+    w = np.concatenate([Z, np.exp(1j * np.abs(np.angle(G.poles())))])  # including each pole's angle
     expected = np.array([G.C @ np.linalg.solve(z * np.eye(G.order) - G.A, G.B) + G.D for z in w])
     np.testing.assert_allclose(G.at(w), expected, atol=1e-9 * np.abs(expected).max(), rtol=0)
 
@@ -186,7 +186,7 @@ def test_blocks_prove_their_shapes():
 
 
 def test_building_a_block_formats_no_matrices():
-    """Thousands are built in a search, and the text of one costs more than its arithmetic."""
+    """A search builds thousands of blocks, and formatting one costs more than its arithmetic."""
 
     class Unwritable(np.ndarray):
         def __repr__(self):
@@ -198,7 +198,7 @@ def test_building_a_block_formats_no_matrices():
 
 
 def exact(G):
-    """A block of Fractions near a floating-point one, with a denominator of its own in every row."""
+    """Return a block of Fractions near G, with a different denominator in each row."""
     T, rounded = Fraction(1, 1000), []
     for name in "ABCD":
         rows = [[Fraction(round(v * (97 + i)), 97 + i) for v in row] for i, row in enumerate(getattr(G, name).tolist())]
@@ -207,7 +207,7 @@ def exact(G):
 
 
 def at_rest(G):
-    """G(1) and C (I - A)^-1 of Fractions by elimination of I - A, with no regard to what G was made of."""
+    """Return G(1) of a block of Fractions by elimination of I - A, from its matrices alone."""
     n = G.order
     rows = [
         [*(Fraction(i == j) - a for j, a in enumerate(row)), *b]
@@ -231,7 +231,7 @@ def test_exact_blocks_at_rest_combine_their_parts(blocks):
         static, R = whole.split_at_one()
         assert (static == np.array(at_rest(whole), dtype=object)).all()
         assert (whole.dc() == static).all()
-        # (z - 1) R = G - G(1): C' (A - I) = C, without any division
+        # (z - 1) R = G - G(1) holds if R.C (A - I) = C, which needs no division
         assert (times(R.C, R.A) - R.C == whole.C).all()
         assert (R.B == whole.B).all()
         assert not R.D.any()

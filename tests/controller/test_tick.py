@@ -1,4 +1,4 @@
-"""The timing convention, by hand and by its laws."""
+"""A tick obeys the timing convention of controller.tick."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ NONE = np.zeros(1)
 
 
 def drive(process: Process, x: np.ndarray) -> np.ndarray:
-    """Forces for given displacements (ticks, m), tick by tick."""
+    """Return the forces (ticks, m) for displacements x (ticks, m)."""
     buffer = StepBuffer(process, len(x), x.shape[1])
     for k, row in enumerate(x):
         buffer.x[k] = row[:, None]
@@ -32,7 +32,7 @@ def process(F: Lti, limit=np.inf, step=0.0) -> Process:
 
 
 def test_three_ticks_by_hand():
-    """A wall of 1000 N/m and 2 N s/m behind a spring of 1000 N/m, one sample of delay, limit 5 N.
+    """A spring-damper of 1000 N/m and 2 N s/m is behind a spring of 1000 N/m; theta = 1, the limit is 5 N.
 
     f_e = 1000 u + 2 (u - u-)/T = 3000 u - 2000 u-,  u = x - f_e/1000  =>  f_e = (3000 x - 2000 u-) / 4
         k   x[mm]   u-[mm]   f_e[N]     u[mm]     f[N] = f_e one tick later, within 5 N
@@ -46,7 +46,7 @@ def test_three_ticks_by_hand():
 
 
 def test_forces_end_at_their_limit_in_both_directions():
-    """Against 1000 N/m with a limit of 5 N: 12 mm, 5 mm and 4 mm to either side."""
+    """A spring of 1000 N/m is moved by 12, 5 and 4 mm to either side; the limit is 5 N."""
     f = drive(process(wall(1000.0), limit=5.0), 1e-3 * np.array([[12.0], [5.0], [4.0], [-4.0], [-5.0], [-12.0]]))
     np.testing.assert_allclose(f[:, 0], [5.0, 5.0, 4.0, -4.0, -5.0, -5.0], atol=1e-12)
 
@@ -115,7 +115,7 @@ def test_an_encoder_of_one_channel_rounds_that_one():
 
 
 def test_encoders_do_not_move_the_device():
-    """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
+    """Only the measured position is rounded; rounding the device's own position would make it creep."""
     buffer = StepBuffer(process(wall(1000.0), step=1e-3), 2, 2)
     buffer.x[0] = 0.6e-3
     buffer.tick(0)
@@ -167,7 +167,7 @@ def test_passivity_layers_count_ticks_of_the_run():
             heard.append(k)
 
     delays = np.zeros((100, 1, 1), dtype=int)
-    delays[:50] = 1  # a packet that is sent at another tick is late
+    delays[:50] = 1  # counted from the block's start, packets would be late
     F = wall(1000.0)
     buffer = StepBuffer(Process(Law(F), np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
     buffer.first = 50

@@ -1,4 +1,4 @@
-"""Delays that vary: the line that holds, patterns, and the switched loop."""
+"""With varying delays the device applies the newest packet, and patterns draw delays within their ranges."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def column(*delays):
 
 
 def carried(delays, forces):
-    """What the device applies, for one channel and one simulation."""
+    """Return the forces that the device applies, for one channel and one simulation."""
     line, applied = HeldLine(delays, 1), []
     for k, g in enumerate(forces):
         force = np.array([[float(g)]])
@@ -31,13 +31,13 @@ def carried(delays, forces):
 
 
 def test_hold_last_by_hand():
-    """Packets sent at k with these delays; the newest that is there is applied.
+    """The device applies the newest packet that has arrived.
 
     k          0    1    2    3    4     5    6
     force      10   11   12   13   14    15   16
     delay      1    3    1    2    lost  1    0
     arrives    1    4    3    5    -     6    6
-    in use     -    0    0    2    2     3    6     (packet 1 comes after packet 2: too late to be of use)
+    in use     -    0    0    2    2     3    6     (packet 1 comes after packet 2 and is never used)
     age        -    1    2    1    2     2    0
     """
     delays = column(1, 3, 1, 2, LOST, 1, 0)
@@ -53,14 +53,14 @@ def test_when_every_packet_is_lost_the_force_stays():
 
 
 def test_a_constant_delay_is_the_linear_block():
-    """The line behind G against Theta G, delays (1, 2): the same sums in another order, so equal to rounding."""
+    """The line behind G equals Theta G with delays (1, 2), up to rounding of sums in another order."""
     E, x = environment(FIGURE_4, T), np.random.default_rng(1).normal(size=(200, 2, 1))
     G, F = (force_map(E, COUPLING, theta, (0, 0)) for theta in ((0, 0), (1, 2)))
     constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))
     forces = []
     for process in (Process(Law(G), NO_LIMIT, IDEAL, delays=constant), Process(Law(F), NO_LIMIT, IDEAL)):
         buffer = StepBuffer(process, 50, 2)
-        for first in range(0, 200, 50):  # stretches: the line goes on where it was
+        for first in range(0, 200, 50):  # the line continues in the next block
             for k in range(50):
                 buffer.x[k] = x[first + k]
                 buffer.tick(k)
@@ -95,11 +95,11 @@ def test_patterns_are_what_they_are_called():
     rng, ticks = np.random.default_rng(4), 40_000
     assert (VaryingDelay((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
     counts = np.bincount(VaryingDelay((1,), (3,)).draw(rng, ticks).ravel())
-    # binomial: four standard deviations of a third of the packets
+    # four standard deviations of a binomial count
     np.testing.assert_allclose(counts[1:], ticks / 3, atol=4 * np.sqrt(ticks * 2 / 9))
     bursty = VaryingDelay((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
     starts = int((np.diff(bursty) == 1).sum())
-    # a burst every 25 packets: about 1600, each stretch geometric, so 4 standard deviations are about 6 percent
+    # about 1600 bursts and calm times, both geometric: 4 standard deviations of their number are about 6 percent
     assert starts == pytest.approx(ticks / 25, rel=0.1)
     assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
     recorded = VaryingDelay((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))

@@ -1,4 +1,4 @@
-"""Walls: the tick's complementarity problem, the energy of contact, and closed loops that bounce."""
+"""Walls solve a complementarity problem in each tick, return at most their energy, and are certified in loops."""
 
 import json
 
@@ -47,21 +47,21 @@ def walled(network: Network, coupling, theta, psi) -> Process:
 
 @pytest.mark.parametrize("damping", [0.0, 0.3, 50.0])
 def test_walls_return_at_most_their_stored_energy(damping):
-    """f[k] (x[k] - x[k-1]) >= potential now less potential before, tick by tick; rounding of 1e-12 of the stiffness."""
+    """f[k] (x[k] - x[k-1]) is at least the rise of the potential energy in every tick, up to rounding."""
     x = wander(2000, 1, 20)
     f = drive(walled(one(700.0, damping, 0.004), NoCoupling(), [0], [0]), x).f[:2000]
     depth = np.maximum(x - 0.004, 0)
     potential = 700.0 * depth**2 / 2
     assert (f[1:] * np.diff(x, axis=0) >= np.diff(potential, axis=0) - 1e-12 * 700).all()
-    assert (f >= 0).all()  # it never pulls
+    assert (f >= 0).all()  # a wall never pulls
     touching = depth > 0
     assert (touching[1:] & ~touching[:-1]).sum() > 100
-    assert ((f == 0) & touching).any() == (damping > 0)  # a strong damper lets go before the spring does
+    assert ((f == 0) & touching).any() == (damping > 0)  # with damping the force ends before contact does
 
 
 @pytest.mark.parametrize("walls", [1, 2, 3, 4])
 def test_the_wall_forces_solve_the_complementarity_problem(walls):
-    """p >= 0, s = M p - q >= 0 and p's = 0 for passive, unsymmetric M: to 1e-12 of what is subtracted."""
+    """For positive definite, unsymmetric M: p >= 0, s = M p - q >= 0 and p's = 0, to 1e-12 of the terms."""
     rng = np.random.default_rng(walls)
     for _ in range(20):
         root, turn = rng.normal(size=(2, walls, walls))
@@ -86,7 +86,7 @@ def test_wall_forces_that_are_not_determined_are_refused():
 
 
 def test_a_wall_behind_a_coupling_matches_root_finding():
-    """u = x - y, K y + B (y - y-)/T = wall(u) = f, one equation a tick, solved by bisection to 1e-13 m."""
+    """Brent's method solves K y + B (y - y-)/T = wall(u) with u = x - y, one equation in each tick."""
     K, B, stiffness, damping, gap = 900.0, 0.4, 3000.0, 2.0, 2e-3
     x = wander(400, 1, 1)[:, 0, 0]
     expected, y_old, h_old = [0.0], 0.0, 0.0  # theta = 1
@@ -100,19 +100,19 @@ def test_a_wall_behind_a_coupling_matches_root_finding():
         expected.append(push(u))
         y_old, h_old = target - u, max(0.0, u - gap)
     f = drive(walled(one(stiffness, damping, gap), SpringDamper([K], [B]), [1], [0]), x[:, None, None]).f[:400, 0, 0]
-    np.testing.assert_allclose(f, expected[:400], atol=1e-9)  # 1e-13 m times 5000 N/m
+    np.testing.assert_allclose(f, expected[:400], atol=1e-9)  # u to 1e-13 m, times 5000 N/m
     assert 0 < (f > 0).mean() < 1
 
 
 class Weighted(Coupling):
-    """A user's own: V = (0.8 + 0.2/z)/900 on each of two channels."""
+    """A user's own coupling: V = (0.8 + 0.2/z)/900 on each of two channels."""
 
     def compliance(self, T):
         return Lti.diag(*[taps([0.8 / 900, 0.2 / 900], T)] * 2)
 
 
 def test_a_wall_behind_a_coupling_of_ones_own():
-    """Between two contacts, with a wall one way only; by hand: f = max(0, k w), w = a - b - 2 (0.8 f + 0.2 f-)/900."""
+    """A wall between two contacts sends f = max(0, k w) with w = a - b - 2 (0.8 f + 0.2 f-)/900."""
     network = Network(("a", "b"), walls=(Wall(("a", "b"), 3000.0),))
     x = wander(60, 2, 1)
     f, expected = 0.0, []
@@ -140,7 +140,7 @@ BOXED = Network(
 @pytest.mark.parametrize("coupling", [NoCoupling(), SpringDamper([2e4, 1e4], [1.0, 0.0])], ids=["none", "stiff"])
 @pytest.mark.parametrize("psi", [(0, 0), (0, 2)])
 def test_a_touching_wall_is_a_spring_damper(coupling, psi):
-    """Walls a metre inside: differences of two runs follow the environment with springs in the walls' place."""
+    """If walls always touch, the difference of two runs equals that with springs in place of the walls."""
     walls = (Wall(("contact 1", GROUND), 5000.0, 3.0, -1.0), Wall(FIGURE_4.contacts, 2000.0, 1.0, -1.0))
     network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
     x = wander(300, 2, 2)
@@ -163,10 +163,7 @@ def test_frozen_states_are_the_environments_with_springs():
 
 
 def test_walls_between_nodes_keep_the_whole_environment_passive():
-    """Two contacts, a mass between two walls, a wall between the contacts: sum f'dx never falls below what is stored.
-
-    From rest with walls open nothing is stored, so the sum is never negative.
-    """
+    """The sum of f'dx is never negative if the run starts at rest with open walls."""
     network = Network(
         BOXED.contacts, BOXED.springs, BOXED.masses, (*BOXED.walls[:2], Wall(FIGURE_4.contacts, 2e3, 1, 1e-3))
     )
@@ -191,10 +188,7 @@ def boxed(scenario):
     ("name", "humans", "seconds"), [("exact", 200, 6.0), pytest.param("mujoco", 20, 3.0, marks=pytest.mark.slow)]
 )
 def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
-    """Walls of 20000 and 2000 N/m hit at up to 0.3 m/s, a coupling certified for whatever is passive.
-
-    The speed falls from the first quarter to the last in every run, though contact is made thousands of times.
-    """
+    """Behind a certified coupling all hands slow down from the first to the last quarter, despite many contacts."""
     scenario = boxed(load())
     assert requirements_of(scenario.loop("I"), SOFT)["any-environment"].certified
     loop = assemble(scenario, SOFT)
@@ -224,7 +218,7 @@ def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
 
 
 def test_both_engines_see_the_same_contacts():
-    """RK4 x 4 against the exact hold on a bouncing trace: 1e-6 of the motion, and the same number of contacts."""
+    """The engines agree on the ticks of contact of a bouncing trace, and on its motion to 1e-6."""
     loop = assemble(load("one-wall").replace(duration=2.0), SpringDamper([900.0], [0.4]))
     exact, own = run(loop, "exact"), run(loop, "mujoco")
     depths = [loop.process.law.depths(record.z) > 0 for record in (exact, own)]
@@ -248,13 +242,13 @@ def test_a_run_reports_contact_and_its_certificate(tmp_path):
     assert soft["stability"]["growth_rate_per_s"] is None
     assert "contact was made 2 times" in soft["stability"]["reason"]
     needed = needs(bare, "this-environment")["required_damping"]
-    assert needed == pytest.approx([4.2221], rel=5e-5)  # a bare wall one sample late, by a separate computation
+    assert needed == pytest.approx([4.2221], rel=5e-5)  # computed separately: a bare wall, one sample late
     assert bare["assessment"]["guarantee"] is None
     assert any("no certificate covers it" in line for line in bare["remarks"])
 
 
 def test_this_environment_is_asked_of_every_frozen_state():
-    """Two walls make four linear loops: switching between them asks more than each, recomputed here."""
+    """Two walls make four linear loops; switching between them requires more damping than each by itself."""
     loop = boxed(load()).loop("I")
     requirement = requirements_of(loop, SOFT)["this-environment"]
     singles = [
@@ -272,8 +266,8 @@ def test_this_environment_is_asked_of_every_frozen_state():
 
 
 def test_stiffer_couplings_are_certified_for_switching_walls():
-    """K = 1200 N/m behind one sample of delay, where any-environment ends at 1033; 1772 N/m is certified in each frozen
-    state, and not for what switches between them."""
+    """With one sample of delay any-environment ends at 1033 N/m. 1200 N/m is certified for the switching wall, and
+    1772 N/m only in each frozen state."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
