@@ -164,7 +164,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
 
 def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement[str]:
-    """Return the requirement of the worst member of the ranges; `here` is that of the nominal environment."""
+    """Return the largest requirement over the ranges; `here` is that of the nominal environment."""
     ranges = check_ranges(loop, coupling, samples=0, condition=condition)
     assert ranges  # The caller passes only loops with ranges.
     _, worst = ranges.worst if ranges.proved else ranges.worst_found

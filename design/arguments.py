@@ -54,7 +54,7 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """Return the value and its type as a short text; for a long value only the type, for None only "None"."""
+    """Return "value (type)", or "a type" for a long value or an object of this package, or "None"."""
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

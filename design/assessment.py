@@ -246,7 +246,7 @@ def violated_between(where: str, place: Member, ratio: float) -> str:
 # Forces at their limits.
 
 
-_OWN_PROOF = "by a proof of its own, for this environment"  # part of a printed line
+_OWN_PROOF = "by a separate proof for this environment"  # part of a printed line
 
 
 @dataclass(frozen=True)
@@ -389,7 +389,7 @@ class Guarantee:
         proof: "rational": exact arithmetic, also for limited forces if `forces` names them; "sampled": a refined sweep;
             "account": an energy account at every tick.
         facts: Properties of the loop that the condition covers (Assessment.facts).
-        hands: The hands that the guarantee covers; of an energy account "no passive hand", the subject of `words`.
+        hands: The hands that the guarantee covers. For an energy account, `words` starts with "no passive hand".
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", the restriction, or the account that scales them.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
@@ -543,7 +543,7 @@ def assess(
     """Assess a coupling in its loop, for the environment, limits and delays that run.
 
     Args:
-        loop: The loop; ranges, switching delays, latency and longest period must all be covered.
+        loop: The loop, with its ranges, switching delays, latency and longest period.
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
@@ -563,7 +563,8 @@ def assess(
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. Its guarantee is for the environment that runs; `holds` also requires `condition` and ranges.
+        The assessment. Its guarantee is for the environment that runs. `holds` also requires `condition` and, with
+        ranges, a guarantee that covers them.
 
     Raises:
         TypeError: `loop` is no Loop, or `coupling` no coupling.

@@ -96,7 +96,7 @@ _Ratio = Callable[[float], float]  # value that is varied -> required over avail
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
-_SMOOTH = 0.1  # A larger step of the ratio beyond the edge may be a jump, where a secant says nothing.
+_SMOOTH = 0.1  # Where the logarithm of the ratio outside the edge is larger, the ratio may jump: no secant is used.
 _NOT_CERTIFIED = "not certified, so there are no margins"
 
 
@@ -150,7 +150,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Return the largest certified K of each channel, at most 2 (delta - B)/T, the bound where z^(theta + 1) = -1.
+    """Return the largest certified K of each channel, at most 2 (delta - B)/T, by (e) at z^(theta + 1) = -1.
 
     Without a latency the set of certified gains is convex and contains K -> 0, so there is only one edge.
     """
@@ -242,10 +242,10 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
     """Return an argument at which the damping suffices, within _EDGE of the edge towards `outside`, relative to itself.
 
-    The distance to the edge is that between the two nearest arguments on its sides, or an estimate by their secant. The
-    steps are bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28,
-    1997). They aim half of _EDGE inside the edge, so that the last one is mostly the result. Five values of `ratio`
-    take less time than importing scipy.optimize.brentq.
+    If the damping suffices at `outside`, that is the result. The distance to the edge is that between the two nearest
+    arguments on its sides, or an estimate by their secant. The steps are bisection, or inverse quadratic interpolation
+    where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997). They aim half of _EDGE inside the edge, so that
+    the last one is usually the result. Five values of `ratio` take less time than importing scipy.optimize.brentq.
     """
     if suffices(ratio(outside)):
         return outside
@@ -332,7 +332,7 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the largest factor that certifies, rounded down to 0.001, or the factor that requires least."""
+    """Return the remedy of the largest factor that certifies, rounded down to 0.001, or that requires least."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
@@ -367,7 +367,7 @@ class Audit:
     """The assessment of a coupling with its margins, and the changes that help if it fails."""
 
     assessment: Assessment
-    margins: dict[str, Margins]  # by condition, in the loop's own environment at the constant delays
+    margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
     switching: SwitchingFigures | None
     helps: list[Help]
     not_covered: str = CAVEATS

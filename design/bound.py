@@ -17,9 +17,9 @@ this bound is
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
 D >= 0, which lowers the bound on J. The bound on J is then proved.
-The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero,
-or the psi differ, so that the zero combinations are known up to rounding only. The integrals over the band are computed
-by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
+The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: only the proved bound is
+zero, or the psi differ, so that the zero combinations are known up to rounding only. The integrals over the band are
+computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
 """
 
 from __future__ import annotations

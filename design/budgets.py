@@ -26,18 +26,18 @@ RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
-#: Largest number of states of a loop with a basis. Design and proof of one with 268 states take 8 (n6, four devices).
+#: Largest number of states of a loop with a basis. Design and proof of one with 268 states take 8 units (n6).
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
 #: Largest number of unknowns of a basis with filters between all channels, for this-environment alone. The largest
 #: program takes ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Largest product of a basis's unknowns and the channels in all other cases. The largest program takes ten seconds.
+#: Largest product of the numbers of unknowns and channels, in all other cases. The largest program takes ten seconds.
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried.
 UNPROVED_BASES = 2
-#: Number of bases whose couplings are proved at every vertex of ranges, the best first, until one proof succeeds.
+#: Largest number of bases, the best first, whose couplings are tried at every vertex of ranges until one is proved.
 RANGED_BASES = 3
 
 # Sizes of proofs, and rounds of searches that normally converge earlier, with the measured numbers -------------------
@@ -51,7 +51,7 @@ MULTIPLIER_ROWS = 24
 #: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many channels
 #: every start has the first number, and the best starts have the second. With few channels every start has the third.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
-#: Rounds that add frequencies to Theorem 4. Only delays of a hundred samples and more take any.
+#: Rounds that add frequencies to a design by Theorem 4. Only delays of a hundred samples and more need them.
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains. Case I takes 2.
 SEQUENCE_STEPS = 60
@@ -72,7 +72,7 @@ BETA_CUTS, BETA_ROUNDS = 40, 60
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the
-# default designs of cases I and II and of 16 loops of benchmarks/loops (n0 to o09) -----------------------------------
+# default designs of cases I and II (n0, n1) and of 16 further loops of benchmarks/loops (n2 to o09) -------------------
 
 #: Newton steps to the centre of a barrier (9 centrings took all and returned the last point), and of the primal-dual
 #: method (two runs took all because of rounding).

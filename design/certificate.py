@@ -429,7 +429,7 @@ def named(condition: str | Condition) -> Condition:
         free = isinstance(name, str) and name.strip() and name not in reserved
         if not (free or _is_ours(condition)):
             own = f"condition {type(condition).__name__}: its name is {name!r}"
-            raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(reserved))}")
+            raise ValueError(f"{own}, expected a name other than {', '.join(sorted(reserved))}")
         return condition
     if condition not in _NAMED:
         raise ValueError(

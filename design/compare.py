@@ -60,10 +60,10 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Evaluate F with all walls touching, and the plain conditions: requirement, and demand over frequency.
+    """Evaluate F with all walls touching, and each condition's requirement and demand over frequency.
 
-    `own` are further conditions of a user; `known` are requirements from an assessment of this loop and coupling.
-    Raises SingularLoop if the algebraic loop has no solution.
+    The conditions are the plain ones and a user's `own`; `known` are requirements from an assessment of this loop and
+    coupling. Raises SingularLoop if the algebraic loop has no solution.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)
@@ -77,7 +77,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and those where conditions bind."""
+    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and the binding frequencies."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz

@@ -380,7 +380,7 @@ class Condition(ABC):
     @property
     def claim(self) -> str:
         """The sentence that reports print if a user's own condition holds."""
-        return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
+        return f"only the block of {self.name} is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
         """Return `claim`, or the shortfall."""
@@ -530,7 +530,7 @@ def asymmetric(V1: Array) -> str | None:
 
 
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
-    """Return the least s (k,) of the demand at w (k,), demanding nothing in directions in which V vanishes.
+    """Return the least s (k,) of the demand at w (k,), with _SOFTENED V(1) added to the gain where V vanishes.
 
     If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. A
     moving average without a constant vanishes at every zero of Theta-hat. If only V vanishes, the ratio is large.

@@ -21,7 +21,7 @@ from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import DesignFailed, Infeasible
 
-#: Largest negative eigenvalue that counts as rounding. Problems are scaled so that 1 is large.
+#: Largest violation that counts as rounding. Problems are scaled so that a violation of 1 would be large.
 _TOLERANCE = 1e-4
 #: Clarabel is slower than `_interior` on a block whose triangle has more than _LARGE entries, and more than _MANY
 #: for each unknown.
@@ -318,7 +318,7 @@ def _inner(problem: ConeProgram, Z: _Parts) -> Array:
 
 
 def _longest(roots: _Parts, steps: _Parts) -> float:
-    """Return the longest step, up to 1, that keeps every matrix positive; `roots` are inverse Cholesky factors."""
+    """Return _KEPT of the step to the boundary, at most 1; `roots` are inverse Cholesky factors of the matrices."""
     pairs = zip(roots, steps, strict=True)
     least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
     return min(1.0, _KEPT / max(-least, 1e-300))

@@ -31,7 +31,7 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 class Certificate(Strict, frozen=True):
     """The claim about a coupling in its loop and its proof: base condition, facts, multipliers, matrices."""
 
-    condition: str  # the base: a name of design.result.CONDITIONS, or the name of a user's own condition
+    condition: str  # base condition: a name of design.result.CONDITIONS, or the name of a user's own condition
     facts: tuple[str, ...]  # covered properties beyond one linear network with constant delays (conditions.FACTS)
     required: tuple[float, ...]  # (m,) [N s/m] required damping, from a refined sweep with `multipliers`
     available: tuple[float, ...]  # (m,) [N s/m] damping for which the condition is proved

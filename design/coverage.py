@@ -45,7 +45,7 @@ class SwitchingFigures:
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
     hi: tuple[int, ...] = off_table()
-    alpha: tuple[float, ...] | None = off_table("if given", None)  # all multipliers, last alpha [N/m] (facts.Switching)
+    alpha: tuple[float, ...] | None = off_table("if given", None)  # all multipliers, alpha [N/m] last (facts.Switching)
     playout: _Playout | None = off_table("if given", None)
     not_covered: str | None = off_table("if given", None)
 
@@ -108,7 +108,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures over the ranges of the design that `nominal` makes without ranges, if any, and of `design`."""
+    """Return the figures of `design` over the ranges, after those of the design by `nominal` without ranges, if any."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

@@ -74,11 +74,11 @@ def kind_of(name: str) -> _Kind:
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
-    The default of a spring-damper is this-environment, which gives the least transparency error. In loops with walls,
-    worlds, ranges or varying delays, but without a latency, it is any-environment. If bounds of the devices are known,
-    two conditions that never require more damping take precedence: known-device replaces this-environment in loops
-    without a latency, and known-device-any is chosen with walls if it covers the loop. Apart from these two, each of
-    the other kinds has only one condition.
+    The default of a spring-damper or a user's own function is this-environment, which gives the least transparency
+    error. In loops with walls, worlds, ranges or varying delays, but without a latency, it is any-environment. If
+    bounds of the devices are known, two conditions of KINDS that never require more damping take precedence:
+    known-device replaces this-environment in loops without a latency, and known-device-any is chosen with walls if it
+    covers the loop. Apart from these two, each of the other kinds has only one condition.
     """
     conditions = kind_of(kind).conditions
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
