@@ -5,7 +5,10 @@ from scipy.linalg import expm
 
 
 class Hands:
-    """Devices in random passive hands, integrated by the matrix exponential."""
+    """Devices in random passive hands, integrated by the matrix exponential.
+
+    `lossless` and `start`, the scale of the first velocities [m/s], are one value or one for each simulation (nsim,).
+    """
 
     def __init__(self, rng, nsim, lossless, start=0.0, masses=None, T=1.2e-3, delta=(1.37, 0.9)):
         m = self.m = len(delta)  # channels
@@ -14,7 +17,7 @@ class Hands:
         self.M = np.zeros((nsim, n, n))
         self.M[:, range(n), range(n)] = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (nsim, n)))
         self.K = root @ root.transpose(0, 2, 1) * np.exp(rng.uniform(0, np.log(2000), (nsim, 1, 1)))
-        loss = rng.normal(size=(nsim, n, n)) * (0 if lossless else 1)
+        loss = rng.normal(size=(nsim, n, n)) * np.reshape(np.logical_not(lossless), (-1, 1, 1))
         damping = loss @ loss.transpose(0, 2, 1)
         damping[:, range(m), range(m)] += delta
         inverse = np.linalg.inv(self.M)
@@ -23,7 +26,7 @@ class Hands:
         generator[:, n : 2 * n, :n], generator[:, n : 2 * n, n : 2 * n] = -inverse @ self.K, -inverse @ damping
         generator[:, n : 2 * n, 2 * n :] = -inverse[:, :, :m]
         self.step = expm(generator * T)[:, : 2 * n]
-        self.s = np.concatenate([np.zeros((nsim, n)), start * rng.normal(size=(nsim, n))], axis=1)
+        self.s = np.concatenate([np.zeros((nsim, n)), np.reshape(start, (-1, 1)) * rng.normal(size=(nsim, n))], axis=1)
 
     @property
     def x(self):
@@ -35,7 +38,7 @@ class Hands:
 
     def energy(self):
         q, v = self.s[:, : self.n], self.s[:, self.n :]
-        return (np.einsum("ki,kij,kj->k", q, self.K, q) + np.einsum("ki,kij,kj->k", v, self.M, v)) / 2
+        return (q[:, None] @ self.K @ q[:, :, None] + v[:, None] @ self.M @ v[:, :, None])[:, 0, 0] / 2
 
     def hold(self, f):
-        self.s = np.einsum("kij,kj->ki", self.step, np.concatenate([self.s, f.T], axis=1))
+        self.s = (self.step @ np.concatenate([self.s, f.T], axis=1)[:, :, None])[:, :, 0]

@@ -19,14 +19,12 @@ T = 1.2e-3
 DELTA = np.array([1.37, 0.9])
 
 
-def springs(hands, rng):
+def springs(x, rng):
     """Return the forces of an unsymmetric stiffness with negative damping, which deliver energy."""
-    K = np.array([[6000.0, 2500.0], [-2500.0, 3000.0]])
-    old = hands.x
+    K, old = np.array([[6000.0, 2500.0], [-2500.0, 3000.0]]), x
 
-    def force():
+    def force(x, v):
         nonlocal old
-        x = hands.x
         out = K @ x - 20 * (x - old) / T
         old = x
         return out
@@ -34,22 +32,36 @@ def springs(hands, rng):
     return force
 
 
-def network(hands, rng):
+def network(x, rng):
     """Return the forces of a random recurrent network of saturating units."""
     A, B, C = rng.normal(size=(30, 30)) / 4, rng.normal(size=(30, 4)) * [300, 300, 5, 5], rng.normal(size=(2, 30)) * 4
-    h = rng.normal(size=(30, 1)) * np.ones((1, hands.s.shape[0]))
+    h = rng.normal(size=(30, 1)) * np.ones(x.shape[1])
 
-    def force():
+    def force(x, v):
         nonlocal h
-        h = np.tanh(A @ h + B @ np.vstack([hands.x, hands.v]))
+        h = np.tanh(A @ h + B @ np.vstack([x, v]))
         return C @ h
 
     return force
 
 
-def thief(hands, rng):
+def thief(x, rng):
     """Return forces of 12 N that always push along the velocity."""
-    return lambda: -12.0 * np.sign(hands.v + 1e-12)
+    return lambda x, v: -12.0 * np.sign(v + 1e-12)
+
+
+def each_in_turn(hands, rng):
+    """Return the forces of three controllers, of which each acts in every third simulation."""
+    parts = [(slice(k, None, 3), make(hands.x[:, k::3], rng)) for k, make in enumerate((springs, network, thief))]
+
+    def force():
+        x, v = hands.x, hands.v
+        out = np.empty_like(x)
+        for part, one in parts:
+            out[:, part] = one(x[:, part], v[:, part])
+        return out
+
+    return force
 
 
 class Line:
@@ -73,26 +85,26 @@ class Line:
         return np.where(old | (self.newest < 0), 0.0, self.force)
 
 
-@pytest.mark.parametrize("lossless", [True, False])
-@pytest.mark.parametrize("controller", [springs, network, thief])
-@pytest.mark.parametrize("start", [1e-3, 0.3])  # [m/s]
-def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
-    rng = np.random.default_rng(7)
-    hands = Hands(rng, 40, lossless, start)
+def test_no_hand_is_given_more_than_the_budget():
+    """Each controller meets twenty hands with and without losses, which start at 1 mm/s and at 0.3 m/s."""
+    rng, n = np.random.default_rng(7), np.arange(240)
+    lossless, start = n // 3 % 2 == 0, np.where(n // 6 % 2 == 0, 1e-3, 0.3)
+    hands = Hands(rng, n.size, lossless, start)
     W0, given, theta = 0.05, hands.energy(), (1, 2)
-    force, budget = controller(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=40)
-    line, x, most = np.zeros((3, 2, 40)), hands.x, 0.0
+    force, budget = each_in_turn(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=n.size)
+    line, x, most = np.zeros((3, 2, n.size)), hands.x, np.zeros(n.size)
     for _ in range(1000):
         line = np.concatenate([budget.limit(force(), hands.x - x)[None], line[:-1]])
         x = hands.x
         assert (budget.energy - budget.reserved > -1e-9).all()
         hands.hold(np.stack([line[n, i] for i, n in enumerate(theta)]))
         received = hands.energy() - given
-        assert received.max() <= W0 + 1e-9 * (1 + given.max())
-        most = max(most, received.max())
+        assert (received <= W0 + 1e-9 * (1 + given)).all()
+        most = np.maximum(most, received)
     assert budget.limited.min() > 0
-    if controller is thief and lossless and start < 0.1:
-        assert most > 0.5 * W0  # some hand receives more than half of the bound
+    assert (
+        most[(n % 3 == 2) & lossless & (start < 0.1)].max() > 0.5 * W0
+    )  # some hand receives more than half of the bound
 
 
 @pytest.mark.validate
@@ -140,41 +152,43 @@ def test_the_budget_holds_on_stiffer_springs():
     ],
 )
 def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
-    rng = np.random.default_rng(8)
-    for controller in (springs, network, thief):
-        hands = Hands(rng, 30, True, 0.01)
-        W0, given, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4
-        budget = EnergyBudget(DELTA, T, Packets(lo, hi, hold), start=W0, nsim=30)
-        line, force, x, acted = Line(rng, lo, hi, hold, loss, 30), controller(hands, rng), hands.x, [np.zeros((2, 30))]
-        worked = np.zeros(30)
-        for k in range(1200):
-            sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
-            x = hands.x
-            if told == "late" and k > late:
-                budget.tell(k - late, acted[k - late + 1])
-            acted.append(line.carry(sent))
-            worked += np.abs(acted[-1]).sum(axis=0)
-            hands.hold(acted[-1])
-            assert (hands.energy() - given).max() <= W0 + 1e-9
-            assert (budget.energy - budget.reserved > -1e-9).all()
-        assert budget.surprises == 0
-        assert worked.min() > 0
+    rng, nsim = np.random.default_rng(8), 90
+    hands = Hands(rng, nsim, True, 0.01)
+    W0, given, lo, hi, late = 0.05, hands.energy(), (0, 1), (3, 2), 4
+    budget = EnergyBudget(DELTA, T, Packets(lo, hi, hold), start=W0, nsim=nsim)
+    line, force, x, acted = (
+        Line(rng, lo, hi, hold, loss, nsim),
+        each_in_turn(hands, rng),
+        hands.x,
+        [np.zeros((2, nsim))],
+    )
+    for k in range(1200):
+        sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
+        x = hands.x
+        if told == "late" and k > late:
+            budget.tell(k - late, acted[k - late + 1])
+        acted.append(line.carry(sent))
+        hands.hold(acted[-1])
+        assert (hands.energy() - given).max() <= W0 + 1e-9
+        assert (budget.energy - budget.reserved > -1e-9).all()
+    assert budget.surprises == 0
+    assert np.abs(acted).sum(axis=(0, 1)).min() > 0
 
 
 @pytest.mark.parametrize("told", [pytest.param("constant", marks=pytest.mark.slow), "late"])
 def test_coarse_encoders_keep_the_guarantee(told):
     """If the budget ignores steps of 0.5 mm and the delays are constant, a hand receives more than twice W0."""
     W0, q, most = 0.05, 5e-4, {}
-    for known in (q, 0.0):
+    for known in (q, 0.0) if told == "constant" else (q,):
         rng = np.random.default_rng(17)
         hands = Hands(rng, 40, True, 0.02)
-        given, force = hands.energy(), thief(hands, rng)
+        given, steal = hands.energy(), thief(hands.x, rng)
         lo, hi = ((0, 1), (0, 1)) if told == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, Packets(lo, hi), encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
         for k in range(1200):
             now = np.round(hands.x / q) * q
-            wanted = force() * (1 + (k % 2))  # forces that change cost energy behind coarse encoders
+            wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # forces that change cost energy behind coarse encoders
             sent = budget.limit(wanted, now - seen)
             if told == "late" and k >= 3:
                 budget.tell(k - 3, acted[k - 3])
@@ -246,7 +260,7 @@ def test_any_environment_loops_are_never_limited():
     rng, eps = np.random.default_rng(10), 0.05
     scenario = load()
     coupling = certified((1 - eps) * np.array(scenario.delta))
-    x = motions(rng, 1500, 60)
+    x = motions(rng, 600, 60)
     stiff = Network(
         ("a", "b"), (Spring(("a", "ground"), 1e5, 3.0), Spring(("a", "b"), 4e4), Spring(("b", "ground"), 9e4))
     )
@@ -272,7 +286,7 @@ def test_delayed_springs_within_bounds_are_never_limited(theta):
 
 def test_a_cap_below_stored_energy_limits_most_ticks():
     """A spring of 1000 N/m stores 0.2 J at 2 cm."""
-    x = 0.02 * np.sin(2 * np.pi * 1.0 * T * np.arange(2500))[:, None, None]
+    x = 0.02 * np.sin(2 * np.pi * 3.0 * T * np.arange(834))[:, None, None]
     spring = Lti.constant([[1000.0]], T)
     share = {cap: acted_on(spring, x, (0,), [1.37], cap=cap)[0] / len(x) for cap in (0.05, 0.25)}
     assert share[0.25] == 0
@@ -369,28 +383,28 @@ def test_hands_behind_the_shell_get_its_budget():
     """Behind a coupling for any environment, hands receive at most W0 from an active mass or from random forces."""
     E = active_environment()
     V = certified(DELTA).compliance(T)
-    solve, most = np.linalg.inv(np.eye(2) + E.D @ V.D), {}
-    for name, W0 in (("active", 0.02), ("nonsense", 0.02), ("active, not limited", 1e9)):
-        rng, nsim = np.random.default_rng(18), 40
+    solve, most, nsim = np.linalg.inv(np.eye(2) + E.D @ V.D), {}, 80
+    nonsense = np.arange(nsim) % 2 == 1
+    for W0 in (0.02, 1e9):
+        rng = np.random.default_rng(18)
         hands, shell = Hands(rng, nsim, True, 0.05), Shell(V, start=W0, nsim=nsim)
-        given, line, z, most[name] = hands.energy(), np.zeros((3, 2, nsim)), np.zeros((E.order, nsim)), 0.0
-        for _ in range(4000):
+        given, line, z, most[W0] = hands.energy(), np.zeros((3, 2, nsim)), np.zeros((E.order, nsim)), np.zeros(nsim)
+        for _ in range(3000):
             wanted = solve @ (E.C @ z + E.D @ shell.free(hands.x))
-            force, u = shell.limit(20 * rng.normal(size=(2, nsim)) if name == "nonsense" else wanted)
+            force, u = shell.limit(np.where(nonsense, 20 * rng.normal(size=(2, nsim)), wanted))
             z = E.A @ z + E.B @ u
             line = np.concatenate([force[None], line[:-1]])
             hands.hold(np.stack([line[1, 0], line[2, 1]]))
-            received = (hands.energy() - given).max()
-            assert received <= W0 + 1e-9
-            most[name] = max(most[name], received)
-    assert most["active, not limited"] > 5 * 0.02
-    assert most["active"] > 0.1 * 0.02
+            most[W0] = np.maximum(most[W0], hands.energy() - given)
+        assert most[W0].max() <= W0 + 1e-9
+    assert most[1e9][~nonsense].max() > 5 * 0.02
+    assert most[0.02][~nonsense].max() > 0.1 * 0.02
 
 
 def test_the_shell_leaves_implicit_passive_environments_alone():
     rng = np.random.default_rng(14)
     E, V = environment(FIGURE_4, T), SpringDamper([879.0, 552.0], [0.39, 0.52]).compliance(T)
-    shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 2000, 20), E.feedback(V)
+    shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 800, 20), E.feedback(V)
     solve = np.linalg.inv(np.eye(2) + E.D @ V.D)
     z, y = np.zeros((E.order, 20)), np.zeros((F.order, 20))
     for now in x:
