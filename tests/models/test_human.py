@@ -1,4 +1,4 @@
-"""A human is a passive port: what is not passive cannot be built, and every way of writing a hand gives one physics."""
+"""A hand that is not passive cannot be built, and each way of describing a hand gives the same plant."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ DEVICE = RigidDevice(mass=0.2, damping=0.9)
 
 
 class Own:
-    """A user's own hand, whatever its port."""
+    """A hand of a user's own class, with the given port."""
 
     def __init__(self, port):
         self._port = port
@@ -27,7 +27,7 @@ class Own:
 
 
 def felt(port, w, device=DEVICE):
-    """The impedance at the device's motor [N s/m] from the plant's matrices: force over velocity."""
+    """Return the impedance at the device's motor, force over velocity [N s/m], from the plant's matrices."""
     scene = build([device], [Own(port)])
     linear = plant(scene.model)
     x = np.linalg.solve(1j * w * np.eye(len(linear.A)) - linear.A, -linear.B[:, -1])
@@ -40,14 +40,14 @@ def felt(port, w, device=DEVICE):
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_every_frequency_is_decided_without_a_grid(seed, n):
-    """Random stable impedances, moved by their least real part over a dense sweep: above it passive, below it not."""
+    """A random impedance is accepted if D lifts the least Re Z of a dense sweep above 0, and refused below 0."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(n, n))
     A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(n)
     B, C = rng.normal(size=(n, 1)), rng.normal(size=(1, n))
     sweep = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 4000)])
     real = (C @ np.linalg.solve(1j * sweep[:, None, None] * np.eye(n) - A, B)).real
-    least = min(real.min(), 0.0)  # at infinity it is 0
+    least = min(real.min(), 0.0)  # Re Z is 0 at infinity
     size = np.abs(real).max()
     assert Impedance(A, B, C, [[-least + 1e-3 * size]]).order == n
     with pytest.raises(ValueError, match="not passive, Re Z is -"):
@@ -57,11 +57,11 @@ def test_every_frequency_is_decided_without_a_grid(seed, n):
 @pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
 @pytest.mark.parametrize("depth", [1e-2, 1.0])
 def test_a_narrow_active_resonance_is_refused(width, depth):
-    """Z = D - c 2 h w0 s/(s^2 + 2 h w0 s + w0^2) has Re Z = D - c < 0 at w0 alone; beside it are broad passive ones."""
+    """The resonance -c 2 h w0 s/(s^2 + 2 h w0 s + w0^2) makes Re Z < 0 near w0 only; broad ones are passive."""
     rng = np.random.default_rng(7)
     w = 90.0 * 10 ** np.array([0.0, -1.0, 0.5, 1.2])
     h = np.array([width, 0.3, 0.05, 0.7])
-    gain = np.array([-2.0 * (1 + depth), 3.0, 0.4, 1.0])  # the last three add what is not negative
+    gain = np.array([-2.0 * (1 + depth), 3.0, 0.4, 1.0])  # the last three are passive
     blocks = [w * np.array([[0.0, 1.0], [-1.0, -2 * h]]) for w, h in zip(w, h, strict=True)]
     A, B = scipy.linalg.block_diag(*blocks), np.tile([[0.0], [1.0]], (4, 1))
     C = np.ravel([[0.0, g * 2 * h * w] for g, h, w in zip(gain, h, w, strict=True)])[None]
@@ -78,19 +78,19 @@ def test_a_narrow_active_resonance_is_refused(width, depth):
 
 
 def test_one_lag_is_passive_two_are_not():
-    """g/(1 + tau s) has the real part g/(1 + (tau w)^2); its square turns negative above w = 1/tau."""
+    """g/(1 + tau s) has the real part g/(1 + (tau w)^2); that of g/(1 + tau s)^2 is negative above w = 1/tau."""
     assert Impedance([[-20.0]], [[20.0]], [[3.0]], [[0.0]]).order == 1
     twice = [[-20.0, 0.0], [20.0, -20.0]], [[20.0], [0.0]], [[0.0, 3.0]], [[0.0]]
     with pytest.raises(ValueError, match=r"not passive, Re Z is -.* N s/m at .* Hz"):
         Impedance(*twice)
-    # its least real part is -g/8, at w = sqrt(3)/tau: that much damping beside it is just enough
+    # The least real part is -g/8, at w = sqrt(3)/tau, so a damping of g/8 is just enough.
     assert Impedance(*twice[:3], [[3.0 / 8]]).order == 2
     with pytest.raises(ValueError, match=r"at 5\.\d* Hz"):
         Impedance(*twice[:3], [[0.999 * 3.0 / 8]])
 
 
 def test_a_lossless_impedance_is_no_rounding_victim():
-    """A resonance of 30 rad/s that hardly decays: Re Z is zero but for rounding at most frequencies."""
+    """Re Z of a lightly damped resonance at 30 rad/s is nearly zero at most frequencies."""
     assert Impedance([[-1e-3, -30.0], [30.0, -1e-3]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]]).order == 2
 
 
@@ -113,7 +113,7 @@ def test_what_is_no_passive_impedance_is_refused(parts, message):
 
 
 def test_a_spring_inside_the_matrices_is_split_off():
-    """k/s + b + g/(1 + tau s) in coordinates that hide it, against the sum written out."""
+    """The hand k/s + b + g/(1 + tau s) is given in coordinates that hide the spring k."""
     k, b, g, tau, mass = 250.0, 4.0, 12.0, 0.05, 0.3
     T = np.array([[1.0, 2.0], [-1.5, 0.5]])
     A, B, C = np.diag([0.0, -1 / tau]), np.array([[1.0], [g / tau]]), np.array([[k, 1.0]])
@@ -127,7 +127,7 @@ def test_a_spring_inside_the_matrices_is_split_off():
 
 
 def test_a_pure_spring_and_damper_is_a_link():
-    """A = 0 of any scale is one spring; nothing is left of the impedance but its damping."""
+    """A = 0 is one spring at any scale of B and C, and an empty A is none; only damping remains."""
     for A, link in (([[0.0]], Link(0.3, 4.0, 250.0)), (np.zeros((0, 0)), Link(0.3, 4.0, 0.0))):
         n = len(A)
         port = state_space(A, np.full((n, 1), 50.0), np.full((1, n), 5.0), 4.0, 0.3)
@@ -151,7 +151,7 @@ def test_no_negative_spring_is_split_off(parts, message):
 
 
 def hill(elastic=400.0, damping=9.0, tissue=0.004, parallel=150.0, mass=0.25):
-    """A muscle after Hill: a series elastic part, the contractile part's damping, a parallel spring, and masses."""
+    """Return Hill's muscle: a series elastic part, the contractile part's damping, a parallel spring, and masses."""
     across = [[-1, 1, 0], [0, -1, 1], [-1, 0, 1]]
     return Port([mass, tissue], across, [0.0, damping, 0.5], [elastic, 0.0, parallel], pull=1)
 
@@ -163,7 +163,7 @@ def test_a_port_is_its_matrices():
     D = np.array([[0.9 + 0.5, 0], [0, 9.0]])
     M = np.diag([0.2 + 0.25, 0.004])
     np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
-    # the voluntary force contracts the contractile part: it pulls the tissue towards the base
+    # The voluntary force shortens the contractile part: it pulls the tissue towards the base.
     scene = build([d], [Own(port)])
     np.testing.assert_allclose(M @ got.B[2:, scene.pushed[0]], [0, 1], atol=1e-12)
 
@@ -179,7 +179,7 @@ def test_a_lever_moves_what_it_should():
 
 
 def test_bodies_and_state_space_agree():
-    """The muscle's own coordinates as states: tension's length e and the tissue's speed u, e' = v - u."""
+    """The states are the elastic part's length e and the tissue's speed u, with e' = v - u."""
     tissue, elastic, damping = 0.004, 400.0, 9.0
     A = [[0.0, -1.0], [elastic / tissue, -damping / tissue]]
     port = state_space(A, [[1.0], [0.0]], [[elastic, 0.0]], 0.0)
@@ -202,7 +202,7 @@ MJCF = """<mujoco><worldbody>
 
 
 def test_mjcf_hands_equal_their_chain():
-    """The arm carries the wrist, on whose far side is the handle; the ring is welded to it."""
+    """The wrist joint connects the handle to the arm; the ring is welded to the handle."""
     port = from_mjcf(MJCF, pull="shoulder")
     chain = Human((Link(0.15, 5.0, 800.0), Link(1.2, 8.0, 150.0)))
     for w in np.geomspace(0.1, 300, 8):
@@ -235,7 +235,7 @@ def test_mjcf_that_is_no_passive_network_is_refused(was, now, message):
 
 
 def test_a_persons_arms_may_differ():
-    """Against the nodal equations of the hands and the body, with an arm that lags and a cross spring."""
+    """The plant obeys the nodal equations of hands and body, with one lagging arm and a cross spring."""
     g, tau, person = 12.0, 0.05, Person((1, 2), 3.0, 20.0, 700.0, Cross(1.0, 40.0))
     lags, link = state_space([[-1 / tau]], [[g / tau]], [[1.0]], 0.5, mass=0.25), Link(0.3, 3.0, 200.0)
     scene = build([DEVICE] * 2, [Own(lags), Human((link,))], [person])
@@ -266,7 +266,7 @@ def test_crowds_stack_each_hands_matrices():
     together = variants(devices, HumanSets(tuple(sets))).plants()
     for i, hands in enumerate(sets):
         alone = plant(build(devices, hands).model)
-        # one is divided by masses, the other multiplied by their inverse
+        # One plant divides by the masses, the other multiplies by their inverses.
         np.testing.assert_allclose(together.A[i], alone.A, rtol=1e-14)
         np.testing.assert_allclose(together.B[i], alone.B, rtol=1e-14)
 
@@ -301,7 +301,7 @@ def test_ports_that_cannot_be_are_refused(call, message):
 
 @pytest.mark.parametrize(("d", "b"), [(2.0, 1.5), (2.0, 2.0), (1.0, 1.5)])
 def test_dead_times_take_their_pade_form(d, b):
-    """d + b (1 - s tau/2)/(1 + s tau/2), of exp(-s tau) the same to (w tau)^3/12: passive just where d >= b."""
+    """d + b (1 - s tau/2)/(1 + s tau/2) equals d + b exp(-s tau) to b (w tau)^3/12; it is passive if d >= b."""
     tau = 0.05
     parts = [[-2 / tau]], [[1.0]], [[4 * b / tau]], d - b
     if d < b:

@@ -1,4 +1,4 @@
-"""The scene: the matrices read from MuJoCo are the physics, and the physics is passive."""
+"""Matrices that are read from MuJoCo equal the equations of motion, and are passive."""
 
 import mujoco
 import numpy as np
@@ -22,7 +22,7 @@ def test_compliant_device_is_a_two_mass_oscillator():
     D = np.array([[d.damping + c, -c], [-c, c + h.damping]])
     np.testing.assert_allclose(got.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-12)
     np.testing.assert_allclose(got.A[2:, 2:], -np.linalg.solve(M, D), rtol=1e-12)
-    # the device feels -f; the outside force acts on the handle
+    # The device feels -f; the external force acts on the handle.
     np.testing.assert_allclose(got.B[2:], [[0, -1 / d.motor_mass], [1 / (d.handle_mass + h.mass), 0]], rtol=1e-12)
     np.testing.assert_array_equal(got.C, [[1, 0, 0, 0]])
 
@@ -64,7 +64,7 @@ TWO_HANDS = Person((1, 2), 20.0, 15.0, 900.0, Cross(2.0, 60.0))
 
 
 def test_a_person_is_two_arms_on_one_body():
-    """Against the matrices written out by hand: rigid devices, an arm of one link and one of two."""
+    """The plant equals matrices written by hand, for rigid devices and arms of one and two links."""
     d, (one,), (near, far), p = RigidDevice(), HAND.links, ARM.links, TWO_HANDS
     scene = build([d, d], [HAND, ARM], [p])
     got = plant(scene.model)
@@ -72,7 +72,7 @@ def test_a_person_is_two_arms_on_one_body():
     M = np.diag([d.mass + one.mass, d.mass + near.mass, far.mass, p.mass])
 
     def springs(a, b, c, body, cross):
-        """a: hand 1 to body, b: hand 2 to its arm, c: arm to body."""
+        """Return the stiffness matrix; a joins hand 1 and body, b joins hand 2 and arm 2, c joins arm 2 and body."""
         return np.array(
             [
                 [a + cross, -cross, 0, -a],
@@ -85,7 +85,7 @@ def test_a_person_is_two_arms_on_one_body():
     K = springs(one.stiffness, near.stiffness, far.stiffness, p.stiffness, p.cross.stiffness)
     D = springs(one.damping, near.damping, far.damping, p.damping, p.cross.damping) + np.diag([d.damping] * 2 + [0, 0])
     np.testing.assert_allclose(got.A[4:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
-    # a muscle pulls the hand and pushes the body; taps reach the hands
+    # A muscle acts between an arm's last link and the body; taps act on the hands.
     pushed = M @ got.B[4:][:, list(scene.pushed)]
     np.testing.assert_allclose(pushed, [[1, 0], [0, 0], [0, 1], [-1, -1]], atol=1e-12)
     tapped = M @ got.B[4:][:, list(scene.tapped)]
@@ -96,17 +96,17 @@ def test_a_heavy_body_acts_as_ground():
     separate = plant(build([CompliantDevice()] * 2, [HAND, ARM]).model).A
     held = plant(build([CompliantDevice()] * 2, [HAND, ARM], [Person((1, 2), 1e3, 1e6, 1e9)]).model).A
     n = separate.shape[0] // 2
-    rows = [*range(n), *range(n + 1, 2 * n + 1)]  # without the body, the last joint
+    rows = [*range(n), *range(n + 1, 2 * n + 1)]  # all joints but the last, the body's
     np.testing.assert_array_equal(held[np.ix_(rows, rows)], separate)
     body = [n, 2 * n + 1]
-    # the arms' springs and dampers over the body's mass are all that moves it
+    # Of the other joints, only the arms' springs and dampers act on the body.
     assert np.abs(held[2 * n + 1, rows]).max() == HAND.links[0].stiffness / 1e3
     assert held[2 * n + 1, body[0]] == pytest.approx(-1e9 / 1e3, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_person_in_both_hands_is_passive(seed):
-    """Hermitian part of the impedance matrix at the handles: never negative; without damping it is zero."""
+    """The Hermitian part of the impedance at the handles is positive, or zero without damping."""
     rng = np.random.default_rng(seed)
     humans = Population(links=int(rng.integers(1, 3))).draw(rng, 2)
     mass, damping, stiffness, cd, ck = np.exp(rng.uniform(-2, 4, 5))
@@ -122,7 +122,7 @@ def test_a_person_in_both_hands_is_passive(seed):
             velocity = np.linalg.solve(1j * w * np.eye(2 * n) - linear.A, -linear.B[:, -2:])[n : n + 2]
             impedance = np.linalg.inv(velocity)
             hermitian = np.linalg.eigvalsh(impedance + impedance.conj().T) / 2
-            # the rounding of the inverses, beside the impedance itself
+            # rounding of the inverses, relative to the impedance
             noise = 1e-9 * np.abs(impedance).max()
             assert (hermitian > noise).all() if lost else np.abs(hermitian).max() < noise
 
@@ -160,7 +160,7 @@ def test_without_input_the_energy_never_increases(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_motor_port_dissipates_its_damping(seed):
-    """Re Z >= damping at every frequency, whoever holds the handle: the OSP level of the compliant device."""
+    """Re Z is at least the damping at every frequency, whoever holds the handle of the compliant device."""
     human = Population(links=2).draw(np.random.default_rng(seed), 1)
     linear = plant(build([CompliantDevice()], human).model)
     n = linear.A.shape[0] // 2
@@ -189,7 +189,7 @@ def test_population_is_log_uniform_and_reproducible():
     low, high = np.log([0.01, 3.0])
     assert low <= masses.min()
     assert masses.max() <= high
-    # mean and spread of a uniform distribution, five standard errors
+    # mean and spread of a uniform distribution, to five and four standard errors
     assert abs(masses.mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * 4000)
     assert abs(masses.std() - (high - low) / np.sqrt(12)) < 0.05
 
@@ -232,7 +232,7 @@ def test_impossible_bodies_cannot_be_built(call, message):
 
 @pytest.mark.parametrize(("name", "device"), [("compliant", CompliantDevice()), ("rigid", RigidDevice())])
 def test_device_files_equal_their_assembled_scene(name, device):
-    """What a viewer opens has the matrices, the limit and the names of one device with an everyday hand."""
+    """A device's MJCF file has the matrices, the limit and the names of the device with a usual hand."""
     drawn = mujoco.MjModel.from_xml_path(str(_FILES / f"{name}.xml"))
     assembled = build([device], [Human((Link(0.3, 3.0, 200.0),))])
     ours, theirs = plant(assembled.model), plant(drawn)

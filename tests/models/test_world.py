@@ -1,4 +1,4 @@
-"""MuJoCo scenes as environments: the step at the contacts, the lemma, linear scenes, and what is refused."""
+"""MuJoCo scenes obey the step of models.world and the lemma of docs/theory.md, equal linear models, or are refused."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ LINE = f"""<mujoco><option gravity="0 0 0"/><worldbody>
 </worldbody><tendon>
 <spatial stiffness="800" damping="1"><site site="l"/><site site="b"/></spatial>
 <spatial stiffness="700" damping="2"><site site="b"/><site site="r"/></spatial></tendon></mujoco>"""
-#: the same network; a contact weighs 30 g, as the program makes it
+#: the network of LINE, with the mass of 30 g that the program gives each contact
 NETWORK = Network(
     ("left", "right"),
     (Spring(("left", "block"), 800.0, 1.0), Spring(("block", "right"), 700.0, 2.0)),
@@ -50,9 +50,9 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_linear_scene_is_the_network(tmp_path, coupling):
-    """Three seconds behind a coupling: the forces of our own network, and u = x - V f.
+    """Behind a coupling the scene sends the network's forces for three seconds, and u = x - V f.
 
-    Tendon springs are longer by 1e-12, 8e-11 N; rounding of lengths of 0.1 m adds 1e-14 N a tick.
+    Tendon springs are 1e-12 of 0.1 m longer, which is 8e-11 N; rounding of the lengths adds 1e-14 N a tick.
     """
     V = coupling.compliance(T)
     port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
@@ -68,7 +68,7 @@ def test_a_linear_scene_is_the_network(tmp_path, coupling):
 
 
 def test_limited_forces_are_felt_by_the_scene(tmp_path):
-    """Free contacts: v+ = v + h f/m with f = G (u0 - u), or the limit where that is more."""
+    """Free contacts obey v+ = v + h f/m, where f = G (u0 - u) is clipped at its limit."""
     text = f'<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody></mujoco>'
     port, limit = world(tmp_path, text).port([3.0, 5.0]), np.array([3.0, 5.0])
     v, u, hit = np.zeros(2), np.zeros(2), np.zeros(2, int)
@@ -89,7 +89,7 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
 
 @pytest.mark.parametrize("radial", [True, False])
 def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
-    """m (v+ - v)/h is the force that was given, and that one is G (u0 - u) within a ball or a box."""
+    """m (v+ - v)/h equals the force, which is G (u0 - u) limited to a ball or a box."""
     text = f'<mujoco><worldbody><body name="tip">{FREE}</body><body name="one">{FREE}</body></worldbody></mujoco>'
     path = tmp_path / "scene.xml"
     path.write_text(text)
@@ -140,7 +140,7 @@ def test_a_slow_scene_stands_still_between_its_steps(tmp_path):
 
 
 def test_two_axes_take_a_full_spring_matrix(tmp_path):
-    """G = Q diag Q': a free contact obeys m (v+ - v)/h = G (u0 - u) in both directions."""
+    """With a full matrix G a free contact obeys m (v+ - v)/h = G (u0 - u) in both directions."""
     text = f'<mujoco><worldbody><body name="tip" euler="20 30 40">{FREE}</body></worldbody></mujoco>'
     G = np.array([[900.0, 300.0], [300.0, 400.0]])
     port = world(tmp_path, text, ["tip"], [G], along=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))).port()
@@ -199,7 +199,7 @@ def scene_of_the_lemma(condim, impratio, d, solref, friction) -> str:
 
 
 def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
-    """Push two contacts at random for so many ticks; compare every constraint of every tick with its bound."""
+    """Push two contacts at random, check each constraint of each tick against its bound, and return their number."""
     along = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     G = ([[800.0, 100.0], [100.0, 300.0]], [[700.0, 0.0], [0.0, 500.0]])
     port = world(folder, scene_of_the_lemma(*scene), G=G, along=along).port()
@@ -213,7 +213,7 @@ def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
             continue
         rows = Rows.of(port.world.model, data)
         excess, bound = rows.excess(T), rows.bound(T)
-        assert (excess <= bound + 1e-15).all()  # of terms up to 1 J
+        assert (excess <= bound + 1e-15).all()  # rounding of terms up to 1 J
         created += np.maximum(excess, 0.0).sum()
         count += len(excess)
     assert port.created == pytest.approx(created, rel=1e-9)
@@ -223,12 +223,12 @@ def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_contact_creates_no_more_than_the_lemma(tmp_path, scene):
-    """`python -m tests.models.test_world` counts 120,000 and more of them."""
+    """`python -m tests.models.test_world` checks more than 120,000 constraints."""
     assert count_of_the_lemma(tmp_path, scene, 600) > 1000
 
 
 def test_friction_loss_takes_more_than_it_creates(tmp_path):
-    """Two contacts push a body with 2 N of friction loss to and fro: the port never gives."""
+    """Two contacts push a body with 2 N of friction loss to and fro; the port never delivers energy."""
     loss = '<joint type="slide" axis="1 0 0" frictionloss="2"/>'
     tips = "".join(
         f'<body name="{n}" pos="{x} 0 0"><geom size="0.01"/></body>' for n, x in (("left", -4e-2), ("right", 4e-2))
@@ -247,7 +247,7 @@ def test_friction_loss_takes_more_than_it_creates(tmp_path):
 
 @pytest.mark.parametrize("scene", SCENES[:5])
 def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
-    """f = -D ((w+ - w)/h + b w+ + K (r + h w+)) wherever a one-sided row presses and no cone cuts it."""
+    """A one-sided row that presses has f = -D ((w+ - w)/h + b w+ + K (r + h w+)); no row is in a friction cone."""
     port = world(tmp_path, scene_of_the_lemma(1, *scene[1:])).port()
     pressed = 0
     for k in range(300):
@@ -267,7 +267,7 @@ def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
 
 
 def test_linear_scenes_linearise_to_their_network(tmp_path):
-    """From 0.1 to 100 Hz, relative to the largest E: rounding of positions over the step of the differences."""
+    """E(z) agrees from 0.1 to 100 Hz to 1e-12 of its largest value, for two steps of the differences."""
     scene, z = world(tmp_path, LINE), np.exp(2j * np.pi * np.geomspace(0.1, 100, 60) * T)
     E = environment_by_hand(NETWORK, z, T)
     for step in (1e-4, 1e-2):
@@ -276,7 +276,7 @@ def test_linear_scenes_linearise_to_their_network(tmp_path):
 
 
 def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
-    """mjd_transitionFD of the same step, without the springs G, at a pose in contact."""
+    """`linear` equals mjd_transitionFD of the same step without the springs G, at a pose in contact."""
     scene = world(tmp_path, scene_of_the_lemma(1, 1, 0.9, "0.01 1", None))
     pose = scene.model.qpos0.copy()
     pose[-1] = -2e-4
@@ -287,7 +287,7 @@ def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
     n = 2 * model.nv
     theirs = np.zeros((n, n))
     mujoco.mjd_transitionFD(model, data, 1e-7, True, theirs, None, None, None)
-    unit = np.repeat([1.0, T], model.nv)  # ours is over (q, h v)
+    unit = np.repeat([1.0, T], model.nv)  # our states are (q, h v)
     assert np.abs(A - unit[:, None] * theirs / unit).max() < 1e-7  # rounding of 0.1 m over differences of 1e-7
     assert B.shape == (n, 2)
 
@@ -328,7 +328,7 @@ def test_a_lifted_contact_releases_nothing(tmp_path, gravity):
 
 @pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'inertiafromgeom="auto"', 'fusestatic="true"'])
 def test_masses_are_those_of_the_scene(tmp_path, compiler):
-    """Also where MuJoCo takes them from geoms although a body names another mass; contacts weigh 30 g."""
+    """Masses equal MuJoCo's, even if MuJoCo takes them from geoms instead of the inertial; contacts weigh 30 g."""
     load = '<inertial pos="0 0 0" mass="5" diaginertia="1 1 1"/><geom name="load" size="0.01" mass="0.2"/>'
     text = with_body(f'<body name="left">{FREE}</body><body name="load"><joint type="slide"/>{load}</body>')
     text = text.replace("<worldbody>", f"<compiler {compiler}/><worldbody>")
@@ -440,7 +440,7 @@ def test_the_digest_covers_what_a_scene_includes(tmp_path):
 
 
 def test_the_digest_covers_every_mesh_that_mujoco_reads(tmp_path):
-    """A mesh beside a file of the same name, a mesh whose path is stripped, and the files of an attached model."""
+    """The files include a mesh with a namesake, a mesh whose path is stripped, and those of an attached model."""
     for name in ("a.obj", "meshes/a.obj", "part/meshes/b.obj", "part/c.xml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("<mujocoinclude/>")
@@ -497,7 +497,7 @@ def test_an_active_scene_is_listed(tmp_path):
 
 
 def test_bodies_are_counted_by_how_they_move(tmp_path):
-    """What slides on a body that turns, turns; slides of one body count once, and contacts not at all."""
+    """A body that slides on a turning body counts as turning; several slides count once, contacts never."""
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 0 1"))
     box, mass = '<geom size="0.01"/>', '<geom size="0.01" mass="1"/>'
     arm = f'<body><joint axis="0 1 0"/>{mass}<body>{slides}{mass}</body></body>'
@@ -514,7 +514,7 @@ if __name__ == "__main__":
 
 
 def test_compensation_by_actuators_releases_nothing_itself(tmp_path):
-    """A motor that carries a weight may be limited: raising the body stores m g z, whatever it asks for."""
+    """Raising a body stores m g z even if a motor compensates its weight, since the motor may be limited."""
     text = f"""<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body>
 <body name="lift" gravcomp="100"><joint name="up" type="slide" axis="0 0 1" actuatorgravcomp="true"
 actuatorfrcrange="-.01 .01"/><geom type="box" size="0.01 0.01 0.01" mass="0.3"/></body></worldbody></mujoco>"""

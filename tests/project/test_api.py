@@ -66,7 +66,7 @@ def test_help_and_completion_show_the_api():
 
 
 def test_the_options_are_those_that_the_designs_take():
-    """One table, the types of the arguments, and the designs' own signatures say the same."""
+    """The options in KINDS are those of DesignOptions and of the designs' signatures."""
     from haptic_loop.design import fixed_order as ccl
     from haptic_loop.design import optimal, spring_damper
 
@@ -107,7 +107,7 @@ def test_a_session_is_rehearsed():
     assert 0.364 - 1e-9 <= session.zero_after <= 0.52  # a ramp of 100 to 250 ms, then 132 ms for each motor
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
-    assert force[-1] <= 0.5 + 1e-9  # N, of the last test; the coupling's own forces have ended
+    assert force[-1] <= 0.5 + 1e-9  # [N] of the last test, after the coupling's forces have ended
     given = rehearse(scenario, SOFT, seconds=0.5)
     assert given.coupling is SOFT
     assert given.assessment.requirements["this-environment"].certified
@@ -122,7 +122,7 @@ def test_a_session_that_is_refused_says_why():
 
 @pytest.mark.slow
 def test_a_rehearsal_at_its_force_limit_is_stopped():
-    """As by the command: forces that were cut for most of a second are not the requested forces."""
+    """A session does not count as finished if more than half of its forces were cut in some second."""
     weak = tuple(replace(device, force_limit=0.03) for device in load().device)
     session = rehearse(load().replace(T=1e-3, theta=(1, 1), device=weak), seconds=1.5)
     assert session.stage == "stopped"
@@ -305,7 +305,7 @@ def test_a_stored_design_runs_as_the_design(tmp_path):
 
 
 def test_a_trace_converts_to_pandas(monkeypatch):
-    """With a stand-in that keeps what it is given, since pandas is no dependency."""
+    """A stand-in that returns its arguments replaces pandas, which is no dependency."""
     stand_in = SimpleNamespace(DataFrame=lambda columns, index: (columns, index), Index=lambda t, name: (t, name))
     monkeypatch.setitem(sys.modules, "pandas", stand_in)
     trace = simulate(SHORT)
@@ -356,7 +356,7 @@ def test_numbers_of_numpy_are_numbers():
 
 
 def test_help_and_refused_options_load_no_large_library():
-    """Each of these takes a twentieth of a second to one, in which no answer needs it."""
+    """Importing one of these libraries takes 0.05 to 1 s, and neither help nor a refusal needs it."""
     code = """
 import contextlib, io, sys
 from haptic_loop.cli.main import COMMANDS, _command
@@ -374,7 +374,7 @@ print(sorted({name.partition(".")[0] for name in sys.modules} & set(sys.argv[1:]
 
 
 def test_a_grounded_inerter_is_a_mass():
-    """The same needs, proved."""
+    """Both networks require the same damping, and it is proved."""
     loop = load("omega-pair").loop("I")
     own = (*loop.network.springs, Spring(("mass", "ground"), 1.0, inertance=0.25))
     same = (*loop.network.springs, Spring(("mass", "ground"), 1.0))

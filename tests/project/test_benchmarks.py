@@ -1,4 +1,4 @@
-"""The published loops: the table says what the loops give, and NumPy alone finds the same."""
+"""The table of the published loops equals recomputed figures, and NumPy alone reproduces its requirements."""
 
 import math
 import re
@@ -30,7 +30,7 @@ def test_the_table_has_the_figures_of_the_loop(path):
     for name, value in cheap(path).items():
         published = ROWS[path.stem][name]
         assert (published == "") == (written(value) == ""), name
-        if value is not None and math.isfinite(value):  # eigenvalues of a slow mode lose digits, sweeps 1e-7
+        if value is not None and math.isfinite(value):  # slow eigenvalues lose digits, sweeps differ by 1e-7
             assert float(published) == pytest.approx(value, rel=1e-4), name
 
 
@@ -46,7 +46,7 @@ def test_no_certified_coupling_beats_the_bound():
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.validate)])
 def test_numpy_alone_finds_the_published_requirements(every):
-    """One row in four, and in `make validate` all."""
+    """`make suite` checks one row in four, `make validate` checks all."""
     checker, compared = runpy.run_path(ROOT / "check.py"), 0
     for loop, row in list(ROWS.items())[::every]:
         for column in ("reference_this_environment", "reference_any_environment"):
@@ -61,7 +61,7 @@ def test_numpy_alone_finds_the_published_requirements(every):
 
 @pytest.mark.parametrize("name", ["o01-wall-light-device", "o02-soft-wall"])
 def test_growth_without_coupling_is_that_of_the_body(name):
-    """One body of device and hand before a spring with a damper, by the exponential of its own matrix."""
+    """Device and hand are one body at a spring-damper, discretised by the matrix exponential."""
     loop = tomllib.loads((ROOT / "loops" / f"{name}.toml").read_text())
     T, (theta,), (device,), (human,) = loop["T"], loop["theta"], loop["device"], loop["human"]
     (link,), (spring,) = human["links"], loop["environment"]["springs"]

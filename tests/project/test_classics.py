@@ -1,4 +1,4 @@
-"""The laws of the classics in examples/classics.py, and the example's figures."""
+"""The classics in examples/classics.py obey their published laws, and docs/energy-budget.md has their figures."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_the_passivity_controller_returns_what_its_observer_misses():
 
 
 def test_the_passivity_controller_is_the_published_one():
-    """The series controller in velocities: W += f v + alpha_- v_-^2, alpha = -W/v^2 where W < 0, force f + alpha v."""
+    """It sends f + alpha v, with W += f v + alpha_- v_-^2, and alpha = -W/v^2 if W < 0, otherwise 0."""
     rng, control = np.random.default_rng(17), PassivityControl(1, T)
     W = alpha = before = acted = 0.0
     for _ in range(500):
@@ -72,6 +72,6 @@ def test_energy_bounding_sends_what_its_law_says():
     ],
 )
 def test_the_figures_of_the_classics(name, figures):
-    """Last digits as printed in docs/energy-budget.md."""
+    """The figures have the digits that docs/energy-budget.md prints."""
     digits = (2, 3, 1, 0, 0, 3)
     assert tuple(round(value, n) for value, n in zip(row(ROWS[name]), digits, strict=True)) == pytest.approx(figures)

@@ -1,4 +1,4 @@
-"""What README and docs say can be done is done: commands and snippets run, output shown is real, files named exist."""
+"""Commands and snippets of README and docs run, the output that pages show is real, and linked files exist."""
 
 import contextlib
 import importlib.util
@@ -27,7 +27,7 @@ SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
-#: within a sentence; those of other modules need a port, a display or minutes
+#: designs that are named in sentences; commands of other modules need a port, a display or minutes
 IN_TEXT = sorted(
     {
         c
@@ -39,13 +39,13 @@ IN_TEXT = sorted(
 
 
 def of_page(page, *values, name):
-    """A parameter set; `make test` runs that of the README, and `make suite` those of all pages, a minute."""
+    """Return a parameter set; `make test` runs those of the README, and `make suite` those of all pages."""
     return pytest.param(*values, id=name, marks=() if page in ("README.md", ROOT / "README.md") else pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """One folder for all, since some commands use what others have written; with the files that pages give."""
+    """Return one folder for all commands, since some read what others write, with the files that pages give."""
     folder = tmp_path_factory.mktemp("docs")
     for step in (s for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "file"):
         assert not (folder / step.name).exists(), f"two pages give a file {step.name}"
@@ -55,13 +55,13 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def printed():
-    """What each command wrote to standard output."""
+    """Return a dict for the standard output of each command."""
     return {}
 
 
 @pytest.mark.parametrize("command", [of_page(COMMANDS[command], command, name=command) for command in IN_ORDER])
 def test_every_command_runs(command, place, printed):
-    """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
+    """The exit code is 0 or 1 (the result holds or does not), and there is no traceback."""
     done = run(command, place)
     assert done.returncode in (0, 1), f"{COMMANDS[command]}: {done.stderr}"
     assert "Traceback" not in done.stderr
@@ -72,7 +72,7 @@ def test_every_command_runs(command, place, printed):
     ("page", "command", "pattern", "shown"), [of_page(block[0], *block, name=block[1]) for block in QUICK]
 )
 def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
-    """`python tests/tools/regenerate.py` writes it anew."""
+    """`python tests/tools/regenerate.py` writes the output anew."""
     output = printed.get(command) or run(command, place).stdout
     fresh = regenerate.kept(output, pattern).splitlines()
     assert shown.splitlines()
@@ -82,7 +82,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 @pytest.mark.slow
 def test_designs_named_in_sentences_exist(place):
-    """No page has one at times."""
+    """IN_TEXT may be empty, since no page need name a design in a sentence."""
     for command in IN_TEXT:
         done = run(command, place)
         assert done.returncode == 0, f"{command}: {done.stderr}"
@@ -90,7 +90,7 @@ def test_designs_named_in_sentences_exist(place):
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
 def test_measured_output_is_of_a_command_that_exists(page, command, pattern, shown):
-    """Minutes, and times: not run here, `python tests/tools/regenerate.py --check` compares all but times."""
+    """These commands take minutes: `python tests/tools/regenerate.py --check` runs them and compares all but times."""
     module = command.split()[2]
     assert importlib.util.find_spec(module) is not None
     assert shown
@@ -99,7 +99,7 @@ def test_measured_output_is_of_a_command_that_exists(page, command, pattern, sho
 
 @pytest.mark.parametrize("page", [of_page(page, page, name=page.name) for page in PAGES if SNIPPETS[page]])
 def test_every_snippet_runs(page, place, monkeypatch):
-    """All Python blocks of a page, in order, in one namespace."""
+    """The Python blocks of a page run in order, in one namespace."""
     monkeypatch.chdir(place)
     monkeypatch.syspath_prepend(place)
     namespace = {"__name__": "snippet"}
@@ -151,7 +151,7 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
 def test_page_blocks_do_not_overlap(page):
     fences = re.findall(r"^.*```.*$", TEXTS[page], re.MULTILINE)
     assert len(fences) % 2 == 0
-    assert set(fences[1::2]) <= {"```"}, "a block's end is lost, and with it what follows"
+    assert set(fences[1::2]) <= {"```"}, "a code block has no end"
     assert all(fence.startswith("```") for fence in fences)
     asked = re.findall(r"^<!-- (?:output|measured)\b", TEXTS[page], re.MULTILINE)
     assert len(asked) == sum(block[0] == page for block in SHOWN + MEASURED)

@@ -17,7 +17,7 @@ DOCS = ("theory.md", "reproducibility.md")
 
 
 def defined_in(name: str) -> set[str]:
-    """Names of the test functions that the files of this name define, without importing them."""
+    """Return the names of the test functions that the files of this name define, without importing them."""
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "tests").rglob(name)]
     nodes = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef)]
     return {node.name for node in nodes if node.name.startswith("test_")}
@@ -44,7 +44,7 @@ def test_reproducibility_rows_name_their_evidence():
 
 
 def test_documented_commands_leave_the_repository_clean():
-    """What they write into the folder that they are run in is ignored by git."""
+    """Git ignores the files that these commands write into the repository."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git, or no clone")
     texts = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))]

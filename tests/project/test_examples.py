@@ -1,4 +1,4 @@
-"""The examples run as a newcomer would run them, and say what they should."""
+"""The examples run as a newcomer would run them, and print the expected lines."""
 
 import re
 from pathlib import Path
@@ -7,12 +7,12 @@ import pytest
 from forked import run
 
 ROOT = Path(__file__).parents[2]
-#: examples of more than two seconds
+#: examples that take more than two seconds
 SLOW = ("limits_of_any_coupling", "unstable_and_certified", "your_own_device", "mujoco_two_fingers", "wheel")
 SLOW += ("first_steps", "neural_environment", "compare_couplings")
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "classics")  # test_classics.py runs its rows
 
-#: what each must print; figures are those that docs and other tests have
+#: patterns that each example must print; docs and other tests have the same figures
 SAYS = {
     "audit": ["this-environment: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
     "compare_couplings": [
@@ -56,7 +56,7 @@ SAYS = {
 }
 
 
-#: what people look for: under 60 lines, and a picture
+#: examples that users search for; each has under 60 lines and saves a picture
 SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall", "wheel")
 
 ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}

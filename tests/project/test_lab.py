@@ -1,4 +1,4 @@
-"""Two unlike devices, from a scenario to C code, without a refusal on the way."""
+"""The commands lead from a scenario with two unlike devices to C code without a refusal."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def go(command: str, *words: str, holds: bool = True) -> None:
 @pytest.mark.slow
 def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # the first basis is as good for this
+    monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # the smallest basis suffices here
     lab = ("--scenario", LAB)
     go("run", *lab, "--duration", "1", "--no-plot", "--out", "run")
     report = json.loads(Path("run/report.json").read_text())

@@ -1,4 +1,4 @@
-"""Who may import whom, without circles of files or of folders, and which package lives where."""
+"""Imports between folders go one way, without circles, and each large package is imported in a few files only."""
 
 import ast
 import tomllib
@@ -16,7 +16,7 @@ from haptic_loop.models.device import CompliantDevice
 ROOT = Path(__file__).parents[2]
 WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
 
-#: arrows of the architecture: a package may import itself and these
+#: A folder may import itself and these folders.
 MAY_IMPORT = {
     "models": {"controller"},  # linear systems, the bound of their real part, and the bounds of devices
     "controller": set(),
@@ -28,9 +28,9 @@ MAY_IMPORT = {
 
 #: the only files that may import a package
 HOMES = {
-    # the view only shows what runs without it: shapes and arrows, the window, pictures without a window
+    # sim/view/ draws shapes and arrows, in a window or in pictures without a window
     "mujoco": {"models/scene.py", "models/world.py", "sim/engines.py", "sim/view/"},
-    "cvxpy": {"design/lmi.py"},  # the lemmas, for who gives expressions
+    "cvxpy": {"design/lmi.py"},  # the paper's lemmas as cvxpy expressions
     "clarabel": {"design/cone.py"},
     "serial": {"hw/transport.py"},
     "matplotlib": {"sim/map_plot.py", "sim/plots.py", "cli/render.py"},  # the latter only shortens its import
@@ -41,7 +41,7 @@ FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"
 
 
 def is_door(node: ast.stmt) -> bool:
-    """The `if __name__ == "__main__":` tail of a file: what it imports is no arrow."""
+    """Return whether a statement is the `if __name__ == "__main__":` tail of a file, whose imports do not count."""
     return isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
 
 
@@ -50,13 +50,13 @@ def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-#: conditions are asked what they say; only their homes know their names
+#: names of conditions, with which only the files AT_HOME may compare
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
 AT_HOME = ("design/conditions", "design/environments", "design/result")
 
 
 def test_no_code_asks_for_a_conditions_name():
-    """A condition of a user's own works in every command, since none of them decides by a name."""
+    """A user's own condition works in every command, since no code decides by a condition's name."""
     asking = []
     for path in FILES:
         place = path.relative_to(ROOT).as_posix().removesuffix(".py")
@@ -70,7 +70,7 @@ def test_no_code_asks_for_a_conditions_name():
 
 @cache
 def imported(path: Path) -> set[str]:
-    """Every module that a file imports, at its head, later or by a string; names of modules in full."""
+    """Return the full names of all modules that a file imports, at its head, later or by a string."""
     names = set()
     for top in _tree(path).body:
         for node in () if is_door(top) else ast.walk(top):
@@ -114,7 +114,7 @@ def test_packages_live_where_they_belong(path):
 
 
 def circle(arrows: dict[str, set[str]]) -> list[str] | None:
-    """A circle of arrows, or None."""
+    """Return a circle of arrows, or None."""
     done, way = set(), []
 
     def visit(node: str) -> list[str] | None:
@@ -137,7 +137,7 @@ def between_files() -> dict[str, set[str]]:
     arrows = {}
     for path in FILES:
         targets = {file_of(name) for name in imported(path) if name.split(".")[0] in WORLDS} - {None, path}
-        # the front of a package names its functions for type checkers only
+        # a package's __init__.py has only a docstring, or imports for type checkers only
         arrows[str(path.relative_to(ROOT))] = {str(t.relative_to(ROOT)) for t in targets if t.name != "__init__.py"}
     return {name: after for name, after in arrows.items() if not name.endswith("__init__.py")}
 
@@ -180,7 +180,7 @@ def test_replaced_fields_exist():
 
 
 def test_installed_versions_satisfy_the_lower_bounds():
-    """`make oldest` finds the least version of each package, and every requirement admits that of constraints.txt."""
+    """`floors` gives a least version for each dependency; each requirement admits the version in constraints.txt."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     named = [Requirement(one) for one in [*project["dependencies"], *project["optional-dependencies"]["dev"]]]
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]

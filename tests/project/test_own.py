@@ -1,4 +1,4 @@
-"""Classes of a user's own, in one file outside of the repository, through the commands."""
+"""The commands accept a user's own classes from a file outside of the repository."""
 
 import json
 
@@ -109,7 +109,7 @@ def place(tmp_path_factory):
     ("name", "covered"), [pytest.param("hard", "any-environment", marks=pytest.mark.slow), ("gel", "this-environment")]
 )
 def test_an_own_environment_is_proved_and_stored(name, covered, place):
-    """The proof is repeated from the file alone, which asks for no class."""
+    """`design.check` repeats the proof from the JSON file alone, without the user's class."""
     words = f"--environment mine.py:{name} --condition {covered} --out {name}.json"
     done = run(f"python -m design {words}", place)
     assert done.returncode == 0, done.stderr
@@ -138,7 +138,7 @@ def test_a_wrong_environment_is_one_line(words, message, place):
     *before, last = done.stderr.splitlines()
     assert done.returncode == 2
     assert message in last
-    assert bool(before) == ("your own" in last), "only an error within their code has a traceback"
+    assert bool(before) == ("your own" in last), "only an error in the user's code has a traceback"
 
 
 def test_an_own_file_prints_to_standard_error(place):
@@ -175,7 +175,7 @@ def test_a_scenario_file_executes_nothing(line, place):
     ],
 )
 def test_a_hand_that_fails_after_a_while(force, message, place):
-    """In a module that the file of hands imports."""
+    """The hand is in a module that the file of hands imports."""
     hand = "import numpy as np\nfrom haptic_loop.models.human import Port\n\n\nclass Hand:\n    def port(self):\n"
     hand += "        return Port([0.3], [[-1, 1]], [4.0], [500.0])\n\n"
     hand += f"    def voluntary_force(self, t):\n        return {force}\n"
@@ -197,7 +197,7 @@ def test_a_coupling_must_be_derived_from_ours(place):
     "command", [f"{RUN} --environment mine.py:hard --coupling", "python -m design.audit --coupling"]
 )
 def test_a_coupling_that_is_its_compliance(command, place):
-    """Behind it are walls in a run, and an audit takes the same words."""
+    """A run puts walls behind the coupling, and an audit accepts the same option."""
     done = run(f"{command} mine.py:weighted", place)
     assert done.returncode == 0, done.stderr
     assert "error" not in done.stderr.lower()

@@ -1,4 +1,4 @@
-"""The wheel in an empty environment, used from a folder with modules of the same names as our folders."""
+"""The wheel works in a new environment, from a folder whose modules have the names of our folders."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ def installed(tmp_path_factory):
 
 
 def _copied_sources(place: Path) -> Path:
-    """Copy the files that git tracks: the build must not write into the checkout, nor pack what is not tracked."""
+    """Copy the files that git does not ignore, without docs and tests: the build must not write into the checkout."""
     listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True)
     for name in listed.stdout.split("\n"):
         source, target = ROOT / name, place / "sources" / name
@@ -41,7 +41,7 @@ def _copied_sources(place: Path) -> Path:
 
 @pytest.fixture
 def users_folder(tmp_path):
-    """Return a project of a user's own, whose modules are named like our folders."""
+    """Return the folder of a user's project, whose modules are named like our folders."""
     for name in ("models/__init__.py", "controller/__init__.py", "sim.py", "cli.py", "design.py", "hw.py"):
         file = tmp_path / name
         file.parent.mkdir(exist_ok=True)
