@@ -547,8 +547,8 @@ def assess(
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
-        energy_budget: W0 [J]. With a shell it is the shell's (default: 0 for a function, 2 mJ for a MuJoCo world).
-            Without a shell it is that of an energy budget at the devices (controller.budget; default: no budget).
+        energy_budget: W0 [J] of the shell (default: 0 for a function, 2 mJ for a MuJoCo world), or without a shell
+            that of an energy budget at the devices (controller.budget; default: no budget).
         certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or

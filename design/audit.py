@@ -150,9 +150,10 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Return the largest certified K of each channel, at most 2 (delta - B)/T, by (e) at z^(theta + 1) = -1.
+    """Return the largest certified K of each channel, at most 2 (delta - B)/T.
 
-    Without a latency the set of certified gains is convex and contains K -> 0, so there is only one edge.
+    This is (e) of docs/theory.md at z^(theta + 1) = -1. Without a latency the set of certified gains is convex and
+    contains K -> 0, so there is only one edge.
     """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):

@@ -46,7 +46,7 @@ from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points of the grid with equal steps, and as many with equal ratios. H is linear between them.
-_KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of evenly spaced knots of h
+_KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h, even in log frequency
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} channels: it would take half a minute and be 1 dB off"
 _NEAR_END = (0.22, 0.5)  # distances of further knots from the band's ends, in steps; h falls to zero there

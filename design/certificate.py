@@ -294,13 +294,13 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
         raise ValueError(f"facts: {certificate.condition} has no multipliers for limited forces, but the file has")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
-        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each device")
+        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected equally many per device")
     limiter = LimitedForces(lags=len(c) // len(rho), held=rho)
     return LimitedKnownDevice(limiter) if base is KNOWN_DEVICE else limiter
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
-    """Check the stored certificate's digest, seal and figures, and prove its matrices again in exact arithmetic.
+    """Check the stored certificate's digest, seal and figures, and repeat the exact proof with its matrices.
 
     A certificate of a user's own condition needs this `condition`. Its block is proved again; that the block keeps the
     loop safe is the claim of the condition's author.

@@ -18,7 +18,7 @@ To add a hands' side, derive a class from `HandsSide` and state
              slip is subtracted from the input;
   `damping`  the matrix over its inputs that is proportional to Delta_D;
   `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
-  `unknowns` its multipliers, by name.
+  `unknowns` its multipliers, by name; `room`, `allowed` and `excess` state which values are allowed.
 Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
 adds walls, limiter and switching without further code.
 
@@ -610,7 +610,7 @@ def _l1_gain(F: Lti) -> Array:
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
     """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], whatever the condition.
 
-    The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound does not hold behind
+    The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
     a limiter or walls. Friction of a device with several `axes` opposes its velocity in space. It must be at least
     |W|_2 of these axes, because the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
     """

@@ -22,7 +22,7 @@ from haptic_loop.design.transparency import decibels, transparency
 
 _NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: varying delays "
-    "of the measured positions, periods longer than T_max, or forces older than the range, as lost packets cause them."
+    "of the measured positions, periods longer than T_max, or forces older than the range, as after lost packets."
 )
 
 

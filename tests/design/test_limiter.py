@@ -233,9 +233,9 @@ def tampered(stored, **fields):
     [
         ({"c": (0.5, 0.5)}, "limiter: required is"),
         ({"c": (1.0, 1.0)}, "limiter: no proof was found"),
-        ({"c": (0.3, 0.1, 0.6)}, "expected as many for each device"),
+        ({"c": (0.3, 0.1, 0.6)}, "expected equally many per device"),
         ({"c": (-0.1, 0.7)}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
-        ({"c": (0.3,)}, "expected as many for each device"),
+        ({"c": (0.3,)}, "expected equally many per device"),
         ({"rho": (20.0, 20.0)}, "required is"),
         ({"rho": (-1.0, 10.0)}, "rho is"),
         ({"facts": ()}, "multipliers are"),
