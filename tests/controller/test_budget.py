@@ -102,9 +102,8 @@ def test_no_hand_is_given_more_than_the_budget():
         assert (received <= W0 + 1e-9 * (1 + given)).all()
         most = np.maximum(most, received)
     assert budget.limited.min() > 0
-    assert (
-        most[(n % 3 == 2) & lossless & (start < 0.1)].max() > 0.5 * W0
-    )  # some hand receives more than half of the bound
+    # some hand receives more than half of the bound
+    assert most[(n % 3 == 2) & lossless & (start < 0.1)].max() > 0.5 * W0
 
 
 @pytest.mark.validate

@@ -154,7 +154,7 @@ def _double_pole():
 
 @pytest.mark.parametrize(("make", "summed"), [(_stiff, True), (_inner_delays, True), (_double_pole, False)])
 def test_stiff_and_defective_responses_match_plain_solves(make, summed):
-    """Poles and taps are summed only where their error is bounded; the Schur form serves everywhere else."""
+    """Poles and taps are summed if the error of the sum is bounded; otherwise the Schur form is used."""
     G = make()
     assert (G._terms is not None) == summed
     w = np.concatenate([Z, np.exp(1j * np.abs(np.angle(G.poles())))])  # including each pole's angle

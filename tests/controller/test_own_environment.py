@@ -172,7 +172,7 @@ def test_a_block_is_bounded_away_from_its_poles():
 
 
 def test_blocks_of_barely_passive_networks_are_accepted():
-    """Such a block gets a spring of at most 2e-6 of its mean gain."""
+    """The block of a barely passive network gets a spring of at most 2e-6 of its mean gain."""
     between = (Spring(("a", "m"), 1000.0), Spring(("m", "b"), 700.0))
     for network in (
         Network(("a",), masses={"a": 0.3}),

@@ -53,7 +53,7 @@ def test_when_every_packet_is_lost_the_force_stays():
 
 
 def test_a_constant_delay_is_the_linear_block():
-    """The line behind G equals Theta G with delays (1, 2), up to rounding of sums in another order."""
+    """A delay line behind G equals Theta G with delays (1, 2), up to rounding of sums in another order."""
     E, x = environment(FIGURE_4, T), np.random.default_rng(1).normal(size=(200, 2, 1))
     G, F = (force_map(E, COUPLING, theta, (0, 0)) for theta in ((0, 0), (1, 2)))
     constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))

@@ -61,7 +61,7 @@ def test_a_narrow_active_resonance_is_refused(width, depth):
     rng = np.random.default_rng(7)
     w = 90.0 * 10 ** np.array([0.0, -1.0, 0.5, 1.2])
     h = np.array([width, 0.3, 0.05, 0.7])
-    gain = np.array([-2.0 * (1 + depth), 3.0, 0.4, 1.0])  # the last three are passive
+    gain = np.array([-2.0 * (1 + depth), 3.0, 0.4, 1.0])  # the last three resonances are passive
     blocks = [w * np.array([[0.0, 1.0], [-1.0, -2 * h]]) for w, h in zip(w, h, strict=True)]
     A, B = scipy.linalg.block_diag(*blocks), np.tile([[0.0], [1.0]], (4, 1))
     C = np.ravel([[0.0, g * 2 * h * w] for g, h, w in zip(gain, h, w, strict=True)])[None]
@@ -301,7 +301,7 @@ def test_ports_that_cannot_be_are_refused(call, message):
 
 @pytest.mark.parametrize(("d", "b"), [(2.0, 1.5), (2.0, 2.0), (1.0, 1.5)])
 def test_dead_times_take_their_pade_form(d, b):
-    """d + b (1 - s tau/2)/(1 + s tau/2) equals d + b exp(-s tau) to b (w tau)^3/12; it is passive if d >= b."""
+    """d + b (1 - s tau/2)/(1 + s tau/2) is d + b exp(-s tau) to b (w tau)^3/12, and passive only if d >= b."""
     tau = 0.05
     parts = [[-2 / tau]], [[1.0]], [[4 * b / tau]], d - b
     if d < b:

@@ -38,7 +38,7 @@ def test_the_passivity_controller_returns_what_its_observer_misses():
 
 
 def test_the_passivity_controller_is_the_published_one():
-    """It sends f + alpha v, with W += f v + alpha_- v_-^2, and alpha = -W/v^2 if W < 0, otherwise 0."""
+    """The controller sends f + alpha v, with W += f v + alpha_- v_-^2, and alpha = -W/v^2 if W < 0, otherwise 0."""
     rng, control = np.random.default_rng(17), PassivityControl(1, T)
     W = alpha = before = acted = 0.0
     for _ in range(500):

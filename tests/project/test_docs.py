@@ -90,7 +90,7 @@ def test_designs_named_in_sentences_exist(place):
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
 def test_measured_output_is_of_a_command_that_exists(page, command, pattern, shown):
-    """These commands take minutes: `python tests/tools/regenerate.py --check` runs them and compares all but times."""
+    """Commands with measured output take minutes; `python tests/tools/regenerate.py --check` runs them."""
     module = command.split()[2]
     assert importlib.util.find_spec(module) is not None
     assert shown

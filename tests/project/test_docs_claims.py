@@ -44,7 +44,7 @@ def test_reproducibility_rows_name_their_evidence():
 
 
 def test_documented_commands_leave_the_repository_clean():
-    """Git ignores the files that these commands write into the repository."""
+    """Git ignores the files that documented commands write into the repository."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git, or no clone")
     texts = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))]

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """Return the scripts folder of a new environment that holds the wheel and sees this one's libraries."""
+    """Return the scripts folder of a new environment that holds the wheel and links to the present libraries."""
     place = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     options = ["--no-deps", "--no-build-isolation", "-w", str(place)]
