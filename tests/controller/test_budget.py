@@ -1,4 +1,4 @@
-"""Energy budgets bound what a passive hand receives, whatever computes the force, and never act in certified loops."""
+"""Energy budgets bound what passive hands receive from any controller, and never act in any-environment loops."""
 
 import msgspec
 import numpy as np
