@@ -202,7 +202,7 @@ def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], 
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double, from the ball's midpoint in the direction `towards`, with a decimal beyond the ball."""
+    """Return the first double, from the ball's midpoint to `towards`, whose decimal lies beyond the ball."""
     import flint
 
     value = float(ball.mid())
@@ -634,7 +634,7 @@ def positive(H: Complex) -> NDArray[np.bool_]:
         pivot = H[..., i, i].real
         holds &= pivot > 0
         column = H[..., i + 1 :, i]
-        # A matrix that does not hold keeps pivot 1, with which its other entries may overflow; it stays refused.
+        # A matrix that has failed stays False. Its elimination continues with pivot 1, so its entries may overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             H[..., i + 1 :, i + 1 :] -= (
                 column[..., :, None] * np.conj(column[..., None, :]) / np.where(holds, pivot, 1.0)[..., None, None]
@@ -664,7 +664,7 @@ class KnownDevice(Condition):
     plain: Multiplied = THIS_ENVIRONMENT  # the condition with the same facts for beta -> 0
 
     def beyond(self, loop: Loop) -> str | None:
-        if loop.latency:  # No declaration mends it, so it is named before missing bounds.
+        if loop.latency:  # This reason comes first, because declaring bounds does not remove it.
             return _LATE
         if not loop.known_devices:
             return _NONE
@@ -787,8 +787,8 @@ class KnownDevice(Condition):
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
         beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map needs thousands of
-        couplings. Returns None for matrix levels or where the plain condition has no such figures, and inf where this
-        condition has none.
+        couplings. Returns None for matrix levels or if the plain condition returns None, and inf if this condition does
+        not cover the loop or has multipliers of facts.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):

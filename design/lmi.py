@@ -30,7 +30,7 @@ RESERVE = 1e-4  # share of the damping that designs do not use, so that the roun
 
 
 def usable(loop: Loop) -> Array:
-    """Return the damping (m,) [N s/m] that a design may use at a constant period. Raises ValueError if it is 0."""
+    """Return (1 - RESERVE) delta T/T_max (m,) [N s/m], which a design may use. Raises ValueError if a delta is 0."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     return (1 - RESERVE) * even_damping(loop)
@@ -63,8 +63,8 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
 class Shaping:
     """The weighted L (22) of a loop, W1 L W2, for fast evaluation with many couplings.
 
-    W2 is diagonal. The defaults of W1 and W2 are the identity and `_low_pass`. Raises ValueError for weights of wrong
-    size, unstable weights, and an active environment.
+    The defaults of W1 and W2 are the identity and `_low_pass`. Raises ValueError for weights of wrong size, unstable
+    weights, a W2 that is not diagonal, and an active environment.
     """
 
     def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:

@@ -41,7 +41,7 @@ _KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below
 _FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's is dropped.
 # Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))
-_HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
+_HOPELESS = 0.9  # Above this mismatch (`_Search.mismatch`) the result is compared with simpler couplings.
 _RESERVES = (0.95, 2.5, 50.0)  # unused damping in units of MARGIN; if a proof fails, the next value is tried
 # An environment that requires more than 1 + _TOLERATED times the damping is added to the program. Scaling the forces
 # removes smaller excesses.
@@ -114,8 +114,8 @@ def design(
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
-    If it is proved, ranges around the environment mean that this-environment holds at every vertex and at every point
-    that the search between the vertices visits, and with a range of delays any switching within the range is safe.
+    With ranges around the environment, a proved coupling satisfies this-environment at every vertex and at every point
+    that the search between the vertices visits. With a range of delays, any switching within the range is safe.
     If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
     environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
 
@@ -163,10 +163,10 @@ def _over_bases(
         gained = np.inf if result.reason else search.gained(best, candidate)
         if best and candidate.g < floor and result.certified:
             result = replace(
-                result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another's"
+                result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another coupling's"
             )
         elif gained <= 0 or result.reason == _SETTLED:
-            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
+            result = replace(result, rejected=f"{_SETTLED}, with lost stiffness counted")
         results.append(result)
         progress(result)
         if result.taken:
@@ -226,7 +226,7 @@ def _for_known_devices(
         )
         gained = search.gained(best, candidate)
         if candidate.proved and gained <= 0:
-            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
+            result = replace(result, rejected=f"{_SETTLED}, with lost stiffness counted")
         results.append(result)
         progress(result)
         if result.taken:
@@ -353,7 +353,7 @@ class _Search:
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
-        """Return the design without a coupling if it is exact and safe and has no further constraints, else None."""
+        """Return the design without a coupling; None if it has a mismatch, is not safe, or has further constraints."""
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)
@@ -507,7 +507,7 @@ class _Search:
         return replace(last, certificate=None, reason=last.reason or "no scaling of its forces is proved in the ranges")
 
     def scaled(self) -> Optimal:
-        """Return the coupling R = kappa I, with kappa reduced, to a half at most, until the coupling is proved."""
+        """Return the coupling R = kappa I. If it is not proved, kappa is reduced, by at most half, until it is."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)
@@ -582,8 +582,8 @@ class _Search:
         """Return unknowns of R = kappa I that satisfy every constraint strictly.
 
         They exist because zero force satisfies each constraint strictly. For F = 0 and the limiter's multiplier M, the
-        Schur complement of its block is 2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is
-        at least 1.
+        Schur complement of its block is rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at
+        least 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:

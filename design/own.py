@@ -28,7 +28,7 @@ def named(option: str, text: str) -> Any:
 
     Raises:
         InputError: The text is not FILE.py:NAME, the file or the object in it does not exist, the file is not valid
-            Python or exits, or a module of its name is loaded that is no user's file.
+            Python or exits, or its name is that of a loaded module that is not a user's file.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)

@@ -54,7 +54,7 @@ _EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; small, because t
 # Up to FULL channels every force has a filter to every device. With further constraints,
 # a latency or ranges, the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
-_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the relative mismatch, up to _RICH channels and above
+_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the mismatch, up to _RICH channels and above
 HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.
 SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch so far, SOFT[1]).
 _EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
@@ -380,7 +380,7 @@ class Problem:
         return x
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and lost static stiffness.
+        """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness.
 
         The forces of a device depend on g and on the device's own row of R only. So each row is a separate
         least-squares problem, which is reduced to its triangular factor.

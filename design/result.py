@@ -248,7 +248,7 @@ class Design(Chosen):
         requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per device, if it is kept because its search took long; or None.
+        c: The multiplier of the limiter, one row per device, for loops in which its search takes long; otherwise None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.

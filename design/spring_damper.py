@@ -278,8 +278,8 @@ class _NoLinearDesign(DesignFailed):
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
     """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
 
-    `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if so many
-    channels would make the search take minutes.
+    `limiter` is True, False or None respectively. Raises the errors of `design`, and DesignFailed at once if the
+    loop has so many channels that the search would take minutes.
     """
     if not named(condition).extensible:  # With psi = 0 any-environment covers limited forces.
         if limiter and named(condition) is KNOWN_DEVICE:
@@ -553,8 +553,8 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
 
     For psi = 0 this is half the largest stiffness for any environment, with the usable damping d [N s/m].
 
-    With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency.
-    Therefore the last start is stiffer than the environment at half the sampling rate.
+    With delay in the environment, the loop of coupling and environment is stable if the coupling is stiffer than the
+    environment at every frequency. Therefore the last start is stiffer at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
@@ -578,11 +578,11 @@ def _spare(loop: Loop) -> float:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
-    For Theorem 4 with constant delays and without a latency, V = T/(2 delta) (1 + ... + z^-theta) requires the damping
-    delta at every frequency. Let n = theta + 1. With the constant e n^2 T/(2 delta) added, V requires delta/(1 + e)
-    where the sum is largest, and less elsewhere. The zeros of the sum lie on the unit circle, so without e the force
-    against an object at rest rings without decay. A world that does not step at every tick is at rest between its
-    steps, so e is larger for such a world.
+    For Theorem 4 with constant delays and without a latency, V = T/(2 delta) (1 + ... + z^-theta), with T_max for T if
+    periods vary, requires the damping delta at every frequency. Let n = theta + 1. With the constant e n^2 T/(2 delta)
+    added, V requires delta/(1 + e) where the sum is largest, and less elsewhere. The zeros of the sum lie on the unit
+    circle, so without e the force against an object at rest rings without decay. A world that does not step at every
+    tick is at rest between its steps, so e is larger for such a world.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)

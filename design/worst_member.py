@@ -2,9 +2,9 @@
 
 The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
 stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or a
-face, which uniformly drawn points never hit. For every set of contacts that may be present, the search therefore tries
-vertices, points on edges, on faces (only for up to _MANY parameters) and inside. A compass search then continues from
-the worst points.
+face, which uniformly drawn points never hit. For every combination of present and absent springs, the search therefore
+tries vertices, points on edges, on faces (only for up to _MANY parameters) and inside. A compass search then continues
+from the worst points.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _member(region: Region, point: Array) -> Member:
 def _points(region: Region) -> Iterator[Array]:
     """Yield points of the unit cube: at vertices, on edges, on faces and inside.
 
-    Up to _MANY dimensions include all vertices and edges; more include a random part of them, and no faces.
+    With up to _MANY dimensions these include all vertices and edges; with more, random ones and no faces.
     """
     n = region.low.size
     rng = np.random.default_rng(_SEED)

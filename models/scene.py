@@ -355,7 +355,9 @@ def _placed(
     for p, (holds, port) in enumerate(held, start=1):
         extra = port.mass.shape[-1] - len(holds)
         if port.handles != len(holds) or extra < 1:
-            raise ValueError(f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
+            raise ValueError(
+                f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)} and at least 1"
+            )
         first = devices[holds[0] - 1]
         if any(devices[i - 1].axis_names != first.axis_names for i in holds):
             raise ValueError(f"person #{p}.holds is {list(holds)}: expected devices with the same free axes")
@@ -745,7 +747,7 @@ def crowds(
 def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int]) -> _Drawn:
     """Draw devices within their guaranteed bounds for the humans of these indices; () unless all devices have bounds.
 
-    The devices have a random stream of their own, so that the humans do not depend on them.
+    The devices have a separate random stream, so that the humans do not depend on them.
     """
     if not (devices and all(device.guaranteed for device in devices)):
         return ()
@@ -756,7 +758,7 @@ def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int])
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
     """Draw the bodies (persons, 5) of the persons with this index who hold several devices, as in Crowd.
 
-    The bodies have the ranges of the links but a random stream of their own, so that the links do not depend on them.
+    The bodies have the ranges of the links but a separate random stream, so that the links do not depend on them.
     """
     if not persons:
         return np.zeros((0, 5))

@@ -57,7 +57,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class _Part:
-    """One kind of part of a scene, and which bound holds for the energy that it generates at the contacts."""
+    """One kind of part of a scene, and the bound on the energy that such parts generate at the contacts."""
 
     what: str
     count: int
@@ -136,9 +136,9 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of the world's bodies without a joint, in file order: those that are not welded may be contacts.
+    """Return the names of the children of the world, in file order, that have no joint and are no mocap bodies.
 
-    Raises ValueError for a file that cannot be read or that MuJoCo refuses.
+    Those that are not welded may be contacts. Raises ValueError for a file that cannot be read or that MuJoCo refuses.
     """
     return _without_joints(_spec(path))
 
