@@ -118,7 +118,7 @@ class Port:
     stiffness: _Array  # (..., springs) [N/m]
     impedance: Impedance | None = None  # between the (only) handle and the base, on every axis
     handles: int = 1
-    pull: int = -1  # index of the spring-damper, or of the group of `axes` of them, that the voluntary force contracts
+    pull: int = -1  # index of the spring-damper (group of `axes` spring-dampers) that the voluntary force contracts
     axes: int = 1
 
     def __post_init__(self) -> None:
