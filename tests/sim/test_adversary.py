@@ -28,12 +28,12 @@ LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, PUBLISHED["I"
 
 def test_it_finds_what_random_humans_do_not():
     """The published gains pass random humans; with 5 % less damping than they need, a lossless hand is found."""
-    rows = attempts(LOOPS, np.array([0.05, 0.1, 0.2]), generations=60)
+    rows = attempts(LOOPS, np.array([0.05]), generations=60)
     assert all(row.worst.destabilises for row in rows)
 
 
 def test_nobody_destabilises_sufficient_damping():
-    rows = attempts(LOOPS, np.array([-1e-3]), generations=6)
+    rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
     # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
@@ -43,10 +43,10 @@ def test_nobody_destabilises_sufficient_damping():
 def test_where_the_condition_binds_slowly_it_is_tight():
     """Without coupling and with delays of 4 and 9 samples it binds at 8 Hz: half a per cent short, a hand is found."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
-    rows = attempts(delayed, np.array([-1e-3, 0.005, 0.02]), generations=15)
+    rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
     print([(row.short, row.worst.growth) for row in rows])
-    assert [row.worst.destabilises for row in rows] == [False, True, True]
-    assert all(6 < row.worst.frequency_hz < 10 for row in rows[1:])
+    assert [row.worst.destabilises for row in rows] == [False, True]
+    assert 6 < rows[1].worst.frequency_hz < 10
 
 
 def test_known_devices_are_searched_within_their_bounds(tmp_path):
@@ -146,7 +146,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_the_rate_by_shortage():
-    rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 10))
+    rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 4))
     found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
     assert found == {0: [False, False], 0.2: [True, True]}
     assert {row.loop for row in rows} == {"no coupling", "spring-damper, case I"}

@@ -100,7 +100,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, wo
     while len(workers := children(process.pid)) < workers_and_their_clerk:  # the last keeps count of shared resources
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    time.sleep(1)
+    time.sleep(0.2)
     process.send_signal(end)
     process.wait()
     while any(Path(f"/proc/{worker}").exists() for worker in workers):
