@@ -535,9 +535,21 @@ def environment(network: Network, T: Number) -> Lti:
     dampers and masses. The block is added. The arithmetic is that of T. Raises ValueError if an internal node has no
     mass and nothing holds it, or if the rounding of directions alone holds it.
     """
-    free = _free_directions(network, network.springs, T)
-    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
+    parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
+    key = parts, type(T), T  # the type of T decides the arithmetic
+    E = _computed.get(key)
+    if E is None:
+        free = _free_directions(network, network.springs, T)
+        E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, free=free), T)
+        if len(_computed) == _MOST_COMPUTED:
+            _computed.pop(next(iter(_computed)))
+        _computed[key] = E
     return E + network.block.at(T) if network.block else E
+
+
+#: E(z) without blocks of the networks seen last. A design asks for the same one about eighty times.
+_computed: dict[Any, Lti] = {}
+_MOST_COMPUTED = 32
 
 
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:

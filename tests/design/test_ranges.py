@@ -168,7 +168,7 @@ def test_reports_say_that_half_the_vertices_are_proved():
     ranges = Ranges(tuple(UncertainSpring(s.between, (80.0, 120.0), (0.4, 0.6)) for s in springs))
     loop = Loop(1e-3, (1,), (0,), (0,), (1.4,), Network(("tip",), springs), ranges)
     coupling = SpringDamper((5000.0,), (0.3,))  # too stiff for any environment
-    assessment = assess(loop, coupling)
+    assessment = assess(loop, coupling, limiter=False, ranges_samples=1)
     assert assessment.guarantee.words == "these ranges: proved at 128 of 256 vertices, searched between them"
     assert "128 of 256 vertices of the ranges" in verdict(assessment)
     assert dict(range_rows(assessment.ranges))["ranges, vertices"].endswith("; 128 of 256 vertices")
