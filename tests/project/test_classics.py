@@ -68,7 +68,7 @@ def test_energy_bounding_sends_what_its_law_says():
     [
         ("PO/PC", (66.59, 0.310, 2.3, 90, 6, 0.118)),
         ("energy bounding", (18.74, 5.675, 12.0, 96, 100, 8.915)),
-        pytest.param("energy budget", (14.40, 0.216, 1.6, 35, 7, 0.131), marks=pytest.mark.slow),
+        pytest.param("energy budget", (14.40, 0.216, 1.6, 35, 7, 0.131), marks=pytest.mark.validate),
     ],
 )
 def test_the_figures_of_the_classics(name, figures):

@@ -68,7 +68,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
             responses["R"] = coupling.filter(scenario.T).at(z)
         return responses["R"] @ E
 
-    for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
+    for K, B in ((90.0, 0.3), (1213.2, 2.54)):
         found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
         assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
         assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
@@ -122,7 +122,7 @@ def test_hands_meet_the_cells_own_environment(optimal):
         assert (growth < 0).all() == stable
 
 
-OPTIONS = ["--coupling", "optimal", "--grid", "4", "--humans", "5", "--points", "2", "--duration", "1.5"]
+OPTIONS = ["--coupling", "optimal", "--grid", "4", "--humans", "5", "--points", "1", "--duration", "1.5"]
 
 
 @pytest.mark.slow

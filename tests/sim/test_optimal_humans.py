@@ -15,7 +15,7 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
-HUMANS = 200
+HUMANS = 100
 
 
 @cache

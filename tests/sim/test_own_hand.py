@@ -174,13 +174,13 @@ def test_the_adversary_searches_what_the_population_draws():
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
     F = assemble(scenario, NoCoupling()).F
-    worst = search_population(scenario, F, seed=1, generations=8)
+    worst = search_population(scenario, F, seed=1, generations=4)
     random = validate(scenario, None, humans=worst.evaluated // 4, seed=1, duration=0.0, engine="exact").exact.max()
     assert worst.growth > random
     assert all(isinstance(hand, Muscle) and 0.02 <= hand.mass <= 2.0 for hand in worst.humans)
     alone = assemble(scenario.replace(human=worst.humans), NoCoupling())
     assert dominant_mode(close(alone.plant, F)).growth == pytest.approx(worst.growth, rel=1e-9)
-    assert search_population(scenario, F, seed=1, generations=8) == worst
+    assert search_population(scenario, F, seed=1, generations=4) == worst
 
 
 class Mixed:
@@ -194,7 +194,7 @@ class Mixed:
 def test_the_adversary_fails_against_enough_damping():
     """The published gains need 1.3987 N s/m."""
     scenario = SCENARIO.replace(delta=(1.42, 1.42), population=Mixed())
-    worst = search_population(scenario, assemble(scenario, PUBLISHED["I"]).F, generations=3)
+    worst = search_population(scenario, assemble(scenario, PUBLISHED["I"]).F, generations=1)
     assert not worst.destabilises
 
 

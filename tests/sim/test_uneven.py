@@ -190,12 +190,12 @@ def test_periods_vary_beside_delays():
 @pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
-    rows = list(uneven.uneven_ticks(0, 3, 1200))
+    rows = list(uneven.uneven_ticks(0, 3, 500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
     assert sum(row.grow > 0 for row in rows) >= 4
     monkeypatch.setattr(uneven, "ENOUGH", 0.5)
-    assert not all(row.holds for row in uneven.uneven_ticks(0, 2, 600))
+    assert not all(row.holds for row in uneven.uneven_ticks(0, 2, 300))
 
 
 def test_latch_positions_are_the_plants():
