@@ -80,25 +80,33 @@ class _Case:
 
 
 def challenges(
-    seed: int, loops: int = 3, hands: int = 60, seconds: float = 6.0, names: Sequence[str] | None = None
+    seed: int,
+    loops: int = 3,
+    hands: int = 60,
+    seconds: float = 6.0,
+    ticks: int = 700,
+    names: Sequence[str] | None = None,
 ) -> Iterator[_Challenge]:
-    """Yield each guarantee on `loops` random loops, at ENOUGH and at too little of what it requires."""
+    """Yield each guarantee on `loops` random loops, at ENOUGH and at too little of what it requires.
+
+    Motions last `ticks`, and hands move for `seconds`.
+    """
     for name, (make, too_little) in GUARANTEES.items():
         if names is not None and name not in names:
             continue
         for number in range(loops):
             for factor in (ENOUGH, too_little):
-                yield _challenge(name, make, seed, number, factor, hands, seconds)
+                yield _challenge(name, make, seed, number, factor, hands, seconds, ticks)
 
 
 def _challenge(
-    name: str, make: Callable[..., _Case], seed: int, number: int, factor: float, hands: int, seconds: float
+    name: str, make: Callable[..., _Case], seed: int, number: int, factor: float, hands: int, seconds: float, ticks: int
 ) -> _Challenge:
     case = make(np.random.default_rng((seed, number)), factor)
     rng = np.random.default_rng((seed, number, 1))
     balances, share = [], 0.0
     for greed in (0.0, 0.5, 1.0):
-        balance, limited_share = _moved(case, _pushes(rng, len(case.delta), case.size, greed), greed)
+        balance, limited_share = _moved(case, _pushes(rng, len(case.delta), case.size, greed, ticks), greed)
         balances.append(balance)
         share = max(share, limited_share)
     least = np.concatenate(balances)
@@ -112,7 +120,7 @@ def _challenge(
 # ---- the adversaries
 
 
-def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int = 700) -> Array:
+def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int) -> Array:
     """Return waves and noise of three sizes (ticks, m, _PUSHED), which with greed end after 150 ticks."""
     w, phase = np.exp(rng.uniform(-5, 1.1, (1, 1, _PUSHED))), rng.uniform(0, 6, (1, m, _PUSHED))
     wave = np.sin(w * np.arange(ticks)[:, None, None] + phase) + 0.3 * rng.normal(size=(ticks, m, _PUSHED))

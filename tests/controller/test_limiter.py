@@ -291,12 +291,12 @@ def test_clipped_cycles_give_energy_limited_ones_none():
 def test_at_rest_is_where_held_displacements_lead(x):
     """The loop keeps the state `at_rest` at held displacements, within the limits and beyond them."""
     limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
-    z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 6000, 2)
+    z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 2000, 2)
     held.x[:, :, 0] = x
     held.z[0, :, 0] = z
-    for k in range(6000):
+    for k in range(2000):
         held.tick(k)
-    np.testing.assert_allclose(held.z[1:, :, 0], np.broadcast_to(z, (6000, z.size)), atol=1e-9)
+    np.testing.assert_allclose(held.z[1:, :, 0], np.broadcast_to(z, (2000, z.size)), atol=1e-9)
     stiffness = limiter.sent.dc()
     e = limiter.slips(held.z)[0, :, 0]
     np.testing.assert_allclose(held.f[0, :, 0], stiffness @ (np.array(x) - e), atol=1e-9)

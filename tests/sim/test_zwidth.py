@@ -538,12 +538,12 @@ def test_maps_cover_latency_and_longest_periods(tmp_path):
         "--grid",
         "6",
         "--humans",
-        "20",
+        "5",
         "--no-plot",
     ]
     needs = {}
     for name, options in {
-        "late": ["--theta", "0", "--latency", "130e-6:130e-6", "--points", "2"],
+        "late": ["--theta", "0", "--latency", "130e-6:130e-6", "--points", "1"],
         "whole": ["--theta", "1", "--points", "0"],
         "long": ["--theta", "0", "--T-max", "1.8e-3", "--points", "0"],
     }.items():
