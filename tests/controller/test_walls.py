@@ -185,7 +185,7 @@ def boxed(scenario):
 
 
 @pytest.mark.parametrize(
-    ("name", "humans", "seconds"), [("exact", 200, 6.0), pytest.param("mujoco", 20, 3.0, marks=pytest.mark.slow)]
+    ("name", "humans", "seconds"), [("exact", 60, 4.0), pytest.param("mujoco", 6, 3.0, marks=pytest.mark.slow)]
 )
 def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
     """Behind a certified coupling all hands slow down from the first to the last quarter, despite many contacts."""

@@ -35,6 +35,7 @@ from haptic_loop.cli.run import main as run_command
 from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
+from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design.assessment import ForceLimits, RangesResult
 from haptic_loop.design.designs import KINDS
 from haptic_loop.models.device import RigidDevice
@@ -90,7 +91,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     assert figures == transparency_of(loop, found.coupling)
     assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
     assert assess(loop, SpringDamper([2870, 2320], [5.47, 5.55])).guarantee is None
-    ranges = load("omega-pair-ranges").loop("I")
+    ranges = replace(loop, ranges=Ranges(masses={"mass": (0.8, 1.2)}))
     assert assess(ranges, SpringDamper([300, 300], [0.1, 0.1]), ranges_samples=0).guarantee.any_environment
 
 

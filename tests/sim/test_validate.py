@@ -94,7 +94,7 @@ def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
     """At 1.001 of what known-device asks none grows, on no device of the bounds; the worst one replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
-    base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed"]
+    base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed", "--no-limiter"]
     assert main([*base, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
     assert report["certified"]
