@@ -1,4 +1,4 @@
-"""sim.accuracy: the table's figures, its front, its exit code."""
+"""sim.accuracy measures known errors, marks the Pareto front, and says when runs stop being credible."""
 
 import json
 
@@ -18,7 +18,7 @@ from haptic_loop.sim.trace import Trace
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """Each row is run once: repeating it is for its seconds, which no test looks at."""
+    """Return the exit code and the report; each setting runs once, because no test needs precise wall times."""
     place = tmp_path_factory.mktemp("accuracy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yardstick, "_REPEATS", 1)
@@ -38,7 +38,7 @@ def test_figures(report):
     assert rows["RK4", 4]["position_relative_rms"] < 1e-7
     assert abs(rows["RK4", 4]["growth_rate_error"]) < 1e-3
     assert rows["RK4", 4]["verdict_correct"]
-    # first order errs towards stable: the sampled position leads
+    # Euler errs towards stable, because its sampled position leads.
     assert rows["Euler", 1]["growth_rate_error"] == pytest.approx(-1.70, abs=0.01)
     assert not rows["Euler", 1]["verdict_correct"]
     assert not rows["discrete", 12]["verdict_correct"]
@@ -46,7 +46,7 @@ def test_figures(report):
 
 
 def test_a_limit_cycle_has_its_forces_deviation():
-    """Of the last 4000 ticks of the channel that varies most; an engine that is the reference has no error."""
+    """The deviation is that of the last 4000 ticks of the most varying channel; the exact engine has no error."""
     scenario = load().replace(duration=5.0)
     loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
     row = measure(reference(*loops), "exact", None, None)
@@ -67,7 +67,7 @@ def test_bad_duration():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """Figure 5 leaves them at 7.35 s: force of the transmission and speed of the motor, from the positions alone."""
+    """The run of Figure 5 leaves the credible limits at 7.35 s; positions alone give its forces and speeds."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
@@ -75,7 +75,7 @@ def test_runs_say_when_they_stop_being_credible():
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
     assert part.transmission_force_n == pytest.approx(force.max(axis=0))
-    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # 14 samples a period
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # 10 samples a period
     assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
     assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)
@@ -102,4 +102,4 @@ def test_a_dominant_frequency_ignores_the_first_time():
     t = 1e-3 * np.arange(1000)
     f, none = np.sin(2 * np.pi * 50 * t)[:, None], np.zeros((1000, 1))
     rates = [Trace(t + begin, none, f, none, none, none, {}).dominant_frequency_hz() for begin in (0.0, 5.0)]
-    assert rates == pytest.approx([50.0, 50.0], abs=4.0)  # a line is 4 Hz wide
+    assert rates == pytest.approx([50.0, 50.0], abs=4.0)  # The spectrum's lines are 4 Hz apart.

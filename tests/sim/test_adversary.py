@@ -27,7 +27,7 @@ LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, PUBLISHED["I"
 
 
 def test_it_finds_what_random_humans_do_not():
-    """The published gains pass random humans; with 5 % less damping than they need, a lossless hand is found."""
+    """With 5 % less damping than required, the search finds a lossless hand that destabilises each loop."""
     rows = attempts(LOOPS, np.array([0.05]), generations=60)
     assert all(row.worst.destabilises for row in rows)
 
@@ -35,13 +35,13 @@ def test_it_finds_what_random_humans_do_not():
 def test_nobody_destabilises_sufficient_damping():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
-    # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
+    # The growth with lossless hands approaches 0 from below, up to the rounding of eigenvalues.
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
 @pytest.mark.slow
 def test_where_the_condition_binds_slowly_it_is_tight():
-    """Without coupling and with delays of 4 and 9 samples it binds at 8 Hz: half a per cent short, a hand is found."""
+    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping a hand is found."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
     print([(row.short, row.worst.growth) for row in rows])
@@ -50,7 +50,7 @@ def test_where_the_condition_binds_slowly_it_is_tight():
 
 
 def test_known_devices_are_searched_within_their_bounds(tmp_path):
-    """Heavy motors on soft transmissions hide what a device at its bounds does; the search finds that device."""
+    """The nominal motors are heavy; the search finds the lightest motor that the guaranteed bounds allow."""
     heavy = {"motor_mass": 1.0, "transmission_stiffness": 3000.0}
     known = load("omega-pair-known")
     devices = tuple(change(device, **heavy) for device in known.device)
@@ -72,7 +72,7 @@ def both_hands(monkeypatch):
 
 
 def test_one_person_in_both_hands_is_found_too(monkeypatch):
-    """A lossless two-port, concrete and passive: what the search says of it, the scene built for it repeats."""
+    """The scene of one lossless person who holds both devices has the growth that the search found."""
     both_hands(monkeypatch)
     worst = search(SCENARIO, assemble(SCENARIO, NoCoupling()).F, generations=15)
     assert worst.destabilises
@@ -86,7 +86,7 @@ def test_one_person_in_both_hands_is_found_too(monkeypatch):
 
 
 def test_one_person_cannot_beat_the_required_damping(monkeypatch):
-    """The condition asks nothing of how humans hang together."""
+    """One person with both devices destabilises the loop with 5 % too little damping, but not with enough."""
     both_hands(monkeypatch)
     light = SCENARIO.replace(device=(RigidDevice(mass=0.02),) * 2)
     rows = attempts({"designed": (light, DESIGNED)}, np.array([-1e-3, 0.05]), generations=30)
@@ -132,7 +132,7 @@ def test_the_command_keeps_the_human_for_a_replay(tmp_path):
 
 
 def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
-    """Were a certificate wrong, the command would say so: here the search is told of another loop."""
+    """The search attacks the uncoupled loop instead and so contradicts the certificate; the command must fail."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(
         adversary, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
@@ -154,7 +154,7 @@ def test_the_rate_by_shortage():
 
 
 def test_a_wrong_condition_fails_the_check(monkeypatch):
-    """A condition that asks for a third of the damping is refuted by a human."""
+    """The search refutes a condition that requires less than a third of the true damping."""
 
     class Third(ThisEnvironment):
         def required(self, loop, coupling, multiplier=None):

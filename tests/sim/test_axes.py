@@ -59,18 +59,18 @@ def scenario(first: str = "", second: str = "", more: str = "") -> Scenario:
 
 
 def line() -> Scenario:
-    """The same devices with one axis each."""
+    """Return the loop of `scenario()` with devices of one axis."""
     return parse(TEXT.replace("axes = 3", "").replace("FIRST", "").replace("SECOND", "").replace("MORE", ""))
 
 
 def rotation(seed: int) -> Array:
-    """A rotation matrix by the QR factors of a random matrix."""
+    """Return the orthogonal factor of a random matrix; with seed 1 it is a rotation."""
     Q, R = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return Q * np.sign(np.diag(R))
 
 
 def rows(matrix: Array) -> str:
-    """A matrix as TOML has it, symmetric to the last bit."""
+    """Return the symmetric part of a matrix as TOML text."""
     return str(((matrix + matrix.T) / 2).tolist())
 
 
@@ -183,7 +183,7 @@ def test_springs_in_space_are_their_matrices() -> None:
 
 
 def wall_forces(network: Network, x: Array) -> Array:
-    """The forces of a law behind a coupling for displacements x (N, m), tick by tick."""
+    """Return the forces (ticks, m) of the network behind a coupling for displacements x (ticks, m)."""
     m = x.shape[1]
     loop = Loop(1e-3, (1,) * m, (0,) * m, (0,) * m, (1.0,) * m, network, axes=(m,))
     law = loop.law(SpringDamper([5000.0] * m, [0.5] * m))
@@ -211,7 +211,7 @@ def test_walls_push_along_their_normals() -> None:
 
 
 def push_along(scene: Scene, direction: Array, first: int, ticks: int) -> Array:
-    """Forces (ticks, outside): 1 N along a direction on the first handle, -1/2 N on the second, for 50 ticks."""
+    """Return forces (ticks, outside): for 50 ticks 1 N on the first handle and -1/2 N on the second."""
     w = np.zeros((ticks, scene.outside))
     for k, column in enumerate(scene.tapped):
         w[: max(0, 50 - first), column] = (1.0, -0.5)[k // len(direction)] * direction[k % len(direction)]
@@ -262,7 +262,7 @@ def test_rotated_loops_have_rotated_trajectories(kind: str, engine: str) -> None
 
 
 def test_plant_with_matrices_is_its_exponential() -> None:
-    """One device of .25 kg with a hand of .3 kg, both with full matrices: M x'' = -K x - B x' - f by hand."""
+    """A device of 0.25 kg in a hand of 0.3 kg moves by the exponential of M x'' = -K x - B x' - f."""
     hand = np.array([[3.0, 0.5, 0.0], [0.5, 2.0, -0.4], [0.0, -0.4, 1.0]])
     K = np.array([[200.0, -50.0, 20.0], [-50.0, 150.0, 0.0], [20.0, 0.0, 90.0]])
     device = RigidDevice(axes=3, damping=tuple(map(tuple, DAMPING.tolist())))
@@ -355,7 +355,7 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
     for name in ("_NEWTON", "_HALVINGS", "_SPLIT"):
         monkeypatch.setattr(complementarity, name, 0)
     blocked = run_scenario(space, COUPLING, lag)
-    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # before the first force, too
+    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # forces are 0 before the first one, too
     assert 10 < blocked.unsolved <= zero
     assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
 
@@ -368,7 +368,7 @@ def test_reports_say_that_held_torques_are_free() -> None:
 
 
 def test_search_shares_a_multiplier_within_a_device() -> None:
-    """The slope of the limited condition by gains and multipliers is that of its differences."""
+    """The slope of `room` by gains and multipliers equals central differences."""
     loop = LimiterLoop(scenario('clamped = ["x"]', 'clamped = ["x"]').loop("I"))
     x = loop.point(SpringDamper([3000.0, 4000.0, 2000.0, 2500.0], [0.3, 0.4, 0.5, 0.2]))
     x[8:] += [0.1, -0.2, 0.3, 0.05]

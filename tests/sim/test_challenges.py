@@ -1,10 +1,10 @@
-"""Guarantees beyond the linear loop, at their edge: a short form of `make validate`."""
+"""Adversaries attack guarantees beyond the linear loop at their edge, as `make validate` does at length."""
 
 import pytest
 
 from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 
-#: the longest ones
+#: the guarantees whose tests take longest
 SLOW = ("limited, any environment", "energy budget")
 
 
@@ -12,7 +12,7 @@ SLOW = ("limited, any environment", "energy budget")
     "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GUARANTEES]
 )
 def test_requirements_suffice_and_much_less_fails(name):
-    """No motion and no lossless hand takes more than it may, at any tick; with too little some motion does."""
+    """With what a guarantee requires nothing takes too much energy at any tick; with far less a motion does."""
     rows = list(challenges(0, loops=1, hands=8, seconds=0.3, ticks=250, names=[name]))
     assert [row.factor for row in rows] == [ENOUGH, GUARANTEES[name][1]]
     enough, less = rows

@@ -1,4 +1,4 @@
-"""What a validation keeps when a worker dies or memory runs out, and that workers end with their parent."""
+"""A validation keeps finished batches if a worker dies or memory runs out; workers end with their parent."""
 
 import json
 import multiprocessing
@@ -32,7 +32,7 @@ def small_batches(monkeypatch):
 
 
 def kill_when_there(times: int, strangers) -> threading.Thread:
-    """Kill one new child process after another, so many of them, soon after each has started."""
+    """Start a thread that kills `times` child processes that are not in `strangers`, one after another."""
 
     def work() -> None:
         left = times
@@ -51,7 +51,7 @@ def kill_when_there(times: int, strangers) -> threading.Thread:
 
 
 def test_a_killed_worker_ends_the_validation():
-    """The batches that were finished keep the findings of a single run."""
+    """The finished batches have the findings of an undisturbed validation."""
     killer = kill_when_there(1, set(multiprocessing.active_children()))
     findings = validate(QUESTION, shards=2)
     killer.join()
@@ -79,7 +79,7 @@ def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
 
 
 def children(pid: int) -> list[int]:
-    """Of a process, from the kernel's own list."""
+    """Return the ids of a process's children, from the kernel's list."""
     return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
@@ -97,7 +97,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, wo
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while len(workers := children(process.pid)) < workers_and_their_clerk:  # the last keeps count of shared resources
+    while len(workers := children(process.pid)) < workers_and_their_clerk:  # one is the resource tracker
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(0.2)

@@ -41,7 +41,7 @@ def error(record, exact) -> float:
 
 @pytest.mark.parametrize(("integrator", "substeps", "order"), [("RK4", 1, 4), ("Euler", 8, 1), ("implicitfast", 8, 1)])
 def test_order_of_convergence(simulation, exact, integrator, substeps, order):
-    """Halving the step divides the error by 2^order; a tenth of an order is left to the next term."""
+    """Halving the step divides the error by 2^order; terms of higher order may change the order by 0.2."""
     errors = [
         error(run(simulation, make_engine(simulation, "mujoco", integrator, n)), exact)
         for n in (substeps, 2 * substeps)
@@ -50,13 +50,13 @@ def test_order_of_convergence(simulation, exact, integrator, substeps, order):
 
 
 def test_the_default_is_exact_to_1e_8(simulation):
-    """With the voluntary motion alone: the agreed accuracy of RK4 x 4, far from reached."""
+    """Without the tap the default engine is at least as accurate as was agreed for RK4 x 4."""
     quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
 
 def test_exact_engine_against_a_fine_integration(simulation):
-    """The matrix exponential against 20000 steps of classical Runge-Kutta, from a random state."""
+    """One step of the exact engine from a random state equals 20000 steps of classical Runge-Kutta."""
     held, continuous = simulation.plant, plant(simulation.scene.model)
     rng = np.random.default_rng(0)
     s, u = rng.normal(size=held.A.shape[0]), rng.normal(size=held.B.shape[1])
@@ -80,7 +80,7 @@ def test_discrete_integrator_loses_the_unstable_mode():
     truth = np.diff(run(loop, "exact").f[late], axis=0).std()
     fooled = np.diff(run(loop, make_engine(loop, "mujoco", "discrete", 12)).f[late], axis=0).std()
     assert dominant_mode(close(loop.plant, loop.F)).growth > 1.4
-    # what is left is the motion of the hands
+    # The remaining motion is that of the hands.
     assert fooled < 0.05 * truth
 
 
@@ -96,7 +96,7 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
         return driven(simulation.process, engine, outside, 200, state)
 
     alone = [follow(MujocoEngine(scene, scenario.T), start[:, [i]]) for i in range(3)]
-    # one buffer of three would sum the tick's product in another order, so each simulation runs its own
+    # A buffer of three simulations would sum a tick's product in another order, so each has its own buffer.
     batched = [follow(MujocoBatchEngine(alike(scene, 1), scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
     together = follow(MujocoBatchEngine(alike(scene, 3), scenario.T, nthread=2), start)
     for i in range(3):
@@ -105,7 +105,7 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
 
 
 def test_saturation_is_the_same_in_both_engines():
-    """Limits far below what the motion asks for: clipped from the start, without an instability to amplify."""
+    """The loop is stable and clips from the start, so no instability amplifies differences between engines."""
     devices = tuple(d.__class__(force_limit=0.05) for d in SHORT.device)
     loop = assemble(SHORT.replace(device=devices), PUBLISHED["I"])
     a, b = run(loop), run(loop, "exact")
@@ -115,7 +115,7 @@ def test_saturation_is_the_same_in_both_engines():
 
 
 def test_uncoupled_limit_cycle_stays_within_the_force_limit():
-    """Figure 5: sustained, bounded by 12 N; the exact engine gives 83.85 Hz and 9.62 N rms in channel 2."""
+    """The oscillation of Figure 5 is bounded by 12 N, with 83.85 Hz and 9.62 N rms in channel 2."""
     record = run(assemble(load(), NoCoupling()), "exact")
     force = record.f[-4000:, 1]
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size)))
@@ -164,7 +164,7 @@ def test_without_the_clock_everything_still_runs(monkeypatch, simulation):
 
 
 def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
-    """The same numbers as in memory; refused where neither has room, with the duration that has."""
+    """A trace on disk has the same numbers as in memory; without room, the error gives the longest duration."""
     expected, ticks = run(simulation, "exact"), simulation.scenario.samples
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(loop, "_SMALL", 0)
@@ -172,7 +172,7 @@ def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
     found = run(simulation, "exact")
     for name in ("t", "x", "f", "x_handle", "w", "z", "s"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    assert not any(tmp_path.iterdir())  # the file has no name, and goes with the trace
+    assert not any(tmp_path.iterdir())  # the trace's file has no name
     monkeypatch.setattr(loop, "_free_memory", lambda: 200 * ticks)
     with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .* allowed are 0.3 s"):
         run(simulation, "exact")

@@ -1,7 +1,6 @@
-"""The exponential engine: exact on linear scenes, first order where it cannot be, and MuJoCo's forces drive it.
+"""The exponential engine is exact on linear scenes and of first order on others; MuJoCo's forces drive it.
 
-`growth` is in 1/s; errors of maps are relative to the map's largest entry, in units where a velocity counts as much as
-the position that the fastest spring turns it into.
+Growth is in 1/s.
 """
 
 import mujoco
@@ -56,7 +55,7 @@ def stiff(transmission: float):
 
 
 def knocked(simulation, engine: Engine, ticks: int, start=None) -> Driven:
-    """A run that the voluntary motion of nobody disturbs: 5 N on both handles for 20 ticks."""
+    """Run without voluntary motion, with 5 N on both handles for 20 ticks."""
 
     def outside(first, count):
         w = np.zeros((count, simulation.scene.outside))
@@ -76,7 +75,7 @@ def simulation():
 
 
 def longer(matrix):
-    """exp in extended precision: a Taylor series of exp(A / 2^40) - 1, doubled forty times."""
+    """Return exp(matrix) in extended precision: a series of exp(matrix / 2^40) - 1, doubled 40 times."""
     part = matrix.astype(np.longdouble) / np.longdouble(2) ** 40
     term, less_one = np.eye(len(matrix), dtype=np.longdouble), 0
     for k in range(1, 12):
@@ -90,7 +89,7 @@ def longer(matrix):
 @pytest.mark.parametrize("T", [1e-5, 1.2e-3, 1e-2, 0.1])
 @pytest.mark.parametrize("stiffness", [14500.0, 1.45e6, 1e9])
 def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
-    """The measured map against the exponential, by scipy and in extended precision.
+    """The measured map equals exponentials by SciPy and in extended precision; velocities are divided by `fastest`.
 
     Rounding of the generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number;
     rounding of the result adds one `eps` for each term of its sums.
@@ -115,13 +114,13 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
 def test_growth_is_the_exact_loops(stiffness, coupling):
     loop = assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=stiffness),) * 2), coupling)
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
-    # the agreed accuracy of four Runge-Kutta steps is five decades behind, where they are enough at all
+    # Four Runge-Kutta steps, which are too few for the stiffer transmission, are less accurate.
     if stiffness == 14500.0 and coupling is PUBLISHED["I"]:
         assert abs(simulated_growth(loop, "RK4", 4) - exact_growth(loop)) > 1e-5
 
 
 def test_runs_equal_the_exact_engine_at_saturation():
-    """Half the devices' forces are clipped here; what MuJoCo clips and what the exact engine clips is the same."""
+    """MuJoCo and the exact engine clip forces in the same way."""
     devices = tuple(device.__class__(force_limit=0.05) for device in SCENARIO.device)
     loop = assemble(SCENARIO.replace(device=devices), PUBLISHED["I"])
     own, exact = (knocked(loop, make_engine(loop, name), 500) for name in ("mujoco", "exact"))
@@ -138,13 +137,14 @@ def test_more_substeps_change_nothing(simulation):
 
 
 def test_the_forces_are_mujocos(simulation):
-    """Springs changed behind the engine's back show: J is the old one, the accelerations are the new ones'. With a
-    wrong J the method is still consistent, of first order: halving the step halves what is left."""
+    """If springs change after the engine was built, J is old, but the accelerations are those of the new springs.
+
+    With a wrong J the method is of first order: halving the step halves the error."""
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
         engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
-        engine.model.tendon_stiffness[...] *= wrong  # of this engine alone
+        engine.model.tendon_stiffness[...] *= wrong  # the engine has a copy of the model
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
     old = hold(plant(simulation.scene.model), SCENARIO.T).A
@@ -154,7 +154,7 @@ def test_the_forces_are_mujocos(simulation):
 
 
 def _one_period(process: Process, engine: Engine, outside: int):
-    """What an engine does with every basis state."""
+    """Return an engine's map (8, 8) of plant states over one period, from every basis state."""
     columns = []
     buffer = StepBuffer(process, 1, 8, outside)
     for unit in 1e-6 * np.eye(8):
@@ -166,7 +166,7 @@ def _one_period(process: Process, engine: Engine, outside: int):
 
 
 def test_of_first_order_where_devices_rub():
-    """Against 64 Runge-Kutta steps. Coulomb friction switches within a step: 9e-6 m at 8 steps, where RK4 has 2e-9."""
+    """Coulomb friction switches within a step, so the error against RK4 x 64 only halves with the step."""
     loop = assemble(RUBBING, PUBLISHED["I"])
 
     def positions(integrator, substeps):
@@ -179,14 +179,14 @@ def test_of_first_order_where_devices_rub():
 
 
 def test_springs_need_mujocos_position_stage(simulation):
-    """A tendon's length is found in that stage: mj_forwardSkip without it leaves the old spring forces."""
+    """The position stage computes a tendon's length: mj_forwardSkip without it leaves the old spring forces."""
     data = mujoco.MjData(simulation.scene.model)
     mujoco.mj_forward(simulation.scene.model, data)
     data.qpos[0] = 1e-3
     mujoco.mj_forwardSkip(simulation.scene.model, data, mujoco.mjtStage.mjSTAGE_POS, 1)
     skipped = data.qacc.copy()
     mujoco.mj_forward(simulation.scene.model, data)
-    # 14500 N/m through 1 mm on a motor of 0.06 kg
+    # A spring of 14500 N/m, stretched by 1 mm, acts on a motor of 0.06 kg.
     assert data.qacc[0] == pytest.approx(-14.5 / 0.06, rel=1e-9)
     assert skipped[0] == 0.0
 
@@ -200,7 +200,7 @@ def hands(count: int) -> Crowd:
 
 
 def test_a_batch_is_a_loop_over_single_engines(simulation):
-    """One simulation bit for bit; of several only the sums of their products run in another order."""
+    """A batch of one equals a single engine bit for bit; a batch of several sums products in another order."""
     start = 1e-3 * np.random.default_rng(0).normal(size=(8, 3))
 
     def batch(nsim, nthread=1):
@@ -217,7 +217,7 @@ def test_a_batch_is_a_loop_over_single_engines(simulation):
 
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_many_hands_are_each_their_own_scene(substeps):
-    """Against an engine for each one's own compiled scene, and against the exact batch."""
+    """Each simulation of a batch equals that of its own compiled scene, and that of the exact batch."""
     crowd = hands(5)
     held_by = variants(SCENARIO.device, crowd)
     loop = assemble(SCENARIO, PUBLISHED["I"])
@@ -233,7 +233,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
 
 
 def test_many_sampled_plants_are_as_exact_as_one():
-    """The stack of exponentials, and that of one plant, against SciPy's: all round by 1e-16 of the largest entry."""
+    """Exponentials of a stack and of one plant equal SciPy's; all round by 1e-16 of the largest entry."""
     plants = variants(SCENARIO.device, hands(20)).plants()
     together = hold(plants, SCENARIO.T)
     n, inputs = plants.B.shape[1:]
@@ -246,14 +246,14 @@ def test_many_sampled_plants_are_as_exact_as_one():
             np.testing.assert_allclose(np.hstack(own), step, rtol=1e-12, atol=1e-14 * np.abs(step).max())
 
 
-# ---- which one, and how many substeps
+# ---- the default integrator and number of substeps
 
 
 def test_the_default_follows_from_the_scene(simulation):
     rubbing = assemble(RUBBING, PUBLISHED["I"])
     assert (default_integrator(simulation.scene), default_substeps(simulation, EXPONENTIAL)) == (EXPONENTIAL, 1)
     assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
-    # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
+    # A stiff linear scene needs one exponential step, but 32 Runge-Kutta steps.
     assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
     assert default_substeps(stiff(1.45e6), "RK4") == 32
     assert _check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
@@ -288,7 +288,7 @@ def test_what_is_refused_is_named(simulation, call, message):
 
 
 def test_heavy_hands_need_no_substeps():
-    """The hard case of the rule: a 1 g handle without human damping, where Runge-Kutta asks for 24 steps at least."""
+    """A 1 g handle in an undamped hand needs at least 24 Runge-Kutta steps, but one exponential step."""
     device = CompliantDevice(handle_mass=1e-3)
     human = Human((Link(0.0, 0.0, 300.0),))
     loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2), PUBLISHED["I"])
@@ -296,7 +296,7 @@ def test_heavy_hands_need_no_substeps():
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
 
 
-# ---- which one keeps an error
+# ---- the cheapest setting within an error
 
 
 def cheapest(loop, error, ticks):
@@ -312,7 +312,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """The reference knows 64 steps, which the search does not look at."""
+    """Against RK4 x 64 the chosen setting keeps the error; half its substeps exceed a quarter of it."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -324,20 +324,20 @@ def test_friction_keeps_the_error_with_fewest_steps():
     truth = positions("RK4", 64)
     for asked, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-4, ("RK4",)), (1e-6, ("RK4",))):
         found = cheapest(loop, asked, ticks)
-        assert found.integrator in expected  # of the first two the cheaper one changes with the load
+        assert found.integrator in expected  # which of two is cheaper depends on the machine's load
         assert missed(found.integrator, found.substeps) <= found.position_relative_rms <= asked
         if found.substeps > 1:
             assert missed("RK4", found.substeps // 2) > asked / 4
 
 
 def test_what_the_finest_run_misses_is_no_chance():
-    """Of x + c/n it is c/n, and half as much for safety; of slower contraction q the sum q + q^2 + .. of the last."""
+    """For runs x + c/n the bound is 1.5 c/n; for slower contraction q it is the last gap times q + q^2 + ..."""
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
-    assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding does not contract, and need not
+    assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding errors need not contract
     assert _missed([0.0, 0.0, 0.0]) == 0
-    # two omegas that rub by .02 N, without a coupling, for 6 s: differences, and distances from a run with 512 substeps
+    # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the distance from 512 substeps.
     gaps = [1.05, 0.167, 0.0794, 0.0849, 0.0183, 0.0117]
     for count, apart in ((3, 9.76e-2), (4, 1.29e-2), (5, 3.11e-2), (6, 1.97e-2)):
         assert _missed(gaps[:count]) > apart
@@ -359,7 +359,7 @@ def test_errors_that_nothing_keeps(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """The third would be one of the many that the first two foretell: 100 ticks of 512 steps of 4 evaluations."""
+    """The first two runs foretell 100 ticks of 512 steps of 4 evaluations, so that no third run begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
@@ -369,7 +369,7 @@ def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
 
 
 def test_a_wrong_verdict_is_shown_and_never_chosen():
-    """Explicit Euler calls the loop without a coupling stable, so its errors do not matter."""
+    """Euler calls the uncoupled loop stable, so it is not chosen, however large an error is allowed."""
     choices = {c.name: c for c in compare_engines(assemble(SCENARIO, NoCoupling()), 1.0, 200)}
     assert not choices["Euler x 1"].verdict_correct
     assert choices["RK4 x 1"].verdict_correct
@@ -389,13 +389,13 @@ def test_engines_are_compared_on_the_actual_run():
 
 
 def test_the_cross_check_finds_wrong_matrices(monkeypatch):
-    """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
+    """RK4 has no J, so it reveals an exponential engine whose J is wrong by one part in a thousand."""
     loop = assemble(SCENARIO.replace(duration=0.5), PUBLISHED["I"])
     sound = cross_check(
         loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EngineSettings("mujoco", EXPONENTIAL, 1)
     )
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
-    assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
+    assert sound.position_relative_rms < 1e-6  # the error of RK4 x 4
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
     wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
     monkeypatch.setattr(engines, "_step_of", lambda *_: wrong_step)
@@ -414,10 +414,10 @@ def test_phi_matches_expm_for_many_sizes():
     for n in (1, 4, 14):
         matrices = rng.normal(size=(40, n, n)) * np.geomspace(1e-8, 30, 40)[:, None, None]
         exact = np.array([longer(matrix) for matrix in matrices])
-        # the exponential's own sensitivity: rounding A by 1e-16 of its norm moves exp(A) by that norm times as much
+        # Rounding A by 1e-16 of its norm moves exp(A), relative to its size, by 1e-16 times the norm.
         allowed = 1e-14 * (1 + np.abs(matrices).sum(axis=1).max(axis=1)) * np.abs(exact).max(axis=(1, 2))
         assert (np.abs(expm_each(matrices) - exact).max(axis=(1, 2)) <= allowed).all()
-        # scipy's, of the same method, is no nearer: by up to 3e-13 of the largest entry
+        # SciPy's expm uses the same method; it errs by up to 3e-13 of the largest entry.
         np.testing.assert_array_less(np.abs(expm(matrices) - exact).max(axis=(1, 2)), 50 * allowed)
 
 
