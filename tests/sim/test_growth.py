@@ -1,4 +1,4 @@
-"""Growth told from displacements alone: known rates come back, people and encoders are not taken for oscillations."""
+"""Displacements alone give known growth rates; voluntary motion and encoder steps are no oscillations."""
 
 import json
 
@@ -19,7 +19,7 @@ T, STEP = 1.2e-3, np.full(2, 1e-6)
 
 
 def motion(seconds, *modes):
-    """A person's 15 mm at 0.6 Hz, with modes (amplitude at the end [m], frequency [Hz], growth [1/s]), rounded."""
+    """Return a motion of 15 mm at 0.6 Hz plus modes (final amplitude [m], frequency [Hz], growth [1/s]), rounded."""
     t = T * np.arange(round(seconds / T))
     x = 15e-3 * np.sin(2 * np.pi * 0.6 * t + 0.3)
     for size, frequency, rate in modes:
@@ -31,7 +31,7 @@ def motion(seconds, *modes):
     ("frequency", "rate"), [(f, g) for f in (6.2, 84.0) for g in (-3.0, -0.5, 0.4, 1.5)] + [(84.0, 6.0)]
 )
 def test_a_known_rate_comes_back(frequency, rate):
-    """To four standard errors, and 0.02 1/s for what is left of the person's motion in the slowest octave."""
+    """Rates are right to four standard errors plus 0.02 1/s for the voluntary motion in the slowest octave."""
     found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
     assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
     assert found.error_per_s < 0.2
@@ -40,7 +40,7 @@ def test_a_known_rate_comes_back(frequency, rate):
 
 
 def test_the_error_of_a_rate_is_its_scatter():
-    """Over traces that differ by noise alone: the root mean square of the reported errors, within a third."""
+    """The rms of reported errors equals the scatter of rates over traces with different noise, within a third."""
     rng, truth = np.random.default_rng(3), 0.3
     clean = motion(6.0, (4e-4, 60.0, truth))
     found = [growth(clean + 1e-4 * rng.normal(size=clean.shape), T, STEP) for _ in range(60)]
@@ -56,7 +56,7 @@ def test_a_person_and_an_encoder_are_no_oscillation():
 
 
 def test_brief_flicker_below_the_named_size_is_nothing():
-    """0.6 um at 5 Hz that decays within a second: above the floor of its own octave, below the 1.1 um that is named."""
+    """A decaying 5 Hz mode has 0.6 um in the first window: above its octave's floor, but below 1.1 um."""
     found = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
     assert found.reason == "nothing oscillates above 1.1 um"
 
@@ -81,7 +81,7 @@ def test_a_limit_cycle_neither_grows_nor_decays():
 
 
 def test_the_exact_engines_growth_without_its_states():
-    """The loop without coupling, people moving: its eigenvalue, to the 1e-3 1/s that sim.stability is held to."""
+    """Without coupling, while people move, the rate is the eigenvalue's within 1e-3 1/s."""
     simulation = assemble(load().replace(duration=6.0), NoCoupling())
     exact = dominant_mode(close(simulation.plant, simulation.F)).growth
     record = run(simulation, "exact")
@@ -113,7 +113,7 @@ def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
     (part,) = json.loads(capsys.readouterr().out)["growth"]
     report = json.loads((tmp_path / "report.json").read_text())
     assert part["growth_rate_per_s"] == pytest.approx(report["stability"]["exact_growth_rate_per_s"], abs=1e-3)
-    assert part["stop"] == report["run"]["steady_ticks"][0][1] < report["run"]["samples"]  # it clips at last
+    assert part["stop"] == report["run"]["steady_ticks"][0][1] < report["run"]["samples"]  # the run clips at its end
     assert (tmp_path / "again.png").stat().st_size > 10_000
     assert trace.main([str(path)]) == 0
     assert "1/s at 84" in capsys.readouterr().out
@@ -162,10 +162,10 @@ def test_an_empty_trace_or_none_is_one_line(tmp_path):
 
 
 def alike():
-    """Two devices and hands alike that move alike, joined so stiffly that they buzz against each other.
+    """Return two equal devices and hands with equal motions, joined so stiffly that a mode between them grows.
 
-    A kernel may add the two halves of a row in different orders. A tick then excites the mode by one rounding, 2e-16 of
-    the state, and it grows by 33/s: the sum over 0.35 s is 6e-10, below the 1e-8 that counts as excited.
+    A BLAS kernel may add the two halves of a row in different orders. A tick then excites the mode by one rounding,
+    2e-16 of the state. The mode grows by 33/s: the sum over 0.35 s is 6e-10, below the 1e-8 that counts as excited.
     """
     one = load("omega-pair")
     link = {"between": ["contact 1", "contact 2"], "stiffness": 2000.0}
@@ -194,9 +194,9 @@ def ran(scenario, engine):
 
 
 def test_no_trace_contradicts_its_eigenvalues():
-    """Number 11 is of two devices that nothing joins: one would buzz, only the other is moved.
+    """Trace 11 has two devices that nothing joins: one is unstable, but only the other moves.
 
-    `make validate` does so for 460.
+    `make validate` checks 460 traces.
     """
     found = list(traces(1, 40))
     assert [row for row in found if not row.holds] == []

@@ -1,4 +1,4 @@
-"""Numerically hard loops: each with the setting that fails, where there is one, and the one that holds."""
+"""In numerically hard loops some settings of integrators fail, but those that the rule picks hold."""
 
 import math
 from functools import partial
@@ -22,14 +22,14 @@ from tests.checks.hard import cases, devices, measure, nominal
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """By its GROWTH and POSITION; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
+    """`checks.hard` defines when a setting holds; the rule's choice has the exact verdict and growth to 1e-2 1/s."""
     row = measure(hard)
     assert row.holds, row
 
 
 @pytest.mark.parametrize(("side", "wrong"), [(-0.1, None), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
 def test_within_a_tenth_of_the_boundary(side, wrong):
-    """Damping tuned by bisection until the exact growth is +-0.1 1/s: RK4 by the rule sees it, cheaper settings do not.
+    """With damping for an exact growth of +-0.1 1/s, RK4 by the rule has the right verdict; cheaper settings do not.
 
     MuJoCo's integrators err towards stable: inside the boundary none of them has the wrong verdict.
     """
@@ -50,7 +50,7 @@ def test_within_a_tenth_of_the_boundary(side, wrong):
 
 
 def test_the_limit_cycle_of_saturation():
-    """Uncoupled, channel 2 over the last 4.8 of 15 s: 83.85 Hz and 9.63 N in RK4 x 4 too; Euler x 1 has none."""
+    """Uncoupled, channel 2 oscillates with 9.63 N at 83.85 Hz, in RK4 x 4 too, but not in Euler x 1."""
     loop = assemble(load(), NoCoupling())
     cycles = [
         _limit_cycle(run(loop, make_engine(loop, *setting)), 1)
@@ -65,7 +65,7 @@ def test_the_limit_cycle_of_saturation():
 
 
 def quiet(loop):
-    """Nobody pushes."""
+    """Return the outside forces of a run in which nobody pushes."""
     return lambda first, ticks: np.zeros((ticks, loop.scene.outside))
 
 
@@ -99,7 +99,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 @pytest.mark.slow
 def test_clipping_breaks_certificates_that_damped_hands_mend():
-    """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
+    """A coupling that is certified for the linear loop keeps clipping with lossless hands, not with damped ones."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=30)
     print(f"lossless hands: {far:.1%} of 60 far and {near} of 30 near starts clip after 48 s, at {frequency:.2f} Hz")
@@ -109,7 +109,7 @@ def test_clipping_breaks_certificates_that_damped_hands_mend():
 
 
 def test_encoder_steps_move_traces_less_than_a_step():
-    """Steps of 1e-5 m: both engines stay within one of the ideal encoder; left alone the devices come to rest."""
+    """With encoder steps, motions stay within a step of the ideal encoder's, and idle devices within a step of 0."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (run(assemble(s, PUBLISHED["I"]), "exact") for s in (scenario, coarse))
@@ -127,7 +127,7 @@ def test_encoder_steps_move_traces_less_than_a_step():
 @pytest.mark.slow
 @pytest.mark.parametrize("minutes", [10, pytest.param(60, marks=pytest.mark.validate)])
 def test_long_runs_do_not_drift(minutes):
-    """Motions of 0.6 Hz repeat every 12500 ticks of 1.2 ms, so that the last period equals one of the first minute."""
+    """Motions of 0.6 Hz repeat every 12500 ticks of 1.2 ms, so the last period equals one after the first minute."""
     loop = assemble(load().replace(tap=None), PUBLISHED["I"])
     period, ticks = 12_500, minutes * 50_000
     outside, rest, kept = partial(outside_forces, loop.scenario, loop.scene), np.zeros((loop.plant.A.shape[0], 1)), {}
@@ -139,9 +139,9 @@ def test_long_runs_do_not_drift(minutes):
     run_blocks(loop.process, make_engine(loop, "exact"), outside, ticks, rest, look, period)
     early, late = kept.values()
     drift = np.abs(late - early).max()
-    print(f"{minutes} minutes: {drift:.1e} m between the first minute and the last")
+    print(f"{minutes} minutes: {drift:.1e} m between the periods after the first minute and at the end")
     assert drift < 1e-12
-    # an accumulated clock would have missed ticks, a counter cannot
+    # A sum of periods would miss ticks; a counter cannot.
     accumulated = np.cumsum(np.full(ticks, loop.scenario.T))
     missed = (np.floor(accumulated / loop.scenario.T) != np.arange(1, ticks + 1)).sum()
     print(f"an accumulated clock is one tick off at {missed} of {ticks} ticks")
@@ -156,7 +156,7 @@ def test_a_rule_that_cannot_be_met_says_so():
 
 
 def test_the_loop_runs_from_any_state():
-    """Both engines agree from a random start under the rule's setting, for the stiffest transmission."""
+    """Both engines agree from a random start under the rule's setting, for a stiff transmission."""
     loop = assemble(devices(transmission_stiffness=1e6), PUBLISHED["I"])
     start = 1e-3 * np.random.default_rng(0).normal(size=(loop.plant.A.shape[0], 1))
 

@@ -1,4 +1,4 @@
-"""The force of the ideal environment for a run's own motion, against a convolution written out here."""
+"""The ideal environment's forces for a run's motion equal those of equations written out here."""
 
 import json
 
@@ -17,10 +17,10 @@ SCENARIO = load()
 
 
 def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
-    """Figure 4's network by backward Euler, in the unknowns of mechanics: no state space, no Lti.
+    """Return the forces of Figure 4's network by backward Euler in positions, without a state space.
 
-    The mass M (1 kg) between spring-dampers (800, 1) and (700, 1): (M/T^2 + D/T + K) q = M (2 q- - q--)/T^2 + the
-    pull of both contacts; the force of contact i is what its spring-damper pulls, `late` samples later.
+    The mass M (1 kg) is between spring-dampers (800, 1) and (700, 1): (M/T^2 + D/T + K) q = M (2 q- - q--)/T^2 + the
+    pull of both contacts. The force of contact i is that of its spring-damper, `late[i]` samples later.
     """
     k, b, M = np.array([800.0, 700.0]), np.array([1.0, 1.0]), 1.0
     q, before, x_old, forces = 0.0, 0.0, np.zeros(2), []
@@ -45,7 +45,7 @@ def test_the_ideal_force_follows_the_measured_motion(case, late):
     record = record_of(simulation, 2.0)
     alike = force_error(simulation, record, SCENARIO.loop(case).lam)
     expected = by_hand(SCENARIO.T, record.x, late)
-    # 1700 ticks of a lightly damped mass in another order of operations
+    # the rounding of 1700 ticks of a lightly damped mass
     np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
     asked = record.f
     np.testing.assert_allclose(alike.asked, asked, atol=1e-12)  # nothing is clipped here
@@ -62,7 +62,7 @@ def test_responses_equal_impulse_convolution():
 
 
 def test_uncoupled_loops_are_ideal_despite_clipping():
-    """F = Theta E = Lambda E: what it asks for is exactly right, and it is unstable."""
+    """F = Theta E = Lambda E, so the forces before clipping are exactly right, although the loop is unstable."""
     simulation = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
     record = record_of(simulation, 6.0)
     assert np.abs(record.f).max() == 12.0
@@ -83,7 +83,7 @@ def test_undefined_errors_have_a_reason():
 
 @pytest.mark.slow
 def test_the_command_ranks_the_designs(tmp_path):
-    """The optimum renders case I to half a percent; any-environment's spring-damper is about half of the force off."""
+    """The optimal coupling's error is below a fifth of this-environment's, which is below half of any-environment's."""
     errors = {}
     for name, condition in (
         ("optimal", None),

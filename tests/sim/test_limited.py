@@ -1,4 +1,4 @@
-"""Runs whose forces are limited: where a guarantee covers them, what the report says, and both engines."""
+"""Runs with limited forces have the right guarantee in the report, and are equal in both engines."""
 
 import json
 
@@ -23,7 +23,7 @@ BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited f
 
 
 def weak(*limits):
-    """The default scenario with motors of these largest forces [N]."""
+    """Return two seconds of the default scenario with these force limits [N]."""
     base = load()
     devices = tuple(msgspec.structs.replace(d, force_limit=f) for d, f in zip(base.device, limits, strict=True))
     return base.replace(device=devices, duration=2.0)
@@ -45,7 +45,7 @@ def test_which_limiter_a_coupling_may_have():
 
 
 def test_the_proved_limiter_is_what_runs(tmp_path):
-    """beta = 0.03 on file, where 0.01 is usual; in a loop with other damping the same beta with a multiplier anew."""
+    """A run uses the file's limiter, beta = 0.03 instead of 0.01; with other damping beta stays and c is new."""
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
@@ -65,7 +65,7 @@ def test_the_proved_limiter_is_what_runs(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
 def test_both_engines_agree_on_limited_forces(coupling, rho):
-    """To 1e-9 of the motion of 3 cm, with forces at their limits a good part of the time; |f| never exceeds them."""
+    """Motions of 3 cm agree to 1e-9 although forces are often at their limits, which they never exceed."""
     limits = np.array([0.3, 0.2])
     simulation = assemble(weak(*limits), coupling, rho)
     exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))
@@ -79,7 +79,7 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
 @pytest.mark.parametrize("limit", [0.69, 1e3])
 def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
-    """Also where forces want to be limited here and there, and the plant goes back: the sums alone are others."""
+    """Runs in blocks equal runs tick by tick up to rounding, also if a block must be undone from a limited tick on."""
     simulation = assemble(weak(limit, limit).replace(duration=5.0), BUILT, (11.4167, 11.4167))
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
     fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))

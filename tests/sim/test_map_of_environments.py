@@ -1,4 +1,4 @@
-"""The K-B map of a fixed coupling: figures against closed forms and dense sweeps, and what the command says of them."""
+"""The K-B map of a fixed coupling equals closed forms and dense sweeps, and the command reports it."""
 
 import json
 
@@ -30,13 +30,13 @@ def around(scenario, coupling):
 
 @pytest.fixture(scope="module")
 def optimal():
-    """Of three channels one over a small basis."""
+    """Return the optimal coupling of each scenario; that of three channels has a small basis."""
     small = design(STAR.loop("I"), Options(bases=((6, 4),)))
     return {PAIR.name: choose(PAIR, "I", "optimal").coupling, STAR.name: small.coupling}
 
 
 def densely(sweep, coupling_force, K, B):
-    """Required over available damping at 60010 frequencies, from the network's equations alone."""
+    """Return required over available damping from 60010 frequencies and the network's equations alone."""
     w = np.concatenate([np.geomspace(1e-6, 1e-5, 10), np.linspace(1e-5, np.pi, 60_000)])
     z = on_circle(w)
     T, (M, D, S) = sweep.loop.T, sweep.loop.network.matrices()
@@ -55,15 +55,15 @@ def densely(sweep, coupling_force, K, B):
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
-    """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2.
+    """The tolerance is 1e-5: between points 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2.
 
-    Beside the slowest pole, 0.0015 from 1, what binds at 0 is larger by (1e-6/0.0015)^2 than at the map's first point.
+    With the slowest pole 0.0015 from 1, a supremum at 0 exceeds the value at 1e-6 rad/sample by (1e-6/0.0015)^2.
     """
     coupling = optimal[scenario.name]
     sweep = around(scenario, coupling)
     responses = {}
 
-    def filtered(z, E):  # at the same frequencies in every environment
+    def filtered(z, E):  # the frequencies are those of every environment
         if not responses:
             responses["R"] = coupling.filter(scenario.T).at(z)
         return responses["R"] @ E
@@ -75,7 +75,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
 
 
 def test_the_model_of_a_pair_may_stay_behind():
-    """With V = Q (I - E0 Q)^-1 from the network of the scenario, in the pair's own environment the two are one loop."""
+    """`model kept` uses V = Q (I - E0 Q)^-1 with the scenario's E0, and so differs from this-environment elsewhere."""
     coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)
 
@@ -98,7 +98,7 @@ def test_bare_walls_match_colgates_condition():
     sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
     needed = sweep.ratios("this-environment", K, B) * sweep.loop.delta[0]
-    # near w = 0, at 1e-5 rad/sample, 1e-16 of rounding is 1e-11 of F/(z-1), and that is K T/w large
+    # At w = 1e-5 rad/sample rounding by 1e-16 becomes 1e-11 of F/(z-1), which has the size K T/w.
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
 
@@ -110,7 +110,7 @@ def test_constant_requirements_are_equal_in_all_cells():
 
 
 def test_hands_meet_the_cells_own_environment(optimal):
-    """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
+    """The growth with each hand equals that of its own loop, closed with the cell's force map."""
     sweep = around(PAIR, optimal["omega-pair"])
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 1, 12, 1)
     F = sweep.force_maps(np.array([300.0, 3000.0]), np.array([0.5, 0.5]))[0]

@@ -1,5 +1,7 @@
-"""One optimal coupling of each form wherever a coupling can run: a filter that covers limited forces, one behind an
-environment with delay and a free mass (psi = 1), and the pair of version 0.1 in a file of version 1."""
+"""Optimal couplings of each form run wherever a coupling can run.
+
+The forms are a filter that covers limited forces, a filter behind a delayed environment (psi = 1) with a free mass, and
+a pair: Q and a model of the environment, as in version 0.1."""
 
 import json
 import shutil
@@ -42,7 +44,7 @@ CC = shutil.which("gcc") or shutil.which("cc")
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """form -> (scenario, its name in commands, file of the coupling)."""
+    """Return form -> (scenario, its name in commands, file of the coupling)."""
     folder, made = tmp_path_factory.mktemp("optimal"), {}
     for form, name in zip(FORMS, ("omega-pair", str(FREE_MASS), "omega-pair"), strict=True):
         scenario = load(name)
@@ -58,7 +60,7 @@ def files(tmp_path_factory):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_its_file_proves_and_drives_the_process(files, form):
-    """The forces are the convolution with an impulse response that comes from R, Psi and E on a circle |z| = 1.05."""
+    """The forces are a convolution with the impulse response that samples of F on the circle |z| = 1.05 give."""
     scenario, _, path = files[form]
     stored, loop = load_file(path), scenario.loop("I")
     assert verify(stored).proved
@@ -117,7 +119,7 @@ def test_its_export_repeats_to_the_last_bit(files, form, tmp_path):
 
 
 class _Never(Executor):
-    """No other coupling is made in the background."""
+    """An executor that never runs a task, so that no other coupling is designed."""
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
         return Future()
@@ -131,7 +133,7 @@ def test_the_live_window_equals_the_simulator(files, form):
     frame = running.frame(0.25)
     ticks = round(frame.t / scenario.T)
     record = close_loop(shown.simulation, "exact", ticks=ticks + 1)
-    np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)  # sums of ninety states
+    np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)  # rounding in sums of 90 states
 
 
 @pytest.mark.parametrize("form", ["filter", "pair"])

@@ -1,4 +1,4 @@
-"""Nobody destabilises the optimal coupling: random and lossless hands, compliant and rigid devices, both engines."""
+"""No random or lossless hand destabilises the optimal coupling, on compliant or rigid devices, in both engines."""
 
 from functools import cache
 
@@ -20,7 +20,7 @@ HUMANS = 100
 
 @cache
 def optimal() -> Coupling:
-    """One coupling for both scenarios: the design sees of a device only its damping, which is the same."""
+    """Return the coupling of both scenarios: a design depends on a device's damping only, which is equal."""
     return choose(load(), "I", "optimal").coupling
 
 
@@ -30,7 +30,7 @@ def hands(lossless: bool) -> Crowd:
     links = np.stack([draw(population, 2, 11, i, 2) for i in range(HUMANS)])
     if lossless:
         links[..., 1] = 0.0
-        # modes up to some 2000 rad/s: beyond, MuJoCo's step would decide and not the hand
+        # Modes are below 2000 rad/s, because above MuJoCo's step would decide, not the hand.
         rng = np.random.default_rng(12)
         links[..., 0] = np.exp(rng.uniform(np.log(0.01), np.log(3.0), links.shape[:-1]))
         links[..., 2] = np.exp(rng.uniform(np.log(0.1), np.log(1e4), links.shape[:-1]))
@@ -44,7 +44,7 @@ def held(scenario: str, lossless: bool) -> Variants:
 
 @cache
 def exact_growth(scenario: str, lossless: bool) -> np.ndarray:
-    """(HUMANS,) [1/s], with the optimal coupling."""
+    """Return the growth (HUMANS,) [1/s] with the optimal coupling."""
     return dominant_mode(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
 
 
@@ -55,7 +55,7 @@ def test_the_same_coupling_is_designed_for_both():
 
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_hundreds_of_hands_are_stable(scenario, lossless):
-    """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
+    """Slow modes of lossless hands are on the unit circle, up to the rounding of eigenvalues."""
     growth = exact_growth(scenario, lossless)
     assert growth.size == HUMANS
     assert growth.max() < _DESTABILISED
@@ -66,7 +66,7 @@ def test_hundreds_of_hands_are_stable(scenario, lossless):
 
 @pytest.mark.parametrize("scenario", DEVICES)
 def test_the_same_hands_upset_the_loop_without_coupling(scenario):
-    """Else the tests above would show nothing. Rigid devices take a lossless hand: no random one is enough for them."""
+    """Without coupling these hands destabilise the loop; on rigid devices only some lossless ones do."""
     F = assemble(load(scenario), NoCoupling()).F
     upset = {}
     for lossless in (False, True):
@@ -79,7 +79,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_mujoco_says_the_same(scenario, lossless):
-    """The eigenvalues of MuJoCo's own one-period map, for all of them."""
+    """The eigenvalues of MuJoCo's one-period map give the exact verdict for every hand."""
     simulation = assemble(load(scenario), optimal())
     mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), simulation.process)).growth
     assert mujoco.max() < _DESTABILISED
@@ -89,7 +89,7 @@ def test_mujoco_says_the_same(scenario, lossless):
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", [pytest.param(DEVICES[0], marks=pytest.mark.validate), DEVICES[1]])
 def test_no_adversary_succeeds(scenario):
-    """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
+    """This search is short; `python -m sim.validate --coupling optimal --adversary` runs a long one."""
     place = load(scenario)
     worst = search(place, assemble(place, optimal()).F, seed=3, generations=1)
     assert not worst.destabilises
