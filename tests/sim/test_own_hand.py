@@ -1,4 +1,4 @@
-"""A user's own hand, written in this file, in the whole chain: both engines, verdicts, random draws."""
+"""A user's own class of hands, written here, works in both engines, in verdicts and in random draws."""
 
 import json
 from dataclasses import dataclass, replace
@@ -22,14 +22,15 @@ from haptic_loop.sim.scenario import InputError, _load_humans
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.verdicts import disagreement_words
 
-AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
+AGREE = 1e-6  # largest relative rms difference between the engines' positions
 SCENARIO = load().replace(duration=1.5)
 
 
 @dataclass(frozen=True)
 class Muscle:
-    """A hand with a muscle after Hill: the contractile part's damping behind a series elastic part, so that its force
-    lags behind the motion by damping / elastic; a parallel spring; the tissue between them weighs something."""
+    """A hand with Hill's muscle: a damper behind a series spring, the tissue's mass between them, a parallel spring.
+
+    The muscle's force lags behind the motion by damping / elastic."""
 
     mass: float = 0.25  # [kg]
     elastic: float = 400.0  # [N/m]
@@ -49,7 +50,7 @@ class Muscle:
 
 
 class MuscleBySpace(Muscle):
-    """The same hand as velocity -> force; states: the elastic part's length, the tissue's speed, the hand's place."""
+    """`Muscle` as a state space; states: length of the series spring, speed of the tissue, position of the hand."""
 
     def port(self):
         k, b, m = self.elastic, self.damping, self.tissue
@@ -58,7 +59,7 @@ class MuscleBySpace(Muscle):
 
 
 class Light(Muscle):
-    """Without the tissue's mass: g/(1 + tau s), one state. A body cannot weigh nothing, so MuJoCo has no such hand."""
+    """`Muscle` without the tissue's mass, as a state space, because a body of MuJoCo cannot be massless."""
 
     def port(self):
         tau = self.damping / self.elastic
@@ -84,18 +85,18 @@ def test_both_engines_simulate_it_and_agree():
 
 
 def test_matrices_and_bodies_give_equal_runs():
-    """No body, but the same hand: the same trace to rounding."""
+    """The state space of a hand gives the trace of its bodies, up to rounding."""
     bodies, space = (
         simulate(held_by(hand, hand), PUBLISHED["I"], engine="exact") for hand in (Muscle(), MuscleBySpace())
     )
-    # the sum of 1250 ticks' rounding
+    # The rounding of 1250 ticks adds up.
     assert rms(space.x, bodies.x) < 1e-9
     assert rms(space.v_handle, bodies.v_handle) < 1e-9
     assert rms(space.f, bodies.f) < 1e-9
 
 
 def test_the_tissue_s_mass_goes_to_nothing():
-    """Half the mass, half the difference to the hand without it."""
+    """Half the tissue's mass halves the difference to the hand without tissue."""
     light = simulate(held_by(Light(), Light()), PUBLISHED["I"], engine="exact").x
     off = [
         rms(simulate(held_by(h, h), PUBLISHED["I"], engine="exact").x, light)
@@ -129,7 +130,7 @@ def test_where_devices_rub_runge_kutta_moves_an_impedance():
     with pytest.raises(InputError, match=r"a human has an impedance .* and a device has friction: use integrator RK4"):
         make_engine(simulation, "mujoco", "exponential")
     coarse, fine = (run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x for n in (4, 16))
-    assert rms(coarse, fine) < 1e-4  # of first order where a device sticks
+    assert rms(coarse, fine) < 1e-4  # RK4 is of first order where a device sticks
 
 
 def test_impedance_populations_agree_in_both_engines():
@@ -152,7 +153,7 @@ class Muscles:
 
 
 def test_own_hand_populations_agree_in_both_engines():
-    """Uncoupled, some of the hands set the loop off; the engines agree on which, and repeats repeat."""
+    """Uncoupled, some hands make the loop unstable; the engines agree which, and a repetition gives equal numbers."""
     scenario = SCENARIO.replace(population=Muscles())
     found = validate(scenario, None, humans=40, duration=0.5)
     assert 0 < (found.exact > 0).sum() < 40
@@ -166,11 +167,11 @@ def test_own_hand_populations_agree_in_both_engines():
     again = validate(scenario, None, humans=10, duration=0.0, engine="exact")
     np.testing.assert_array_equal(again.exact, found.exact[:10])
     assert found.mass.shape == (40,)
-    assert (found.damping == 0).all()  # the elastic part has none
+    assert (found.damping == 0).all()  # the series spring has none
 
 
 def test_the_adversary_searches_what_the_population_draws():
-    """A worse set than random draws of the same number meet, of hands that were drawn, and its growth is the loop's."""
+    """The search finds a worse set than a quarter as many draws; its hands were drawn, its growth is the loop's."""
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
     F = assemble(scenario, NoCoupling()).F
@@ -278,7 +279,7 @@ def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
 
 
 def test_a_measured_hand_and_a_population_from_files(tmp_path):
-    """A transfer function in TOML is checked and run; a Python file may say who is drawn."""
+    """A state space in TOML is checked and simulated; a Python file may define a population."""
     file = tmp_path / "hands.toml"
     space = "[[human]]\nmass = 0.2\nA = [[-30.0]]\nB = [[1.0]]\nC = [[{C}]]\nD = [[2.0]]\n"
     chain = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
@@ -321,7 +322,7 @@ def test_a_state_space_is_no_coupling():
 
 
 def test_a_population_on_a_wall():
-    """Verdicts are of the worst frozen contact state, by both engines; contact is made and energy kept account of."""
+    """Both engines' verdicts are those of the worst frozen contact state; traces touch the wall and give no energy."""
     scenario = load("one-wall")
     coupling = design_coupling(scenario.loop("I"), "spring-damper", "any-environment")
     found = validate(scenario, coupling, humans=20, duration=2.0)
@@ -329,7 +330,7 @@ def test_a_population_on_a_wall():
     assert not found.disagreements.any()
     assert found.contacts.sum() > 10
     assert (found.energy >= -1e-9 * found.audited).all()
-    # by the loops themselves: open and touching, each with this human
+    # The growth is the larger one of the open and the touching loop with this human.
     simulation = assemble(scenario, coupling.coupling)
     crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
     plant = hold(variants(scenario.device, crowd).plants(), scenario.T)

@@ -1,4 +1,4 @@
-"""Nets in the simulated loop: the energy budget and the shell end to end."""
+"""The energy budget and the shell bound the energy that simulated loops give to hands."""
 
 import json
 from dataclasses import replace
@@ -25,7 +25,7 @@ def stiffer(scenario, factor):
 
 
 def given(simulation, trace):
-    """The most [J] that passive hands were given: by the forces, less what delta of the motion's dissipation is."""
+    """Return the largest energy [J] given to hands: work of the forces less the devices' least dissipation."""
     s, dx = trace.s[:, : simulation.process.channels], np.diff(trace.s[:, : simulation.process.channels], axis=0)
     assert len(s) == len(trace.f)
     lost = (dx**2 * np.array(simulation.scenario.delta)).sum(axis=1) / simulation.scenario.T
@@ -34,7 +34,7 @@ def given(simulation, trace):
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_a_budget_that_does_not_act_changes_nothing(engine):
-    """Certified for any environment at 95 % of the damping, from rest, without cap and without a joule."""
+    """With W0 = 0 and from rest the budget does not act on a coupling that is certified with 95 % of the damping."""
     weaker = SHORT.replace(delta=tuple(0.95 * d for d in SHORT.delta)).loop("I")
     coupling = design_coupling(weaker, "spring-damper", "any-environment").coupling
     with_budget = simulate(SHORT, coupling, engine, energy_budget=0.0)
@@ -48,7 +48,7 @@ def test_a_budget_that_does_not_act_changes_nothing(engine):
 
 @pytest.mark.parametrize(("start", "vary"), checkered([0.0, 0.01], [False, True]))
 def test_hostile_loops_cannot_exceed_the_budget(start, vary):
-    """The optimal coupling on springs 2.5 times stiffer; the users' work does not count, so nobody is given more."""
+    """An optimal coupling on springs 2.5 times stiffer gives hands no more energy than the budget allows."""
     coupling = design_coupling(load().loop("I"), "optimal", "this-environment").coupling
     scenario = stiffer(load().replace(duration=4.0), 2.5)
     simulation = assemble(scenario, coupling)
@@ -57,7 +57,7 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
         scenario = scenario.replace(varying_delay={"lo": (0, 1), "hi": (2, 3), "loss": 0.05})
         delays = rng.integers((0, 1), (3, 4), (scenario.samples, 2))
         delays = np.where(rng.random(delays.shape) < 0.05, -1, delays)
-        delays[500:530] = -1  # a gap that the device must not hold through
+        delays[500:530] = -1  # a gap so long that the device must stop holding its force
         simulation = replace(assemble(scenario, coupling), scenario=scenario)
         simulation = replace(simulation, process=replace(simulation.process, delays=packet_delays(delays[:, :, None])))
     guarded = netted(simulation, EnergyNet(start))
@@ -74,7 +74,7 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
 
 
 def test_walls_stand_behind_a_budget_too():
-    """With room enough it changes nothing, also of contact; with none it limits, and keeps its word."""
+    """A large budget changes nothing in a run with a wall; with W0 = 0 no energy is given."""
     scenario = load("one-wall").replace(duration=1.5)
     simulation = assemble(scenario, NoCoupling())
     alone, rich, poor = (
@@ -86,7 +86,7 @@ def test_walls_stand_behind_a_budget_too():
 
 
 def test_the_shell_bounds_own_environments():
-    """A force that pushes along the motion: without shell it drives the hands, with it it gives 2 mJ at most."""
+    """A force along the motion gives at most W0 = 2 mJ through the shell, and far more with a huge W0."""
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
     V, energies = coupling.compliance(SHORT.T), {}
 
@@ -131,7 +131,7 @@ def test_reports_say_what_the_budget_did(tmp_path):
 
 @pytest.mark.slow
 def test_uneven_periods_cannot_exceed_the_budget():
-    """It reserves for the longest tick; the loop without a coupling, which grows, takes what it is given."""
+    """With uneven periods the budget reserves for the longest tick, so an unstable loop gives at most W0."""
     scenario = stiffer(load().replace(duration=2.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
     simulation = assemble(scenario, NoCoupling())
     for start in (0.0, 0.01):

@@ -1,4 +1,4 @@
-"""Other people's tools simulate the same loop: what the comparison of costs rests on. Skipped where not installed."""
+"""Other tools simulate the same loop, so that costs can be compared; tools that are not installed are skipped."""
 
 import importlib.util
 from pathlib import Path
@@ -17,7 +17,7 @@ assert _spec.loader
 peers = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(peers)
 
-#: relative rms error of positions and forces that each may have in a run that is all transient, and what it needs
+#: tool -> allowed relative rms error of positions and forces in a transient run, and the package that it needs
 ALLOWED = {
     "exponential x 1": (1e-11, None),
     "RK4 x 4": (1e-5, None),
@@ -41,7 +41,7 @@ def test_every_peer_is_looked_at():
     assert set(ALLOWED) | {"exact"} == set(peers.PEERS)
 
 
-@pytest.mark.filterwarnings("default")  # of the tools themselves
+@pytest.mark.filterwarnings("default")  # the tools emit warnings
 @pytest.mark.parametrize("name", ALLOWED)
 def test_it_is_the_same_loop(loop, name):
     allowed, needed = ALLOWED[name]

@@ -1,4 +1,4 @@
-"""What is drawn is what was reported: lines, marks and legends of every picture, looked at before it is written."""
+"""Lines, marks and legends of every picture show the reported numbers."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from haptic_loop.sim.trace import Trace
 
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
-    """Draws, and returns the axes; the picture is written, too."""
+    """Return a function that draws and writes a picture, and returns its figure."""
     seen = []
     save = plots.save
 
@@ -58,20 +58,20 @@ def test_a_run_is_drawn_with_its_turns():
     near = plots._sharpest(trace(f), 83.0)
     assert 2480 <= near.start < near.stop <= 2620
     assert near.stop - near.start == 72  # six periods
-    # where nothing turns, the whole is shown as it is
+    # A short run is shown whole.
     assert plots._sharpest(trace(f[:20]), 83.0) == slice(0, 20)
 
 
 def test_pictures_contain_every_sample(drawn):
     steps = np.random.default_rng(0).normal(size=(1200, 3))
     steps[60:] *= 1e-3
-    f = steps.cumsum(axis=0)  # turns sharply in its first ticks only: there is something to zoom into
-    f[:, 1] = 0.01 * np.arange(1200)  # calm: drawn last, so that it stays visible
+    f = steps.cumsum(axis=0)  # Sharp turns in the first ticks give the picture a zoom.
+    f[:, 1] = 0.01 * np.arange(1200)  # the calm channel is drawn last, so that it stays visible
     figure = plots.draw_run(trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
     whole = lines(figure.axes[2])
     for i in range(3):
         np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
-        np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
+        np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # x in mm equals f
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
     assert figure.axes[0].get_ylabel() == "displacement of the handle [mm],\nwhere the encoder is"
     assert legend(figure) == [
@@ -84,14 +84,14 @@ def test_pictures_contain_every_sample(drawn):
 
 def test_nearby_handles_are_drawn_with_their_distance(drawn):
     x = np.sin(np.arange(3000) / 300)[:, None]
-    run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm beside 1 m: one line in the picture
+    run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm apart at 1 m look like one line
     (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
     assert axis.get_ylabel() == "displacement of the handle [mm],\nwithin 4 mm of the encoder"
     np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
 
 
 def test_names_walls_and_curves_that_coincide(drawn):
-    """A calm run has no zoom; walls are where they stand; a curve that lies on another one says so."""
+    """A calm run has no zoom; walls are drawn at their positions; the legend names a curve that covers another."""
     t = np.arange(3000)
     wave = np.sin(t / 300)
     f = np.stack([wave, wave, 2 * wave], axis=1)
@@ -122,7 +122,7 @@ def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
     result = Trace(t, x, 800 * x, np.stack([handle, handle], axis=1), x, np.zeros((6000, 1)), {})
     middle, sizes = plots._amplitudes(result, 84.0, 5000)
     np.testing.assert_allclose(sizes[:, 0], 1e-6 * np.exp(1.4 * middle), rtol=0.02)
-    assert middle[-1] < 5.0  # up to the first clipped tick
+    assert middle[-1] < 5.0  # the amplitudes end before the first clipped tick
     onset = plots.Onset(1.4, 5000, 4.0)
     figure = plots.draw_run(result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
@@ -134,7 +134,7 @@ def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
     np.testing.assert_allclose(encoders[:, 1], 1e3 * x[:, 0])
     (veil,) = figure.axes[0].patches
     assert veil.get_x() == 4.0
-    assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom is of what is credible
+    assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom shows the credible part only
 
 
 def test_wrong_verdicts_are_crossed(drawn):
@@ -144,7 +144,7 @@ def test_wrong_verdicts_are_crossed(drawn):
     rows.append(SimpleNamespace(integrator=None, position_relative_rms=0.0, growth_rate_error=0.0))
     position, growth = drawn(plots.plot_accuracy, rows).axes
     np.testing.assert_array_equal(lines(growth)["RK4"], [(0.1, 1e-3), (0.3, 1e-5)])
-    assert not lines(position)["Euler"].size  # no error to be drawn on a logarithmic axis
+    assert not lines(position)["Euler"].size  # an error of 0 has no place on a logarithmic axis
     assert [line.get_xydata().tolist() for line in growth.lines if line.get_marker() == "x"] == [[[0.05, 2.0]]]
 
 
@@ -186,7 +186,7 @@ def test_binding_frequencies_are_marked(drawn):
     np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
     marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
     np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37))
-    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # at 0 Hz, and 40 times what there is
+    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # drawn at the edge: 0 Hz, 40 times the available damping
     assert here.get_title() == "this environment"
     assert here.get_ylabel() == "required damping [N s/m]"
     assert "soft (no curve: see the printed remarks)" in lines(anywhere)
@@ -240,7 +240,7 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
     cells = axis.collections[0].get_array()
     np.testing.assert_array_equal(cells.mask.ravel(), [False] * 4 + [True, False])
     assert cells.compressed().tolist() == [0, 0, 1, 1, 0]
-    edges = axis.collections[1:3]  # the same edge twice: the broken one is drawn last
+    edges = axis.collections[1:3]  # Both edges coincide; the broken line is drawn last.
     assert [edge.get_linewidth()[0] for edge in edges] == [3.6, 1.8]
     assert legend(figure) == [
         "exact: stable with all of 7 humans",

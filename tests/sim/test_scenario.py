@@ -79,7 +79,7 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
     made = parse(bare)
     assert made.psi == (0, 0)
     hands = [human.voluntary.phase for human in made.human]
-    assert hands == [0.0, np.pi / 2], "who moves apart feels the spring between"
+    assert hands == [0.0, np.pi / 2], "the hands must move apart, so that they feel the spring"
     assert made.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
     assert made.replace(theta=(1, 1)).human == made.human
     for empty, expected in (
@@ -129,7 +129,7 @@ def test_the_default_is_the_papers():
 
 
 def test_titles_name_the_delay_of_the_reference():
-    """By definition: the reference is `lam` samples late, in case I theta + psi and in case II 0 if lam is absent."""
+    """The reference is late by `lam` samples; if lam is absent, by theta + psi in case I and by 0 in case II."""
     own = load("omega-pair").replace(name="own", theta=(1, 1), psi=(0, 1))
     titles = {(case, lam): own.replace(lam=lam).title(case) for case in CASES for lam in (None, (0, 0), (1, 0), (1, 2))}
     late, without = "own, reference [1, 0] samples late", "own, reference without delay"
@@ -158,7 +158,7 @@ def test_replacing_nothing_changes_nothing(name):
 
 
 def test_scripts_and_files_make_equal_scenarios():
-    """Lists, numpy's arrays and numbers, whole numbers where any are allowed."""
+    """Scripts may use lists, NumPy's arrays and numbers, and integers for floats."""
     scenario = load().replace(theta=[1, 3], psi=np.array([1, 0]), T=np.float64(1e-3), duration=2, delta=np.ones(2))
     assert (scenario.theta, scenario.psi, scenario.delta) == ((1, 3), (1, 0), (1.0, 1.0))
     assert [type(value) for value in (*scenario.psi, scenario.T, scenario.duration)] == [int, int, float, float]
@@ -194,7 +194,7 @@ def test_replacing_is_as_strict_as_a_file(change, message):
 
 
 def test_damping_and_other_fields_are_replaced_together():
-    """A new damping keeps every other new field, in one step as in two steps of either order."""
+    """A new damping keeps every other new field, whether fields are replaced together, in two steps or one by one."""
     known = load("omega-pair-known")
     wider = DeviceBounds(0.06, 14500.0, 0.5, 5.0)
     changes = {
@@ -301,7 +301,7 @@ springs = [{{ between = ["a", "b"], stiffness = 100.0 }}]
 
 
 def test_a_device_of_the_catalogue_with_overrides():
-    """What is published is taken, what is given goes first, and what is neither is the class's assumption."""
+    """A given value replaces the published one; a field without either has the default of the device's class."""
     both = parse(FALCON.format(device='[{ device = "falcon", damping = 0.5 }, "omega.3"]'))
     falcon, omega = both.device
     assert (falcon.damping, falcon.force_limit, falcon.encoder_step, falcon.mass) == (0.5, 8.0, 63.5e-6, 0.25)

@@ -1,4 +1,4 @@
-"""Growth rates: the agreed figures, and what a trace may be asked."""
+"""Growth rates equal the agreed figures; a trace that cannot give one gives a reason."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_exact_and_measured_growth(coupling, growth, frequency):
 
 
 def test_the_this_environment_matrix_is_the_loop():
-    """Stepping the matrix by hand gives the loop's own record."""
+    """Steps of the closed loop's matrix give the states of the run."""
     simulation = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), PUBLISHED["I"])
     record = run(simulation, "exact")
     loop = close(simulation.plant, simulation.F)
@@ -78,7 +78,7 @@ def test_verdicts():
 
 
 def test_knocks_die_away_as_the_held_plant():
-    """One body of device and hand before a spring: the exponential of its own matrices, without the program's."""
+    """Device and hand are one body before a spring; the poles come from matrices that are written out here."""
     T, K = 2e-3, 900.0
     text = """
 name = "knock"

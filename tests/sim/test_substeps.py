@@ -1,4 +1,4 @@
-"""The substep rule, the engine's own one-period map that checks it."""
+"""The rule picks enough substeps; the one-period map of an engine checks this."""
 
 import json
 
@@ -33,7 +33,7 @@ def simulation():
 
 
 def test_pace_of_known_matrices():
-    """An oscillator of 3 rad/s with 10 % damping, beside a decay of 50 1/s and a free mass."""
+    """The plant is an oscillator of 3 rad/s with 10 % damping, a decay of 50 1/s and a free mass."""
     A = np.zeros((5, 5))
     A[:2, :2] = [[0, 1], [-9, -0.6]]
     A[2, 2] = -50
@@ -54,10 +54,10 @@ def test_the_exact_engine_is_its_own_map(simulation):
     np.testing.assert_allclose(held.B, simulation.plant.B, rtol=1e-9, atol=1e-12)
 
 
-# `discrete` keeps a memory of its own from step to step, so no map of position and velocity is all of it
+# `discrete` has more state than position and velocity, so a map of these two does not describe it.
 @pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {"discrete"}))
 def test_the_map_is_what_a_run_does(simulation, integrator):
-    """Stepping the map closed with the process gives the simulated trace."""
+    """The map takes each recorded state and its forces to the next recorded state."""
     record = run(simulation, make_engine(simulation, "mujoco", integrator, 4), ticks=300)
     held = _measured_hold(simulation, "mujoco", integrator, 4)
     for k in range(299):
@@ -77,7 +77,7 @@ def test_wrong_default_steps_are_doubled_or_refused():
     assert default_substeps(loop, "Euler") == 4
     with pytest.raises(InputError, match="discrete gives no reliable verdict"):
         default_substeps(loop, "discrete")
-    # just unstable: Euler's bias towards stable hides it at 4 substeps
+    # The loop is just unstable, which Euler's bias towards stable hides at 4 substeps.
     near = assemble(SCENARIO.replace(delta=(1.55, 1.55)), NoCoupling())
     assert 0 < exact_growth(near) < 0.4
     assert default_substeps(near, "Euler") > 4
@@ -95,7 +95,7 @@ def test_unstable_steps_are_refused_with_advice():
 
 @pytest.mark.parametrize(("integrator", "edge"), [("RK4", 2.828), ("Euler", 2.0), ("implicitfast", 2.0)])
 def test_edges_of_the_stable_regions(integrator, edge):
-    """An almost undamped 1 kg oscillator: the textbook edges, mode times step."""
+    """Two masses of 1 kg on an almost undamped spring lose stability at the textbook's mode times step."""
     device = CompliantDevice(transmission_stiffness=1e4, motor_mass=1.0, handle_mass=1.0, damping=0.0, delta=None)
     human = Human((Link(0.0, 0.0, 0.0),))
     loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2, T=0.02), PUBLISHED["I"])

@@ -1,4 +1,4 @@
-"""The loop that switches: mode matrices against the simulated loop, the worst switching, sim.run with them."""
+"""With switching delays mode matrices equal the simulated loop, and the search finds switching that grows."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ ASSEMBLY = assemble(load(), STIFF)
 
 
 def with_delays(simulation, delays):
-    """The same loop with packets that take these delays in place of the constant theta."""
+    """Return the loop with packets that take these delays instead of the constant theta."""
     return replace(simulation, process=replace(simulation.process, delays=delays))
 
 
@@ -44,7 +44,7 @@ def one(held: HeldPlant) -> HeldPlant:
 
 
 def own_hold() -> HeldPlant:
-    """The plant under a zero-order hold, from expm here: not the code under test."""
+    """Return the plant under a zero-order hold by SciPy's expm, independent of the code under test."""
     continuous, T = plant(ASSEMBLY.scene.model), ASSEMBLY.scenario.T
     n, inputs = continuous.B.shape
     step = expm(np.block([[continuous.A, continuous.B], [np.zeros((inputs, n + inputs))]]) * T)
@@ -52,7 +52,7 @@ def own_hold() -> HeldPlant:
 
 
 def test_mode_products_equal_the_simulated_map():
-    """60 ticks of random ages on both channels, from a random state: the loop tick by tick against one product."""
+    """60 ticks with random ages from a random state equal the product of their mode matrices."""
     rng, ticks, depth = np.random.default_rng(0), 60, (3, 2)
     wanted = np.tile(depth, (ticks, 1))
     for k in range(4, ticks):
@@ -87,9 +87,9 @@ def test_constant_delay_lines_equal_constant_loops():
 
 
 def test_switching_can_grow_beyond_constant_delays():
-    """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
+    """The delays (1, 2) are certified, but switching within 1 to 2 makes the loop grow with the scenario's humans."""
     worst = _worst_switching(ASSEMBLY, VaryingDelay((1, 1), (2, 2), "adversarial"))
-    assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
+    assert worst.growth > 1.5  # the search found 2.05 1/s
     assert set(np.unique(worst.ages)) <= {1, 2}
     period, held = len(worst.ages), own_hold()
     G, product = ASSEMBLY.process.law.sent, None
@@ -97,7 +97,7 @@ def test_switching_can_grow_beyond_constant_delays():
         A = _mode_matrix(held, G, (2, 2), row)
         product = A if product is None else A @ product
     radius = np.abs(np.linalg.eigvals(product)).max()
-    # eigenvalues of a product of 134 matrices: their rounding adds up
+    # The rounding of a product of many matrices adds up.
     assert radius == pytest.approx(worst.spectral_radius, rel=1e-8)
     met = ages(np.tile(worst.delays, (3, 1))[:, :, None])[2 * period :, :, 0]
     np.testing.assert_array_equal(met, worst.ages)
@@ -110,7 +110,7 @@ def test_switching_can_grow_beyond_constant_delays():
 
 
 def test_greedy_ages_repeat_the_trajectory_that_chose_them():
-    """The growth under the packet delays of greedy ages is positive, and random delays do not reach it."""
+    """The loop grows under the packet delays of greedy ages, and decays under random ones."""
     varying_delay, ticks = VaryingDelay((1, 1), (2, 2)), 1600
     process, held = ASSEMBLY.process, one(ASSEMBLY.plant)
     delays = realising(_greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
@@ -146,7 +146,7 @@ def run(tmp_path, *options):
 
 def test_both_engines_meet_the_same_delays(tmp_path):
     report = run(tmp_path, "--varying-delay", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
-    # RK4 in four substeps per period: 1e-7 is what the constant loop reaches too
+    # The exponential integrator has rounding errors only, 2e-14 when measured.
     assert report["error"]["position_relative_rms"] < 1e-7
     varying_delay = report["varying_delay"]
     assert not varying_delay["covered"]
@@ -178,7 +178,7 @@ def test_recorded_delays_and_total_loss(tmp_path):
     quick = ["--coupling", "published", "--engine", "exact", "--duration", "0.3"]
     report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), *quick)
     assert (report["varying_delay"]["lo"], report["varying_delay"]["hi"]) == ([1, 2], [2, 2])
-    assert report["varying_delay"]["lost_packets"] == [0, 83]  # of 250 ticks every third
+    assert report["varying_delay"]["lost_packets"] == [0, 83]  # every third of 250 packets
     report = run(tmp_path, "--loss", "1", *quick)
     assert report["varying_delay"]["age"] is None
     assert np.load(tmp_path / "out" / "trace.npz")["f"].any() == np.False_  # no force ever arrives
@@ -225,7 +225,7 @@ def validated(tmp_path, *options):
 
 @pytest.mark.validate
 def test_random_humans_under_the_worst_switching(tmp_path):
-    """The constants' design fails for most humans, the switching-proof one for none; 0 and 1 are what is claimed."""
+    """The design for constant delays fails for half the humans or more, the one for switching delays for none."""
     coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
@@ -253,7 +253,7 @@ def test_the_population_meets_lost_packets(tmp_path):
 
 @pytest.mark.slow
 def test_both_engines_see_the_population_grow_alike():
-    """Four humans, adversarial delays: MuJoCo's growth within 0.01 1/s of the exact one, as of its constant loops."""
+    """With four humans and adversarial delays MuJoCo's growth is within 0.01 1/s of the exact one."""
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"))
     loop = assemble(scenario, STIFF)
     links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
@@ -267,7 +267,7 @@ def test_both_engines_see_the_population_grow_alike():
 
 
 def test_runs_report_the_constant_delays_mismatch():
-    """The process of a loop that switches holds G without Theta; what is felt is still F."""
+    """The process of a switching loop contains G without Theta, but its `felt` is F with the constant theta."""
     moved = with_delays(ASSEMBLY, np.ones((5, 2, 1), dtype=int))
     z = np.exp(1j * np.linspace(0.001, 3, 50))
     theta = z[:, None, None] ** -np.array(ASSEMBLY.scenario.theta, dtype=float)[:, None]
