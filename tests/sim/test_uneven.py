@@ -1,4 +1,4 @@
-"""Periods that vary and forces that latch within them: engines against each other and against expm, by hand."""
+"""With varying periods, and forces that latch within them, both engines equal a solution by expm."""
 
 import gc
 import json
@@ -31,7 +31,7 @@ DRAWN, LATE = Periods(0.6e-3, 1.5e-3), ((1e-4, 1.3e-4), (0.0, 5e-4))
 
 
 def by_hand(simulation, ticks):
-    """Plant states (ticks + 1, states) of a run, from latch to latch, each stretch by an exponential of its own."""
+    """Return the plant states (ticks, states) of a run, with one matrix exponential from latch to latch."""
     P, m, timing = plant(simulation.scene.model), simulation.process.channels, simulation.timing
     n, w, F = len(P.A), P.B.shape[1] - m, simulation.F
     s, z, held, states = np.zeros(n), np.zeros(F.order), np.zeros(m), []
@@ -61,7 +61,7 @@ def test_both_engines_move_from_latch_to_latch(ticks):
     assert abs(run(simulation, "mujoco").s - exact.s).max() < 1e-11 * scale
     rk4 = [run(simulation, make_engine(simulation, "mujoco", "RK4", n)).s for n in (8, 16)]
     assert abs(rk4[1] - exact.s).max() < 2e-7 * scale
-    assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # of fourth order
+    assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # RK4 is of fourth order
 
 
 def test_block_sizes_do_not_change_runs():
@@ -70,7 +70,7 @@ def test_block_sizes_do_not_change_runs():
     assert trace.t[:5] == pytest.approx([0, 1e-3, 3e-3, 3.5e-3, 4.5e-3])
     assert len(trace.t) == pytest.approx(3.0 / (3.5e-3 / 3), abs=1)
     assert trace.t[-1] == pytest.approx(3.0, abs=3e-3)
-    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks
+    again = run(simulation, "exact", ticks=1500)  # these ticks fill other blocks
     np.testing.assert_array_equal(again.s, trace.s[:1500])
 
 
@@ -147,7 +147,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
 
 @pytest.mark.validate
 def test_hands_that_meet_uneven_ticks(tmp_path):
-    """With a coupling nobody grows; without one most do, and both engines agree about whom."""
+    """With a coupling no hand makes the loop grow; without one some do, and both engines agree which."""
     file = tmp_path / "r.json"
     ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "3", "--duration", "0.3"]
     options = [*ticks, "--no-plot", "--out", str(tmp_path), "--json", str(file)]
@@ -162,7 +162,7 @@ def test_hands_that_meet_uneven_ticks(tmp_path):
 
 
 def test_growth_of_uneven_ticks_agrees_with_the_eigenvalues():
-    """Fast decays hid slow growth: 19 of 43 hands, and the scenario's own, were called stable."""
+    """Fast decays must not hide the slow growth of this loop, with drawn hands or with the scenario's own."""
     springs = (Spring(("a", "m"), 397.7, 0.0), Spring(("b", "m"), 23.85, 0.2625), Spring(("c", "m"), 911.5, 0.2725))
     nearly_even = {"period": Periods(0.99e-3, 1.01e-3), "theta": (1, 1, 4), "T_max": 1.1e-3}
     scenario = load("three-rigid").replace(environment=Network(tuple("abc"), springs, {"m": 1.227}), **nearly_even)
@@ -189,7 +189,7 @@ def test_periods_vary_beside_delays():
 
 @pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
-    """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
+    """This is a short form of the check in `make validate`, which must fail with half the required damping."""
     rows = list(uneven.uneven_ticks(0, 3, 500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
@@ -199,7 +199,7 @@ def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
 
 
 def test_latch_positions_are_the_plants():
-    """Two devices that one person joins, the second latching first: from there on its new force moves the first."""
+    """One person joins two devices; the second device latches first, and its new force then moves the first."""
     rng = np.random.default_rng(4)
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-300 * np.array([[2, -1], [-1, 2]]), -2 * np.eye(2)]])
     B = np.vstack([np.zeros((2, 3)), rng.normal(size=(2, 3))])
@@ -217,8 +217,9 @@ def test_latch_positions_are_the_plants():
 
 
 def test_counted_dissipation_is_a_lower_bound():
-    """Mechanical energy that two devices lose in a tick, joined by springs, less the work of the forces before and
-    after the latch: never below the count, and within a percent of it in most ticks."""
+    """The dissipation of two joined devices in a tick is never below the count, and within 1 % of it in most ticks.
+
+    It is the lost mechanical energy less the work of the forces before and after the latch."""
     late, delta, F, T = np.array([1e-4, 4e-4]), np.array([1.37, 1.1]), PAIR.loop("I").F(SOFT), PAIR.T
     M, K = np.diag([0.5, 0.3]), np.array([[900.0, -300.0], [-300.0, 500.0]])
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, np.diag(delta))]])
@@ -242,7 +243,7 @@ def test_counted_dissipation_is_a_lower_bound():
 
 
 def test_the_energy_audit_sees_late_forces():
-    """Nothing at any tick with one that is certified; without one some loops give energy, all of them unstable."""
+    """With a certified coupling no loop gives energy; without coupling some do, and all of these are unstable."""
     late = PAIR.replace(latency=LATE)
     for coupling, gives in ((SOFT, False), (NoCoupling(), True)):
         found = _examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))
@@ -254,14 +255,14 @@ def test_the_energy_audit_sees_late_forces():
 @pytest.mark.parametrize("timed", [True, False])
 @pytest.mark.parametrize("integrator", [EXPONENTIAL, "RK4"])
 def test_no_cycle_keeps_an_engine(integrator, timed):
-    """The last reference frees a batch, a MiB for every 125 hands: nothing waits for the collector."""
+    """An engine, with a MiB for every 125 hands, is freed with its last reference, not by the garbage collector."""
     simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
     gc.disable()
     try:
         for make, scene in ((MujocoEngine, simulation.scene), (MujocoBatchEngine, alike(simulation.scene, 1))):
             engine = make(scene, simulation.scenario.T, integrator, timing=simulation.timing)
             run(simulation, engine, ticks=3)
-            kept = weakref.ref(engine._access)  # all that holds MuJoCo's memory
+            kept = weakref.ref(engine._access)  # this object holds MuJoCo's memory
             del engine
             assert kept() is None
     finally:

@@ -1,4 +1,4 @@
-"""A thousand humans at once give what each alone gives, in both engines, however the work is split."""
+"""Many humans at once have the results of each human alone, in both engines, however the work is split."""
 
 import json
 import multiprocessing
@@ -74,7 +74,7 @@ KNOWN = load("omega-pair-known")
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_drawn_devices_are_within_their_bounds(engine):
-    """Every drawn pair is the scene of its own devices, and validation judges that scene."""
+    """Validation judges each drawn pair of devices in the scene of these devices."""
     question = Validation(KNOWN, NoCoupling(), 5, 40, MIXED, engine, 0.0)
     found, F = validate(question), assemble(KNOWN, NoCoupling()).F
     for index, people in question.crowds(range(8)):
@@ -85,13 +85,13 @@ def test_drawn_devices_are_within_their_bounds(engine):
             assert growth[index[i]] == pytest.approx(alone.growth, abs=1e-9 if engine == "exact" else 1e-3)
     masses = np.array([one.motor_mass for i in range(40) for one in question.crowd(i).mechanics[0]])
     assert masses.min() == 0.06 < np.median(masses[masses > 0.06]) < masses.max() < 0.6
-    assert 0.3 < (masses == 0.06).mean() < 0.7  # the worst device is at its bounds
+    assert 0.3 < (masses == 0.06).mean() < 0.7  # often at the bound, where the worst device is
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("humans", [60, pytest.param(400, marks=pytest.mark.validate)])
 def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
-    """At 1.001 of what known-device asks none grows, on no device of the bounds; the worst one replays."""
+    """With 1.001 times the damping that known-device requires no hand grows on any device; the worst replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
     base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed", "--no-limiter"]
@@ -114,7 +114,7 @@ HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
 def test_stacked_people_equal_single_ones(devices):
-    """Each row of the crowd is the scene built for it, and MuJoCo's map agrees with the exact one as for others."""
+    """Each person of a crowd has the plant of the person's own scene, and MuJoCo's map agrees with the exact one."""
     scenario = HELD.replace(device=devices)
     ((_, people),) = asked(scenario).crowds(range(20))
     held_by = variants(devices, people)
@@ -126,19 +126,19 @@ def test_stacked_people_equal_single_ones(devices):
     simulation = assemble(scenario, PUBLISHED["I"])
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
     np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, simulation.process)).growth, exact, atol=1e-3)
-    # the arms are the same as of people who hold one device each
+    # The arms equal those of people who hold one device each.
     np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
 
 
 def test_both_engines_agree_on_a_person():
-    """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
+    """MuJoCo equals the exact engine, including voluntary motion and its reaction on the body."""
     scenario = HELD.replace(duration=1.5)
     simulation = assemble(scenario, PUBLISHED["I"])
     mujoco, exact = run(simulation), run(simulation, "exact")
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
-    # speeds ring at the transmissions' 90 Hz after the tap, where RK4 x 4 errs by 1.3e-5 of the fastest one
+    # After the tap speeds ring at the transmissions' 90 Hz; even RK4 x 4 errs by only 1.3e-5 of the largest.
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
 
 
@@ -174,7 +174,7 @@ def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
 def test_mujoco_maps_are_the_exact_maps(devices):
-    """RK4 x 4 is within 1e-3 1/s of the exact growth for every human: a verdict cannot change but at zero."""
+    """RK4 x 4 is within 1e-3 1/s of the exact growth for every human, so a verdict can change only near zero."""
     scenario = SCENARIO.replace(device=devices)
     simulation = assemble(scenario, PUBLISHED["I"])
     held_by = variants(devices, crowd(40, 2))
@@ -214,7 +214,7 @@ def test_a_human_depends_on_seed_and_index_only():
 
 @pytest.mark.slow
 def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
-    """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
+    """Verdicts and MuJoCo's traces do not depend on the shards; most traces are long enough for a growth rate."""
     monkeypatch.setattr(examine_module, "_BATCH", 10)
     question = Validation(SCENARIO, PUBLISHED["I"], 0, 25, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
@@ -239,7 +239,7 @@ class EveryThirdLossless:
 
 
 def test_sampled_traces_are_those_of_all_hands():
-    """MuJoCo's for the lossless ones, the nearest to the limit and 64 more, the exact step's for the others."""
+    """MuJoCo traces lossless hands, those nearest to the limit and 64 more; the exact engine traces the others."""
     people = SCENARIO.replace(population=EveryThirdLossless())
     question = Validation(people, PUBLISHED["I"], 3, 200, 1, "both", 0.3)
     some, every = validate(question), validate(replace(question, all_traces=True))
@@ -248,11 +248,11 @@ def test_sampled_traces_are_those_of_all_hands():
     assert every.witnessed.all()
     assert not exact.witnessed.any()
     for name in ("trace", "trace_error", "clipped"):
-        # how many hands are computed at once decides the order of sums: rounding moves a rate by some 1e-13 of its size
+        # The order of sums depends on the number of hands in a batch: rates differ by about 1e-13 of their size.
         values = getattr(some, name)
         np.testing.assert_allclose(values[chosen], getattr(every, name)[chosen], rtol=1e-9)
         np.testing.assert_allclose(values[~chosen], getattr(exact, name)[~chosen], rtol=1e-9)
-    np.testing.assert_array_equal(some.mujoco, every.mujoco)  # growth rates are both engines', of every hand
+    np.testing.assert_array_equal(some.mujoco, every.mujoco)  # both engines give a rate for every hand
     assert np.isfinite(some.mujoco).all()
     lossless = some.damping == 0
     assert 40 < lossless.sum() < 100
@@ -274,7 +274,7 @@ def test_designed_coupling_holds_for_everyone():
     np.testing.assert_allclose(traced.trace, traced.exact, atol=1e-3)
     assert not traced.clipped.any()
     assert (traced.energy >= 0).all()
-    # Definition 3: these humans are damped, and two seconds show it
+    # Definition 3: with these damped humans motions decay within two seconds.
     assert (traced.settling < 1).all()
 
 
@@ -306,7 +306,7 @@ def test_the_worst_human_replays(tmp_path):
     stability = json.loads(file.read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
     assert stability["exact_verdict"] == "unstable"
-    # the hands of the scenario are judged beside those that are drawn, and those of a file in their place
+    # Besides the drawn hands the command judges the scenario's hands, or those of a file instead.
     own = report["own_humans"]
     assert (own["from"], own["exact_verdict"], own["holds"]) == ("omega-pair", "unstable", True), (
         "nothing was certified"
@@ -319,7 +319,7 @@ def test_the_worst_human_replays(tmp_path):
 
 
 def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
-    """MuJoCo's explicit Euler calls loops stable that are not: the suite must fail, and say with whom."""
+    """MuJoCo's Euler calls unstable loops stable; the command must fail and store the humans."""
     monkeypatch.setattr(
         examine_module,
         "mujoco_loops",
@@ -353,7 +353,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_ends_other_processes_batches():
-    """A batch of an hour and a half of simulated time each would otherwise be waited for."""
+    """Ctrl-C does not wait for a batch of 50,000 simulated seconds."""
     scenario = load("omega-pair")
     question = Validation(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
     before = set(multiprocessing.active_children())
@@ -368,7 +368,7 @@ def test_ctrl_c_ends_other_processes_batches():
 
 @pytest.mark.parametrize("duration", [0.5, 40.0])
 def test_restless_short_traces_give_no_verdict(duration):
-    """Against the slowest eigenvalue of the same humans, by the exact engine."""
+    """Settling decides only on traces that are long against the slowest decay with the same humans."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
     traces = Traces.of(question, found)
@@ -436,7 +436,7 @@ def test_impossible_crowds_cannot_be_built():
 
 
 class OwnEngine(ExactEngine):
-    """The exact one, as somebody else would write it: of one simulation."""
+    """The exact engine of one simulation, as a user would write it."""
 
     def __init__(self, simulation):
         super().__init__(simulation.plant)
@@ -444,7 +444,7 @@ class OwnEngine(ExactEngine):
 
 @pytest.mark.parametrize("delays", [None, VaryingDelay((1, 2), (2, 3), "random")])
 def test_own_engines_judge_every_hand(delays):
-    """Made anew for each set of humans, it says of the period and of the traces what the stacked exact engine says."""
+    """A user's engine, built for each set of humans, gives the growth rates of the stacked exact engine."""
     scenario = load().replace(varying_delay=delays)
     found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
     np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
@@ -460,7 +460,7 @@ def test_own_engines_need_even_ticks():
 
 
 def slow_question(humans: int, seed: int, duration: float) -> Validation:
-    """Three devices with delays of 2, 3 and 1 ticks and a mass of 0.3 kg between soft springs: decays of seconds."""
+    """Return a validation of three devices with delays around 0.3 kg on soft springs, with decays of seconds."""
     rng = np.random.default_rng(seed)
     springs = tuple(Spring((end, "m"), float(rng.uniform(20, 400)), float(rng.uniform(0, 0.5))) for end in "abc")
     scenario = load("three-rigid").replace(environment=Network(("a", "b", "c"), springs, {"m": 0.3}), theta=(2, 3, 1))
@@ -478,18 +478,18 @@ def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
     assert 0 < decided.sum() < decided.size
     np.testing.assert_array_equal(found.trace[decided] > 0, found.exact[decided] > 0)
     assert (np.abs(found.trace[decided] - found.exact[decided]) < found.trace_error[decided]).all()
-    assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # four times of decay or growth
+    assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # at least four time constants
 
 
 def test_traces_decide_only_what_eigenvalues_say():
-    """150 of the 2,000 slow loops of `make validate`."""
+    """These are 150 of the 2,000 slow loops of `make validate`."""
     rows = list(slow(0, 150))
     assert all(row.holds for row in rows)
     assert 0 < sum(row.decided for row in rows) < 150
 
 
 def test_short_traces_do_not_vote():
-    """A decay of 0.331 1/s that a fit to 2 s gives as a growth of 0.168 1/s: only MuJoCo's map may contradict."""
+    """If a short trace grows by 0.168 1/s, but all maps decay by 0.331 1/s, the trace is no disagreement."""
     found = slow_loops(4, 0, 0.3)
     rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}
     slow = replace(found, **rates, trace_error=np.full(4, 2.0))

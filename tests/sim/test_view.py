@@ -1,4 +1,4 @@
-"""The running loop behind the window, without a window: clock, keys and mouse are given by the test."""
+"""The live loop runs without a window; the tests supply the clock, the keys and the mouse."""
 
 import contextlib
 import json
@@ -70,7 +70,7 @@ SCENARIO = load()
 
 
 class Inline(Executor):
-    """Does at once what is submitted."""
+    """An executor that runs each task when it is submitted."""
 
     def submit(self, fn, /, *args, **kwargs):
         future = Future()
@@ -79,7 +79,7 @@ class Inline(Executor):
 
 
 class Later(Executor):
-    """Does what is submitted when the test says so, in order."""
+    """An executor that runs its tasks in order, one per call of `work`."""
 
     def __init__(self):
         self.tasks = []
@@ -117,9 +117,9 @@ def press(running, *names):
 
 
 def test_the_session_is_the_simulation(none):
-    """Whatever the times at which it is looked at: but for a rounding a tick, which the unstable mode grows sevenfold.
+    """Frames at any times show the run, but for a rounding per tick, which the unstable mode amplifies sevenfold.
 
-    A block of ticks sums in another order than tick after tick.
+    A block of ticks sums in another order than single ticks.
     """
     running = session(none)
     for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
@@ -144,7 +144,7 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 
 
 def test_rest_is_where_a_held_position_leads(published):
-    """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
+    """At rest z = A z + B x, and the force is F(1) x with F(1) of the transfer function."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
@@ -158,14 +158,14 @@ def test_switching_keeps_the_plant_state(none):
     press(running, "7")
     assert running.frame(0.5).prepared.label == "published"
     alone.frame(0.5)
-    assert np.array_equal(running.state, alone.state)  # position and velocity, although it moves
+    assert np.array_equal(running.state, alone.state)  # position and velocity do not jump
     F, x = running.prepared.simulation.F, before.q[:2]
     force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
     assert np.allclose(force, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
 
 def test_the_oscillation_starts_and_dies(none):
-    """Without coupling and with more delay it grows to the limits; with the published gains and less it decays."""
+    """The loop grows to its limits without coupling at more delay, and decays with the published gains at less."""
     running = session(none, "0:theta+2 2.5:theta-3 2.5:published")
     grown = running.frame(2.5 - 1e-3)
     assert grown.prepared.mode.growth > 3
@@ -177,7 +177,7 @@ def test_the_oscillation_starts_and_dies(none):
 
 
 def test_vectors_at_their_limit_are_counted():
-    """A frame counts a force vector at its longest, although no axis alone reaches the limit."""
+    """A frame counts a force vector whose length is at the limit, although no single axis reaches it."""
     space = load("omega-space")
     pushed = Human((Link(0.3, 3.0, 200.0),), Voluntary(0.05, 2.0, along=(1.0, 1.0, 1.0)))
     limit = 0.3
@@ -199,7 +199,7 @@ def replace_theta(prepared, theta):
 
 
 def test_a_process_that_runs_away_starts_again():
-    """Soft springs and dampers against an environment with delay are unstable by themselves: radius 1.63."""
+    """A soft coupling of a delayed environment is a process that is unstable by itself, with spectral radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
     prepared = _changed(replace(before, chosen=Chosen(soft, "any-environment", kind="spring-damper")), _Delay("psi", 1))
@@ -214,7 +214,7 @@ def test_a_process_that_runs_away_starts_again():
 
 
 def test_keys_leave_the_viewer_its_own():
-    """0 to 5 and the letters show and hide parts of MuJoCo's scene."""
+    """MuJoCo's viewer uses the digits 0 to 5, the letters and some other keys."""
     own = {ord(c) for c in "012345ABCDEFGHIJKLMNOPQRSTUVWXYZ [],-=`/;'\\"} | {256, 258, 262, 263, 266}
     assert not own & set(KEYS)
     assert {"none", "published", "designed", "optimal", "theta+1", "theta-1"} <= {words(e) for _, e in KEYS.values()}
@@ -249,7 +249,7 @@ def test_the_loop_runs_during_a_design(none):
     later.work()
     delayed = running.frame(0.3).prepared
     assert delayed.scenario.theta == (2, 3)
-    assert delayed.coupling is made.coupling  # a delay changes under a coupling, not with it
+    assert delayed.coupling is made.coupling  # a new delay keeps the coupling
 
 
 def test_a_push_is_felt_until_the_next(none):
@@ -294,7 +294,7 @@ def test_what_is_too_late_is_lost_and_said():
 
 
 def test_the_mouse_is_one_more_passive_hand(none):
-    """A hand of one mass, spring and damper, with the mouse's spring and damper added to its own."""
+    """A grip equals a hand of one link with the mouse's spring and damper added to those of the link."""
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
@@ -389,7 +389,7 @@ def test_the_overlay_says_growth_and_certificates(none, published):
 
 
 def test_a_refusal_is_said_whole_and_once(none):
-    """However long; in a window it stands by itself, where no bodies are."""
+    """A refusal of any length stands in a separate part of the window, where no bodies are."""
     running = session(none)
     press(running, "Insert")
     frame = running.frame(0.1)
@@ -418,7 +418,7 @@ def test_the_envelope_holds_every_force(ticks):
 
 
 def followed(name, coupling, **changes):
-    """A run, and the displacements of the object's nodes at each tick, (ticks, nodes)."""
+    """Return the scenario, a run, and the displacements of the object's nodes (ticks, nodes)."""
     scenario = load(name).replace(**changes)
     simulation = assemble(scenario, coupling)
     trace, drawn = close_loop(simulation, "exact", ticks=1500), object_of(simulation)
@@ -429,7 +429,7 @@ def followed(name, coupling, **changes):
 
 @pytest.mark.parametrize(("psi", "K", "B"), [((0, 0), 700.0, 0.5), ((0, 1), 50000.0, 20.0)])
 def test_the_drawn_springs_carry_the_forces(psi, K, B):
-    """800 N/m and 1 N s/m from contact 1 to the mass, 700 N/m to contact 2, by backward differences; f is delayed."""
+    """Forces are those of the drawn springs, 800 and 700 N/m with 1 N s/m, by backward differences and delayed."""
     scenario, trace, q = followed("omega-pair", SpringDamper([K, K / 2], [B, B]), psi=psi)
     for i, stiffness in enumerate((800.0, 700.0)):
         stretch = q[:, i] - q[:, 2]
@@ -440,7 +440,7 @@ def test_the_drawn_springs_carry_the_forces(psi, K, B):
 
 
 def test_the_drawn_tip_stops_at_the_wall():
-    """3000 N/m and 2 N s/m that push beyond 5 mm: max(0, K h + B (h - h_-)/T), one tick late."""
+    """A wall at 5 mm with 3000 N/m and 2 N s/m pushes by max(0, K h + B (h - h_-)/T), one tick late."""
     scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
     h = np.maximum(q[:, 0] - 0.005, 0.0)
     force = np.maximum(3000 * h + 2 * np.diff(h, prepend=0.0) / scenario.T, 0.0) * (h > 0)
@@ -449,7 +449,7 @@ def test_the_drawn_tip_stops_at_the_wall():
 
 
 def test_held_devices_hold_the_object(none):
-    """Springs in series: 1/K1, 1/800, 1/700, 1/K2."""
+    """The object rests like springs in series with the compliances 1/K1, 1/800, 1/700, 1/K2."""
     K, x = np.array([900.0, 400.0]), np.array([0.01, -0.004])
     motion = object_of(none.simulation).motion(SpringDamper(K, [0.5, 0.5]), (0, 0), SCENARIO.T)
     f = (x[0] - x[1]) / np.sum(1 / np.array([*K, 800.0, 700.0]))
@@ -473,7 +473,7 @@ def test_scene_files_show_the_object_beside_devices(name):
 
 
 def test_a_film_shows_how_the_mass_moves(none):
-    """In pixels, from the distance of 70 mm between the columns of contacts and masses."""
+    """The mass moves by its displacement; the columns of contacts and masses, 70 mm apart, give the scale."""
     running = session(none)
     pictures = pictures_for(running)
 
@@ -489,7 +489,7 @@ def test_a_film_shows_how_the_mass_moves(none):
 
 
 class FakeWindow:
-    """What the loop asks of the viewer."""
+    """A stand-in for the viewer, with the attributes that the loop uses."""
 
     def __init__(self, frames, stage):
         self.left, self.said, self.figures, self.synced = frames, [], [], 0
@@ -535,7 +535,7 @@ def test_the_window_s_loop_without_the_window(none):
     assert "push" in window.said[-1][0][2]
     assert "push" not in window.said[5][0][2]
     assert len(window.figures[-1]) == 2
-    assert window.user_scn.ngeom >= 3  # a force each, and the push
+    assert window.user_scn.ngeom >= 3  # an arrow for each force, and one for the push
     figure = window.figures[-1][0][1]
     drawn = figure.linedata[0, 1 : 2 * figure.linepnt[0] : 2]
     assert drawn.max() == pytest.approx(running.frame(0).history[:, 0].max(), rel=1e-6)  # single precision
@@ -588,7 +588,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
 
 
 def test_flat_pictures_show_where_things_are(none):
-    """The first device's handle, by its colour: it moves as many pixels as its position says."""
+    """The first device's handle, found by its colour, moves by its displacement in pixels."""
     painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)
 
@@ -598,7 +598,7 @@ def test_flat_pictures_show_where_things_are(none):
         ]  # between the words and the plots
         return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
 
-    # in pixels, each end rounded; 520 of them are two steps and two arrows, 0.42 m
+    # 520 pixels show two steps and two arrows, 0.42 m; both ends of a motion are rounded.
     assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
 
 
@@ -619,7 +619,7 @@ def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
 
 
 def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
-    """A stand-in for ffmpeg, which keeps what it was given: every picture, in order."""
+    """A stand-in for ffmpeg copies its input, which must be every picture in order."""
     tool = tmp_path / "ffmpeg"
     tool.write_text(
         f"#!{sys.executable}\nimport shutil, sys\nshutil.copy(sys.argv[sys.argv.index('-i') + 1], sys.argv[-1])\n"
@@ -636,7 +636,7 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
 
 
 def test_case_none_takes_a_coupling_later(tmp_path):
-    """Nothing designed for "none" exists: what is asked for later is designed for case I."""
+    """No coupling is designed for case none, so one that is chosen later is designed for case I."""
     where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
     words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--fps", "5")
     run(*words, "--video", where, "--json", str(told))
@@ -704,7 +704,7 @@ def ball():
 
 
 def test_live_worlds_feel_as_in_a_run(ball):
-    """The session delays forces by itself; sim.run does it by packets."""
+    """The live loop delays forces itself, and sim.run by packets; the forces are equal."""
     running = LiveLoop(ball, Inline(), (), math.inf)
     trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")
     frame = running.frame(0.5)
@@ -757,7 +757,7 @@ def test_a_film_of_a_world_shows_the_scene(ball, tmp_path, capsys):
         pytest.skip("no OpenGL here")
     with contextlib.closing(artist):
         first, last = (artist.rendered(running.frame(t), 160, 120).astype(int) for t in (0.0, 1.0))
-    assert (first == 255).all(axis=2).mean() > 0.3  # nothing behind the scene
+    assert (first == 255).all(axis=2).mean() > 0.3  # white background
     assert (first != last).any(axis=2).sum() > 100
     run("--scenario", "world-peg", "--duration", "0.4", "--video", str(tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as image:

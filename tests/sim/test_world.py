@@ -1,4 +1,4 @@
-"""MuJoCo worlds in a loop: the energy account, what it proves of hands, and what a scenario may say."""
+"""MuJoCo worlds in a loop keep the energy account; scenarios and couplings that do not fit are refused."""
 
 import json
 from importlib import import_module
@@ -49,12 +49,12 @@ contacts = {contacts}
 
 
 def certified(loop: Scenario):
-    """The stiffest coupling for any environment, at the loop's delays."""
+    """Return a moving-average design that is certified for any environment at the loop's delays."""
     return design_by_kind(loop.loop("I"), "moving-average")
 
 
 class Touch:
-    """Passive hands on a world through its shell; the energy is that of the hands, by the textbook."""
+    """Passive hands that touch a world through its shell; their energy comes from textbook formulas."""
 
     def __init__(self, loop: Scenario, hands: Hands, start: float = START_J, gravity: bool = True, credit: bool = True):
         coupling = certified(loop).coupling
@@ -65,7 +65,7 @@ class Touch:
         self.start = float(hands.energy()[0])
 
     def tick(self) -> float:
-        """The energy that hands and devices have beyond their first one [J]."""
+        """Return by how much the energy [J] of hands and devices exceeds that at the start."""
         free = self.shell.free(self.hands.x)
         wanted = self.port.step(free[:, 0])[:, None]
         if self.credit:
@@ -81,7 +81,7 @@ class Touch:
 
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
-    """Hands thrown at each scene, delays 0 to 3; the shell acts on no tick with random hands."""
+    """Hands are thrown at each scene with delays 0 to 3; with damped hands the shell never acts."""
     rng, acted, ticks = np.random.default_rng(3), 0, 0
     for run in range(3):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
@@ -94,7 +94,7 @@ def test_no_hand_is_given_more_than_the_account(name, lossless):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_without_gravity_energy_never_rises(name):
-    """Kinetic energy of the scene and energy of the hands, against what they began with and W0."""
+    """Hands' energy and the scene's kinetic energy rise by no more than W0 and what springs release."""
     loop = load(f"world-{name}").replace(theta=(0, 3))
     touch = Touch(loop, Hands(np.random.default_rng(5), 1, True, 0.3, T=T, delta=loop.delta), gravity=False)
     model, data = touch.port.world.model, touch.port.data
@@ -127,7 +127,7 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
 
 
 def test_the_plate_lifts_the_cube():
-    """Friction at the plate carries 0.1 kg by more than a centimetre."""
+    """Friction at the plate lifts the cube of 0.1 kg by more than a centimetre."""
     loop = load("world-cube")
     coupling = certified(loop).coupling
     port, shell = scene_of(loop, coupling).port(LIMIT), Shell(coupling.compliance(T), start=START_J)
@@ -140,7 +140,7 @@ def test_the_plate_lifts_the_cube():
 
 
 def test_contacts_have_the_axes_of_their_devices(tmp_path):
-    """A smooth oblique plate pushes along its normal, less what clamped axes hold; a device off it feels nothing."""
+    """A smooth oblique plate pushes the free axes along its normal; a device off the plate feels no force."""
     plate = '<geom type="box" pos="0 0 -.05" size=".2 .2 .05" condim="1" solimp=".9 .9"/>'
     (tmp_path / "scene.xml").write_text(
         f"""<mujoco><compiler angle="degree"/><option gravity="0 0 0"/><worldbody>
@@ -157,7 +157,7 @@ def test_contacts_have_the_axes_of_their_devices(tmp_path):
         loop, n = load(tmp_path / "loop.toml"), len(free)
         assert loop.channel_names == tuple(f"{body}.{'xyz'[axis]}" for body in ("one", "two") for axis in free)
         port = scene_of(loop, SpringDamper([900.0] * 2 * n, [5.0] * 2 * n)).port()
-        goal = np.array([0.01, -0.02, -0.01])[free]  # of the tip of 10 mm radius, in the plate from the start
+        goal = np.array([0.01, -0.02, -0.01])[free]  # the tip, of radius 10 mm, starts in the plate
         for _ in range(400):
             force = port.step(np.concatenate([goal, goal]))
         assert np.abs(force[:n]).max() > 1.0
@@ -168,7 +168,7 @@ def test_contacts_have_the_axes_of_their_devices(tmp_path):
 
 
 def test_full_levels_dissipate_by_their_matrices():
-    """Given is -f'dx - dx' Delta dx/T: -(1 - 2 + 6) mJ - 7.6 mJ, worked out by hand."""
+    """The energy given is -f'dx - dx' Delta dx/T = -(1 - 2 + 6) mJ - 7.6 mJ, worked out by hand."""
     damping = [[1.5, 0.4, 0.1], [0.4, 0.9, -0.2], [0.1, -0.2, 1.2]]
     loop = load("world-space").replace(device=[{"kind": "rigid", "axes": 3, "damping": damping}] * 2)
     simulation = assemble(loop, certified(loop).coupling)
@@ -195,7 +195,7 @@ UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
 def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
-    """Hands carry a tray of 0.3 kg. Without the credit and without W0 the shell holds every force back."""
+    """Hands carry a tray of 0.3 kg. Without the credit and without W0 the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
     acted = {}
     for credit in (True, False):
@@ -214,7 +214,7 @@ def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
 
 @pytest.mark.slow
 def test_an_active_scene_is_held_back(tmp_path):
-    """A motor with negative damping drives a body against the contacts: neither gravity nor a spring gives that."""
+    """A motor with negative damping drives a body against the contacts; the shell limits the energy that it gives."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="left" pos="-0.03 0 0">{TIP}</body>
     <body name="right" pos="0.08 0 0">{TIP}</body><body name="load"><joint name="j" type="slide" axis="1 0 0"/>
     <geom type="box" size="0.019 0.05 0.05" mass="0.3" solimp="0.9 0.9"/></body></worldbody>
@@ -232,7 +232,7 @@ def test_an_active_scene_is_held_back(tmp_path):
 
 
 def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
-    """Least energy at the port [J], and ticks of the shell: hands of 1 kg, each on a spring, thrown at 1.5 m/s."""
+    """Return (least energy at the port [J], ticks on which the shell acts) for hands of 1 kg thrown at 1.5 m/s."""
     coupling = SpringDamper([1000.0, 1000.0], [0.5, 0.5])
     port, shell = scene_of(loop, coupling).port(), Shell(coupling.compliance(T), start=start)
     x, v, at_port, least, before = np.zeros(2), np.array([-1.5, 1.5]), 0.0, 0.0, port.u
@@ -249,7 +249,7 @@ def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
 
 @pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
 def test_contacts_that_multiply_a_mass_are_held_back(tmp_path, impedance, gives_J):
-    """Contacts of 0.1 kg are made at speed: d = 0.99 and MuJoCo's default give, and the shell lets W0 through."""
+    """Contacts of 0.1 kg hit walls: solimp 0.99 and MuJoCo's default give energy, of which the shell passes W0."""
     tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
     walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))
     text = f"""<mujoco><option gravity="0 0 0"/><default><geom solimp="{impedance} 0.001"/></default><worldbody>{walls}
@@ -277,7 +277,7 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
 
 
 def test_ticks_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
-    """Without a repetition of the step, these are the ticks on which a force is at its limit."""
+    """If no step may be repeated, the counted ticks are those on which a force is at its limit."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     scenario(tmp_path, TRAY, more=UP)
     text = (tmp_path / "loop.toml").read_text().replace("12.0", "0.5").replace("[1, 2]", "[0, 0]")
@@ -422,7 +422,7 @@ def test_the_digest_is_of_contents_not_of_places(tmp_path):
 
 
 def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
-    """A body on a spring and a damper beside each contact: E(z) of the pair, masses of contacts included."""
+    """Each contact is on a spring and a damper; the linear model has their E(z), with the contacts' masses."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody>
     <body name="left"><site name="l"/>{TIP}</body><body name="right" pos="1 0 0"><site name="r"/>{TIP}</body>
     <site name="wall" pos="0.5 0 0"/></worldbody><tendon>
@@ -457,7 +457,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_default_couplings_of_slow_worlds_do_not_ring(every):
-    """Between its steps the scene is a wall: what alternates from tick to tick, (f - 2 f_- + f_--)/4, dies away."""
+    """The alternating part of the forces, (f - 2 f_- + f_--)/4, stays below 0.1 N rms between a scene's steps."""
     loop = load("world-cube").replace(duration=0.8)
     world = replace(loop.environment.world, every=every)
     slow = loop.replace(environment=replace(loop.environment, world=world))

@@ -1,4 +1,4 @@
-"""The K-B map: its figures against closed forms and design.conditions, its verdicts against loops one by one."""
+"""The K-B map has the figures of closed forms and design.conditions, and the verdicts of single loops."""
 
 import csv
 import json
@@ -33,7 +33,7 @@ from haptic_loop.sim.zwidth import CouplingSweep, _Grid, draw_map, make_grid
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")
-#: the mass of the pair between two walls in the place of the springs
+#: the pair with two walls in place of its springs
 WALLED_PAIR = Network(
     PAIR.environment.contacts,
     PAIR.environment.springs[2:],
@@ -60,7 +60,7 @@ def softer(network, share):
 
 
 def wall(theta, K, B):
-    """Force maps and both conditions' damping [N s/m] against a rigid wall, this-environment first."""
+    """Return the damping [N s/m] that this-environment and any-environment require against a rigid wall."""
     sweep = rigid(theta)
     assert sweep.loop.delta == (DELTA,)
     return [DELTA * sweep.ratios(name, np.array(K), np.array(B)) for name in ("this-environment", "any-environment")]
@@ -82,7 +82,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_the_map_is_that_of_design_margin(name):
-    """2e-9: near w = 0 the map stops at 1e-5 rad/sample, where truncation grows with the square of the delay."""
+    """The tolerance is 2e-9: the map begins at 1e-5 rad/sample, an error that grows with the square of the delay."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
@@ -98,7 +98,7 @@ def test_the_map_is_that_of_design_margin(name):
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_no_cell_of_the_widest_plane_is_lost(scenario):
-    """K = 1e-3 N/m in series with a free mass swings at 1e-5 rad/sample: F(1) must be asked for far below that."""
+    """A free mass on K = 1e-3 N/m swings near 1e-5 rad/sample, so the value for F(1) must be taken far below that."""
     sweep = of(scenario, scenario.theta)
     K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
     true = [sweep.requirement("this-environment", k, b).ratio for k, b in zip(K, B, strict=True)]
@@ -107,7 +107,7 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
 
 @pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
 def test_maps_before_walls_match_designs(theta, least):
-    """K = 2000, B = 2 before 3000 N/m, 2 N s/m; the frozen contact asks less."""
+    """K = 2000, B = 2 before a wall of 3000 N/m, 2 N s/m; with delay the frozen contact requires less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
@@ -130,14 +130,15 @@ def test_undelayed_walls_match_colgates_condition():
 
 def test_a_late_spring_needs_the_closed_form():
     K = np.geomspace(10, 5000, 9)
-    # the supremum is at w -> 0, of which the map sees 1e-5 rad/sample
+    # The supremum is at w -> 0; the map begins at 1e-5 rad/sample.
     for needed, share in zip(wall(1, K, 0 * K), (1.5, 2), strict=True):
         np.testing.assert_allclose(needed, share * K * T, rtol=1e-9)
 
 
 def test_the_stiffest_spring_dampers():
-    """2740 without delay (= 2 delta/T). With one sample 1135 against a wall, of the 1370 that any linear law may, and
-    against every passive environment 878.86 at T = 1.2 ms: K T is what counts."""
+    """The largest K is 2740 N/m without delay (2 delta/T), and 1135 with one sample of delay against a wall.
+
+    Against every passive environment it is 878.86 N/m at T = 1.2 ms, and inversely proportional to T."""
     K, B = (
         axis.ravel()
         for axis in np.meshgrid([*np.arange(1050.0, 1060), *np.arange(1130.0, 1140)], np.linspace(0.32, 0.4, 41))
@@ -159,7 +160,7 @@ def test_the_force_maps_are_those_of_single_couplings():
 
 
 def test_a_velocity_filter_is_a_series_spring():
-    """Backward Euler of that network is another derivation of the filtered coupling."""
+    """The filtered coupling is a spring beside a spring and damper in series, discretised by backward Euler."""
     cutoff, K, B = 30.0, 900.0, 1.3
     tau = 1 / (2 * np.pi * cutoff)
     springs = (Spring(("tip", GROUND), K), Spring(("tip", "inner"), B / tau), Spring(("inner", GROUND), 0.0, B))
@@ -207,7 +208,7 @@ def test_the_grid_says_what_is_wrong_with_it():
 
 @pytest.mark.parametrize("links", [1, 0], ids=["simple", "mixed"])
 def test_the_population_is_decided_as_one_by_one(links):
-    """The same eigenvalues from sim.verdicts, human by human; 1e-7 1/s is rounding of eigenvalues over T."""
+    """The growth equals that of sim.stability for the same humans; 1e-7 1/s is the eigenvalues' rounding over T."""
     sweep = rigid(1)
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 3, 30, links)
     F = sweep.force_maps(np.array([1500.0]), np.array([0.4]))[0][0]
@@ -248,7 +249,7 @@ def test_what_counts_as_an_oscillation():
     cases = [
         (wave(1e-4, 0.0, 40), True),  # a limit cycle
         (wave(1e-4, 0.5, 40), True),
-        (wave(1e-4, -0.5, 40), False),  # large still, but on its way out
+        (wave(1e-4, -0.5, 40), False),  # still large, but decaying
         (wave(5e-6, 0.0, 40), False),  # below the threshold
         (0.5 * (1 - np.exp(-t / 30)), False),  # a slow hand that gives way
         (wave(1e-2, -2.0, 7) + wave(2e-5, 0.3, 80), True),  # a slow decay does not hide a fast growth
@@ -256,7 +257,7 @@ def test_what_counts_as_an_oscillation():
     ]
     found = oscillation(np.concatenate([x for x, _ in cases], axis=2), T, 1e-5)
     assert found.sustained.tolist() == [verdict for _, verdict in cases]
-    # Hann and octaves leave the amplitude of a line; 2 % is what falls into the neighbouring octave
+    # An octave has the amplitude of its line, but for 2 % that falls into the neighbouring octave.
     assert found.amplitude[0] == pytest.approx(1e-4, rel=0.02)
     assert found.frequency_hz[0] == pytest.approx(40, abs=1)
     assert np.isinf(found.amplitude[-1])
@@ -264,9 +265,9 @@ def test_what_counts_as_an_oscillation():
 
 
 def test_a_slow_swing_that_decays_is_no_oscillation():
-    """A hand that springs back, as soft environments leave it: 4 mm at 1 Hz, at any phase, 400 times the threshold.
+    """A hand swings back with 4 mm at 0.6 to 1.2 Hz, at any phase, 400 times the threshold.
 
-    Hann's window of .75 s leaves 2e-3 of it in the lowest octave, and more or less than before; the trend takes it out.
+    A Hann window of 0.75 s leaves 2e-3 of the swing in the lowest octave; the removed trend takes this out.
     """
     t, phases = (np.arange(1500) * T)[:, None, None], np.linspace(0, np.pi, 24, endpoint=False)
     for hz in (0.6, 1.0, 1.12, 1.2):
@@ -285,7 +286,7 @@ def walled(count):
 
 @pytest.mark.parametrize("walls", [0, 1, 2])
 def test_many_processes_are_each_as_alone(walls):
-    """Rounding apart, since the sums are in another order."""
+    """Processes in one buffer equal single ones up to rounding, because their sums are in another order."""
     rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
     if walls:
         contacts = [walled(walls), walled(walls)]
@@ -308,7 +309,7 @@ def test_many_processes_are_each_as_alone(walls):
 
 
 def test_coulomb_friction_stops_a_device_where_coulomb_says():
-    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo's constraint, 1.5e-6 m off when measured, may be 3e-6."""
+    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo, 1.5e-6 m off when measured, may be 3e-6 m off."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
     model = _discretised(scene, T, "RK4", 4)
@@ -323,11 +324,11 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
     held = float(data.qpos[0])
     data.ctrl[:] = 0.5 * force, 0.0
     mujoco.mj_step(model, data, 4 * 500)
-    assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # half its force does not move it
+    assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # half the friction does not move the device
 
 
 def points(sweep, K, B, **changes):
-    """The simulated points of a 2 x 2 map whose corners they are."""
+    """Return the simulated points of a 2 x 2 map, its four corners."""
     settings = {"points": 2, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
     grid = _Grid(np.array(K), np.array(B), "linear")
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
@@ -389,7 +390,7 @@ OMEGA3 = [
 
 @pytest.fixture(scope="module")
 def audit(tmp_path_factory):
-    """CHAI3D's limits for an omega.3, where a user would look for them."""
+    """Return exit code, report and folder of a map with CHAI3D's limits of an omega.3 as its mark."""
     out = tmp_path_factory.mktemp("zwidth")
     code = zwidth.main([*OMEGA3, "--duration", "1.5", "--out", str(out), "--json", str(out / "again.json")])
     return code, json.loads((out / "report.json").read_text()), out
@@ -404,7 +405,7 @@ def test_where_the_limits_of_an_omega3_lie(audit):
         assert not mark[condition]["certified"]
         assert mark["stiffest_K_at_this_B"][condition] == pytest.approx(2740, rel=1e-5)
     assert mark["unstable_humans"] > 30
-    # what random humans allow is more than what every passive human does, and not much more
+    # Random humans allow a little more than all passive humans do.
     assert 2740 < mark["stiffest_K_at_this_B"]["population"] < 3200
 
 
@@ -412,7 +413,7 @@ def test_the_map_holds_together(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
     ratio = np.array(report["this-environment"]["required_over_available"], float)
-    # constant over frequency at B = 0, where rounding at the lowest one is 1e-8
+    # At B = 0 the requirement is constant over frequency; rounding at the lowest one is 1e-8.
     np.testing.assert_allclose(ratio * DELTA, K * T / 2 + B, rtol=3e-8)
     growth = np.array(report["population"]["growth_rate_per_s"], float)
     assert (growth[ratio < 1] <= 1e-9).all()
@@ -422,7 +423,7 @@ def test_the_map_holds_together(audit):
     assert report["simulation"]["differ_from_linear"] == 0
     for error in report["error"].values():
         assert error["figure_relative"] < 3e-8
-        # this edge is a straight line, which interpolation meets; the search for the true edge stops at 1e-7
+        # Interpolation is exact for this straight edge; the search for the true edge stops at 1e-7.
         assert error["edge_relative_in_K"] < 1e-6
 
 
@@ -525,7 +526,7 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_maps_cover_latency_and_longest_periods(tmp_path):
-    """1000 N/m before a rigid wall needs 0.7749 N s/m at 0.13 ms of 1.2 ms, 1.8 as a whole sample; 0.9 up to 1.8."""
+    """1000 N/m needs 0.7749 N s/m with forces 0.13 ms late, 1.8 with forces 1.2 ms late, and 0.9 with T_max 1.8 ms."""
     file = tmp_path / "r.json"
     wall = [
         "--rigid",
