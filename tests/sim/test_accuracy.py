@@ -38,7 +38,7 @@ def test_figures(report):
     assert rows["RK4", 4]["position_relative_rms"] < 1e-7
     assert abs(rows["RK4", 4]["growth_rate_error"]) < 1e-3
     assert rows["RK4", 4]["verdict_correct"]
-    # Euler errs towards stable, because its sampled position leads.
+    # Euler errs towards stable, because its sampled position leads the true one.
     assert rows["Euler", 1]["growth_rate_error"] == pytest.approx(-1.70, abs=0.01)
     assert not rows["Euler", 1]["verdict_correct"]
     assert not rows["discrete", 12]["verdict_correct"]

@@ -1,4 +1,4 @@
-"""Devices with several axes: scenarios, environments, scenes, engines and hands in space."""
+"""Devices with several axes follow closed forms and devices with one axis; impossible ones are refused."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_rotated_loops_have_rotated_trajectories(kind: str, engine: str) -> None
 
 
 def test_plant_with_matrices_is_its_exponential() -> None:
-    """A device of 0.25 kg in a hand of 0.3 kg moves by the exponential of M x'' = -K x - B x' - f."""
+    """A device of 0.25 kg in a hand of 0.3 kg moves by the solution of M x'' = -K x - B x' - f."""
     hand = np.array([[3.0, 0.5, 0.0], [0.5, 2.0, -0.4], [0.0, -0.4, 1.0]])
     K = np.array([[200.0, -50.0, 20.0], [-50.0, 150.0, 0.0], [20.0, 0.0, 90.0]])
     device = RigidDevice(axes=3, damping=tuple(map(tuple, DAMPING.tolist())))

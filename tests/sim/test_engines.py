@@ -1,4 +1,4 @@
-"""The two engines simulate the same plant; MuJoCo converges to the exact one at each integrator's order."""
+"""The two engines simulate the same plant; MuJoCo converges to the exact engine at each integrator's order."""
 
 import ctypes
 import tempfile

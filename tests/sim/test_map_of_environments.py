@@ -63,7 +63,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     sweep = around(scenario, coupling)
     responses = {}
 
-    def filtered(z, E):  # the frequencies are those of every environment
+    def filtered(z, E):  # all environments have the same frequencies
         if not responses:
             responses["R"] = coupling.filter(scenario.T).at(z)
         return responses["R"] @ E

@@ -199,7 +199,7 @@ def replace_theta(prepared, theta):
 
 
 def test_a_process_that_runs_away_starts_again():
-    """A soft coupling of a delayed environment is a process that is unstable by itself, with spectral radius 1.63."""
+    """A soft coupling and a delayed environment make a process that is unstable by itself, of spectral radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
     prepared = _changed(replace(before, chosen=Chosen(soft, "any-environment", kind="spring-damper")), _Delay("psi", 1))
@@ -465,7 +465,7 @@ def test_scene_files_show_the_object_beside_devices(name):
     drawn, bare = (mujoco.MjModel.from_xml_string(xml) for xml in (scene_xml(simulation), simulation.scene.xml))
     network = scenario.environment
     parts = 4 if network.world else len(network.points or network.nodes()) + len(network.springs) + len(network.walls)
-    assert drawn.ngeom == bare.ngeom + parts  # of the world: the floor, the cube, the finger and the plate
+    assert drawn.ngeom == bare.ngeom + parts  # a world has four: the floor, the cube, the finger and the plate
     assert not drawn.geom_contype.any()
     assert drawn.geom_pos[drawn.geom_bodyid == 0][:, 0].max() < -0.09  # left of the motors
     assert np.array_equal(plant(drawn).A, plant(bare).A)

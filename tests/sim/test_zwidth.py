@@ -82,7 +82,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_the_map_is_that_of_design_margin(name):
-    """The tolerance is 2e-9: the map begins at 1e-5 rad/sample, an error that grows with the square of the delay."""
+    """Maps begin at 1e-5 rad/sample; the error of this grows with the square of the delay, here up to 2e-9."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
