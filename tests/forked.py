@@ -77,6 +77,7 @@ def draw_once(folder: Path) -> None:
     def drawn(figure: Figure, path: Path, dpi: int = 130) -> Path:
         try:
             (folder / f"{Path(sys.argv[0]).name}-{Path(path).name}").touch(exist_ok=False)
+            figure.set_layout_engine("none")  # tests/sim/test_plots.py draws with the layout, which takes twice as long
         except FileExistsError:
             figure = Figure()
         return save(figure, path, dpi)

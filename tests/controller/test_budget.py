@@ -93,7 +93,7 @@ def test_no_hand_is_given_more_than_the_budget():
     W0, given, theta = 0.05, hands.energy(), (1, 2)
     force, budget = each_in_turn(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=n.size)
     line, x, most = np.zeros((3, 2, n.size)), hands.x, np.zeros(n.size)
-    for _ in range(1000):
+    for _ in range(700):
         line = np.concatenate([budget.limit(force(), hands.x - x)[None], line[:-1]])
         x = hands.x
         assert (budget.energy - budget.reserved > -1e-9).all()
@@ -161,7 +161,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
         hands.x,
         [np.zeros((2, nsim))],
     )
-    for k in range(1200):
+    for k in range(800):
         sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
         x = hands.x
         if told == "late" and k > late:
@@ -185,7 +185,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
         lo, hi = ((0, 1), (0, 1)) if told == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, Packets(lo, hi), encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
-        for k in range(1200):
+        for k in range(800):
             now = np.round(hands.x / q) * q
             wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # forces that change cost energy behind coarse encoders
             sent = budget.limit(wanted, now - seen)

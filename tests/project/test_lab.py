@@ -28,6 +28,7 @@ def go(command: str, *words: str, holds: bool = True) -> None:
 def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # the smallest basis suffices here
+    monkeypatch.setattr("haptic_loop.design.budgets.BOUND_SWEEPS", 1)  # so does a weaker bound
     lab = ("--scenario", LAB)
     go("run", *lab, "--duration", "1", "--no-plot", "--out", "run")
     report = json.loads(Path("run/report.json").read_text())

@@ -86,9 +86,9 @@ def test_no_hand_is_given_more_than_the_account(name, lossless):
     for run in range(3):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
         touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
-        for _ in range(500):
+        for _ in range(350):
             assert touch.tick() <= START_J + touch.port.released + 1e-12
-        acted, ticks = acted + int(touch.shell.limited[0]), ticks + 500
+        acted, ticks = acted + int(touch.shell.limited[0]), ticks + 350
     assert acted <= (ticks // 1000 if lossless else 0)
 
 
@@ -99,7 +99,7 @@ def test_without_gravity_energy_never_rises(name):
     touch = Touch(loop, Hands(np.random.default_rng(5), 1, True, 0.3, T=T, delta=loop.delta), gravity=False)
     model, data = touch.port.world.model, touch.port.data
     mass = np.diag(model.dof_M0)
-    for _ in range(500):
+    for _ in range(350):
         risen = touch.tick()
         kinetic = data.qvel @ mass @ data.qvel / 2  # bodies here translate, or turn about one fixed hinge
         assert risen + kinetic <= START_J + touch.port.released + 1e-9
