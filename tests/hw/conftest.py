@@ -1,4 +1,4 @@
-"""The scenario that sessions are held with, and couplings for its links: made once."""
+"""Provide the scenario of the sessions and certified couplings for its links, made once per test run."""
 
 import pytest
 
@@ -9,11 +9,11 @@ from tests.checks.faults import _lively
 
 @pytest.fixture(scope="session")
 def scenario():
-    """People who move soon after arming, at full amplitude."""
+    """Return the default scenario with people who move at full amplitude soon after arming."""
     return _lively(scenario_of())
 
 
 @pytest.fixture(scope="session")
 def rungs(scenario):
-    """Couplings for links of one and two ticks."""
+    """Return certified couplings for links of one and two ticks."""
     return certified_couplings(scenario, "I", None, None, 1, spare=1)

@@ -1,4 +1,4 @@
-"""Arming and stopping of a board without a host (hw/firmware/haptic_alone.h), compiled for this processor.
+"""Arm and stop a board without a host: hw/firmware/haptic_alone.h, compiled for this processor.
 
 The handle is a mass with damping, Coulomb friction and a constant force such as gravity, stepped ten times a tick.
 """
@@ -17,7 +17,7 @@ FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
 T, MASS, COUNT = 1e-3, 0.08, 2e-5
 READY, RUNNING = 1, 3
 ASKED, SIGN, DEAD, SCALE = 1, 6, 7, 8
-#: a spring of 300 N/m with a little damping in the place of the exported file; the board's force is -f
+#: A spring of 300 N/m with a little damping replaces the exported file. The board's force is -f.
 SOURCE = """
 #define PROCESS_CHANNELS 2
 #define PROCESS_PERIOD 1e-3
@@ -53,7 +53,7 @@ def board(request, tmp_path_factory):
 
 
 class Bench:
-    """Two handles before a board: axis 2 may be wrong."""
+    """A board with two handles. The motor or the sensor of axis 2 may be wrong."""
 
     def __init__(self, board, seed=0, noise=0.0, friction=0.0, gravity=0.0, speed=0.0, motor=1.0, sensor=1.0):
         self.board, self.rng, self.noise = board, np.random.default_rng(seed), noise
@@ -65,7 +65,7 @@ class Bench:
 
     def tick(self):
         """Run a tick, and return the board's phase and cause."""
-        acting = self.force[0], self.motor * self.force[1]  # computed from the last sample
+        acting = self.force[0], self.motor * self.force[1]  # the board computed these from the last sample
         noise = self.noise * self.rng.standard_normal(2)
         shown = [round(x / COUNT + n) * COUNT for x, n in zip(self.x, noise, strict=True)]
         self.seen[0], self.seen[1] = shown[0], self.sensor * shown[1]
@@ -81,14 +81,14 @@ class Bench:
         return told % 16, told // 16
 
     def armed(self):
-        """Arm, and return phase and cause once the tests are over."""
+        """Arm the board, and return its phase and cause after its motor tests."""
         for _ in range(150):
             self.tick()
         self.board.arm()
         for _ in range(1300):
             if (state := self.tick())[0] in (READY, RUNNING):
                 return state
-        raise AssertionError("the test does not end")
+        raise AssertionError("the motor tests do not end")
 
 
 SEEDS = range(6)
@@ -133,7 +133,7 @@ def test_a_sensor_that_dies_under_a_force_ends_in_a_ramp(board, noise):
     bench = Bench(board, 1, noise)
     assert bench.armed() == (RUNNING, 0)
     for k in range(1500):
-        bench.hand = 1.5 * min(1, k / 500) * (1 + 0.02 * np.sin(2 * np.pi * 9 * T * k))  # with a hand's tremor
+        bench.hand = 1.5 * min(1, k / 500) * (1 + 0.02 * np.sin(2 * np.pi * 9 * T * k))  # the hand has tremor
         assert bench.tick() == (RUNNING, 0)
     assert abs(bench.force[1]) > 1.0
     bench.stuck = bench.sensor * round(bench.x[1] / COUNT) * COUNT

@@ -1,4 +1,4 @@
-"""Sketches that run an exported tick without a host, on a simulated ATmega328P and Cortex-M7 (make firmware)."""
+"""Sketches run an exported tick without a host on a simulated ATmega328P and Cortex-M7 (make firmware)."""
 
 import re
 import subprocess
@@ -48,7 +48,7 @@ def exported(folder, limit, *scenario, single=False):
 
 
 class Board:
-    """A simulated board that is asked tick by tick."""
+    """A simulated board. Each tick sends it one line and reads its line of answer."""
 
     def __init__(self, *command, said=subprocess.DEVNULL):
         pipe = subprocess.PIPE
@@ -58,7 +58,7 @@ class Board:
         self.process.stdin.write(" ".join(map(str, order)) + "\n")
         self.process.stdin.flush()
         while (words := self.process.stdout.readline().split())[:1] == ["Loaded"]:
-            pass  # simavr says so on standard output
+            pass  # simavr prints this line on standard output
         return words
 
     def __enter__(self):
@@ -71,7 +71,7 @@ class Board:
 
 
 class Handle:
-    """A mass with damping, moved by a force that is held for T: v decays to f/b."""
+    """A mass with damping, moved by a force that is held for T: v approaches f/b."""
 
     def __init__(self, mass, damping, T):
         self.b, self.x, self.v = damping, 0.0, 0.0
@@ -89,7 +89,7 @@ class Handle:
 
 @pytest.fixture(scope="module")
 def hapkit(tmp_path_factory):
-    """The folder with the sketch, the test vector and the board, and the exported block."""
+    """Return the folder of the sketch, the test vector and the board, and the exported block."""
     folder = tmp_path_factory.mktemp("hapkit")
     block = exported(folder, 4.8, "--scenario", str(ROOT / "examples/hapkit.toml"), single=True)
     core = CORE / "cores/arduino"
@@ -114,17 +114,17 @@ HOME, DUTY = f32(-0.045), f32(255) * PER_RADIAN / f32(0.03)
 
 
 def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
-    """A session in which the hand pushes with hand(k) [N]: counts, and the board's four numbers per tick."""
+    """Run a session under hand(k) [N]; return counts, the board's four numbers per tick, last phase and cause."""
     handle, counts, told = Handle(0.07, 0.5, 1.25e-3), [], []
     with (folder / "said.txt").open("w") as said, Board(folder / "board", folder / "hapkit.elf", 1, said=said) as board:
         for k in range(ticks):
             seen = 0.045 + sensor * (handle.x - 0.045) if k > 225 else handle.x
             counts.append(300 + round(seen / float(PER_COUNT)))
-            millivolts = int((counts[-1] % 1024 + 0.5) * 5000 / 1023)  # which the converter rounds down
+            millivolts = int((counts[-1] % 1024 + 0.5) * 5000 / 1023)  # the converter rounds down
             key = "h" if k == 5 else "a" if k == 230 else "."
             told.append([int(word) for word in board.tick(millivolts, key, int(held(k)))])
             *_, pwm, negative = told[-1]
-            if 5 < k < 220:  # from the stop to the middle
+            if 5 < k < 220:  # the hand moves it from the stop to the middle
                 handle.x = 0.045 * min(1, k / 200)
             handle.push(motor * (-1) ** negative * pwm / 255 * 0.03 / float(PER_RADIAN) + hand(k))
     causes = re.findall(r"^(\d)(\d) ", (folder / "said.txt").read_text(), re.MULTILINE)
@@ -132,7 +132,7 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
 
 
 def swing(k):
-    """Push slowly, and at times for 30 ms by more than the limit."""
+    """Push slowly, and in 30 of 250 ticks by 2.2 N more, at times above the limit."""
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 
@@ -142,16 +142,16 @@ def test_the_hapkit_repeats_the_test_vector(hapkit):
 
 
 def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
-    """Its forces are those of Python's tick to the last step of the PWM, with the limiter at work."""
+    """The steps of the PWM equal those of Python's tick, also while the limiter is at work."""
     folder, block = hapkit
     counts, told, state = paddle(folder, 1900, swing)
-    start = int(np.argmax(told[:, 0] > 10_000))  # the first tick of the coupling; those of the test take less
+    start = int(np.argmax(told[:, 0] > 10_000))  # the coupling's first tick takes longer than those of the motor test
     x = PER_COUNT * (counts - counts[5]).astype(f32) + HOME
     f = _sequential(block.system, (x[start:] - x[start])[:, None], block.limiter, f32)[:, 0]
     gain = np.minimum(np.cumsum(np.full(len(f), f32(1.25e-3) / f32(0.25)), dtype=f32), f32(1))
     force = np.clip(-gain * f, f32(-4.8), f32(4.8))
     duty = np.minimum(np.abs(force) * DUTY + f32(0.5), f32(255)).astype(int)
-    assert told[-1, 0] > 10_000, state  # it still runs
+    assert told[-1, 0] > 10_000, state  # the coupling still runs
     assert duty.max() > 240
     np.testing.assert_array_equal(told[start + 1 :, 2:].T, [duty[:-1], force[:-1] < 0])
     limited = np.abs(f) >= f32(4.79999)
@@ -203,7 +203,7 @@ def test_the_cortex_m7_repeats_the_test_vector(teensy):
 
 
 def test_the_cortex_m7_limits_vectors(tmp_path):
-    """Two devices with three axes each: the limiter on balls repeats the ticks of Python to the last bit."""
+    """For two devices of three axes, the vector limiter repeats the ticks of Python to the last bit."""
     words = "--scenario", "omega-space", "--out", str(tmp_path / "coupling.json")
     assert design.main([*words]) == 0
     process = ["--process", "--force-limit", "3", "--out", str(tmp_path / "coupling-process.c")]
@@ -233,7 +233,7 @@ def test_the_teensys_forces_are_those_of_python(teensy):
     start = next(k for k in range(first, 500) if not pins[k + 1].any() and not pins[k].any()) - 1
     x = 10e-6 * (np.array(counts) - counts[3])
     candidates = []
-    for begin in range(start - 2, start + 3):  # the first tick of the coupling is not told
+    for begin in range(start - 2, start + 3):  # the board does not report the coupling's first tick
         f = _sequential(block.system, x[begin:] - x[begin], block.limiter)
         gain = np.minimum(np.cumsum(np.full(len(f), 1.2e-3 / np.float32(0.25))), 1.0)[:, None]
         steps = np.round(np.clip(-gain * f, -8, 8) / 12 * 4095).astype(int)

@@ -1,4 +1,4 @@
-"""Two boards with two clocks behind one session: the paper's pair of devices, with its delays of 1 and 2 samples."""
+"""One session runs two boards with two clocks: the paper's pair of devices with delays of 1 and 2 samples."""
 
 import json
 import os
@@ -26,12 +26,12 @@ from haptic_loop.sim.scenario import load as load_scenario
 from tests.pseudo_terminal import Terminal
 
 BEHIND = (0, 1)
-SLIP_SOON = 1020.0  # [us] of the second board's first tick: with 100 ppm its samples are late soon after full gain
+SLIP_SOON = 1020.0  # [us] second board's first tick; clocks 100 ppm apart make its samples late soon after full gain
 
 
 @pytest.fixture(scope="module")
 def alone(scenario):
-    """Each device by itself, as its emulator needs it."""
+    """Return a scenario of one device for each emulator."""
     one = load_scenario("one-wall").replace(T=scenario.T)
     each = zip(scenario.device, scenario.human, scenario.delta, strict=True)
     return [one.replace(device=(device,), human=(human,), delta=(delta,)) for device, human, delta in each]
@@ -51,7 +51,7 @@ def rehearsal_of(scenario, alone, made, clock=1.0, faults=((), ()), begin_us=300
 
 
 def watched(emulator):
-    """The counts and forces of every tick of an emulated board, by its own number."""
+    """Record count and force of every tick of an emulated board by the board's tick number."""
     ticks, tick = {}, emulator.device.tick
 
     def noted(now, counts):
@@ -65,7 +65,7 @@ def watched(emulator):
 
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf):
-    """The other board stops and rests, which must not hide the force that is left."""
+    """The other board rests, which must not hide the force that the deaf one keeps."""
     faults = [(), ()]
     faults[deaf] = ("stuck@0.1",)
     stop = (0.4, lambda session, now: session.stop("asked to", now))
@@ -75,7 +75,7 @@ def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf)
 
 @pytest.mark.slow
 def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
-    """Through a slip, forces are 1 and 2 steps old, and the host's energies are those at the devices, in integers."""
+    """Through a slip, forces are 1 and 2 ticks old, and the host's energies are exactly those at the devices."""
     rehearsal = rehearsal_of(scenario, alone, made, 1.0001, begin_us=SLIP_SOON)
     session, rows = rehearsal.session, []
     session.record = lambda row: (rows.append(row), recorder(row))
@@ -85,10 +85,10 @@ def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
     assert session.stage == Stage.ARMED
     assert (made[0].scenario.theta, made[0].link, made[0].scenario.T_max) == ((1, 2), 1, 1.2e-3 * (1 + CLOCK_TOLERANCE))
     assert session.counters.late == session.counters.gaps == 0
-    assert session.missed_while_driving <= 1  # the first tick after CONFIG
+    assert session.missed_while_driving <= 1  # only the first tick after CONFIG may be missed
     steps = [row.tick for row in rows]
     assert np.diff(steps).tolist() == [1] * (len(rows) - 1)
-    for axis, theta, slips in ((0, 1, 0), (1, 2, 1)):  # ticks without length
+    for axis, theta, slips in ((0, 1, 0), (1, 2, 1)):  # slips: session ticks in which this board has none
         counts, sent = ([row.state.counts[axis] for row in rows], [row.sent[axis] for row in rows])
         begun = next(k for k in range(len(rows)) if sent[k]) + theta
         host = sum(sent[k - theta] * (counts[k + 1] - counts[k]) for k in range(begun, len(rows) - 1))
@@ -109,7 +109,7 @@ ENDING = ["unplug", "up:drop=1", "down:drop=1", "stall=0.03", "trip", "estop", "
 
 @pytest.mark.parametrize(("board", "fault"), checkered([0, 1], ENDING))
 def test_a_fault_of_one_stops_both(scenario, alone, made, board, fault):
-    """Whichever link or board it is: a named end, and both motors at zero within 20 ms of it."""
+    """A fault of either board or link ends the session, and both motors are at zero within 50 ms."""
     faults = [(), ()]
     faults[board] = (f"{fault}@0.6",)
     rehearsal = rehearsal_of(scenario, alone, made, faults=faults)
@@ -136,7 +136,7 @@ def test_clocks_that_are_not_covered_are_refused(scenario, alone, made, clock, b
 
 
 def test_a_faster_clock_stops_forces(scenario, alone, made, monkeypatch):
-    """Where the measurement did not tell: before any tick is two periods long."""
+    """Without the comparison of clocks, the session stops before an answer is late."""
     monkeypatch.setattr(boards, "_COMPARED", 10**6)
     rehearsal = rehearsal_of(scenario, alone, made, 0.998, begin_us=300.0)
     rehearsal.run_until_armed(1.5)
@@ -146,7 +146,7 @@ def test_a_faster_clock_stops_forces(scenario, alone, made, monkeypatch):
 
 
 def test_each_link_is_timed_by_itself(scenario, alone, made):
-    """Answers that wait for the other board's sample are no older for it."""
+    """Waiting for the other board's sample does not add to the age of an answer."""
     rehearsal = rehearsal_of(scenario, alone, made, faults=((), ("up:delay=0.0003",)))
     rehearsal.run_until_armed(0.0)
     first, second = rehearsal._driver.device.ages
@@ -167,7 +167,7 @@ def test_the_board_with_the_least_delay_leads():
 
 
 class _Terminals:
-    """Virtual time between two real pseudo-terminals and two emulated boards."""
+    """Connect two real pseudo-terminals to two emulated boards in virtual time."""
 
     def __init__(self, rehearsal, monkeypatch):
         self.rehearsal, self.ends = rehearsal, [Terminal(), Terminal()]
@@ -202,7 +202,7 @@ class _Terminals:
 
 
 def test_two_ports_reach_the_serial_stack(scenario, alone, made, monkeypatch, capsys, tmp_path):
-    """The command with two pseudo-terminals, pyserial and clocks that differ by 100 ppm, in virtual time."""
+    """In virtual time, the command runs over pyserial, two pseudo-terminals and clocks that differ by 100 ppm."""
     pytest.importorskip("serial")
     rehearsal = rehearsal_of(scenario, [nobody(one) for one in alone], (), 1.0001, begin_us=SLIP_SOON)
     ports = _Terminals(rehearsal, monkeypatch).ports

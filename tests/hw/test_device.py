@@ -1,4 +1,4 @@
-"""The device's rules, as docs/protocol.md states them: when a force acts, what stops it, what never starts it again."""
+"""The device follows docs/protocol.md: when forces act, what stops them, and what never starts them again."""
 
 import pytest
 
@@ -28,7 +28,7 @@ CONFIG = Config(1, 4, 4, 0, (24_000, 20_000), (48_000,) * 2)
 
 
 class Rig:
-    """A device with a host at its side that says only what a test tells it to."""
+    """A device, and a host that sends only what a test tells it to send."""
 
     def __init__(self, config: Config | None = CONFIG, first_tick: int = 0) -> None:
         self.device, self.decoder, self.now = Device(INFO), Decoder(), 0
@@ -44,7 +44,7 @@ class Rig:
             self.device.receive(encode(message), self.now + after)
 
     def answer(self, force=(0, 0), command=Command.RUN, back: int = 0, after: int = 300) -> None:
-        """The FORCE that answers the STATE of `back` ticks ago."""
+        """Send the FORCE that answers the STATE of `back` ticks ago."""
         source = (self.device.k - back) & 0xFFFF
         self.say(Force(command, (source + self.config.theta) & 0xFFFF, source, force), after=after)
 
@@ -150,7 +150,7 @@ def test_forces_act_only_after_arming():
 @pytest.mark.parametrize("theta", [1, 2, 3, 15])
 @pytest.mark.parametrize("first_tick", [0, 65_500])
 def test_forces_act_at_k_plus_theta(theta, first_tick):
-    """A staircase: 10 k answers tick k (counted from arming); at tick k the device carries 10 (k - theta)."""
+    """The force 10 k answers tick k (counted from arming), so the device applies 10 (k - theta) at tick k."""
     rig = Rig(CONFIG._replace(theta=theta), first_tick)
     rig.arm()
     for k in range(60):
@@ -182,11 +182,11 @@ def test_late_early_and_misaddressed_frames_are_not_used():
     rig.say(*[Force(Command.RUN, a, s, (900, 900)) for a, s in wrong])
     rig.tick()
     assert (rig.forces, rig.device.phase) == ((100, 100), Phase.HOLDING)
-    assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this one, and the tick of the CONFIG
+    assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this tick and that of the CONFIG
 
 
 def test_theta_zero_forces_act_on_arrival():
-    """The answer to a tick is latched within it, whenever it comes; the margin is what was left of the tick."""
+    """An answer is latched as soon as it comes within its tick; the margin is the rest of the tick."""
     rig = Rig(CONFIG._replace(theta=0))
     rig.answer(command=Command.ARM, after=200)
     assert (rig.device.phase, rig.device.applied) == (Phase.ARMED, (0, 0))
@@ -197,7 +197,7 @@ def test_theta_zero_forces_act_on_arrival():
         rig.answer((10 * k, -10 * k), after=after - 1)
         rig.answer((7, 7), after=after)  # the first one counts
         assert carried == (10 * (k - 1), -10 * (k - 1))
-        assert rig.device.applied == (10 * k, -10 * k)  # before any tick
+        assert rig.device.applied == (10 * k, -10 * k)  # before the next tick
         rig.tick()
         assert rig.forces == (10 * k, -10 * k)
         assert (rig.state.echo, rig.state.margin_us) == ((rig.device.k - 1) & 0xFFFF, T - after + 1)
@@ -206,7 +206,7 @@ def test_theta_zero_forces_act_on_arrival():
 
 
 def test_with_theta_zero_a_force_is_latched_once():
-    """A force that came within its tick is not taken again when the next begins: it moved by the slew rate once."""
+    """A force that was latched within its tick is not latched again at the next one, so it slews once."""
     rig = Rig(CONFIG._replace(theta=0, slew=(3, 3)))
     rig.answer(command=Command.ARM)
     for k in range(1, 5):
@@ -231,7 +231,7 @@ def test_theta_zero_late_answers_are_held_through():
     for _ in range(6):
         rig.tick()
         seen.append(rig.forces[0])
-    assert seen == [200, 200, 200, 100, 0, 0]  # answered, held twice, then down in two ticks
+    assert seen == [200, 200, 200, 100, 0, 0]  # answered, held for two ticks, ramped down in two
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
@@ -260,7 +260,7 @@ def test_the_margin_is_time_before_the_latch():
     slow.receive(encode(CONFIG._replace(theta=15, hold=2)), 0)
     slow.tick(3000, (0, 0))
     slow.receive(encode(Force(Command.IDLE, 16, 1, (0, 0))), 3000)
-    assert slow.margin == 32_767  # of 45,000: the most that the wire can say
+    assert slow.margin == 32_767  # the margin is 45,000; the wire carries no more
     rig = Rig()
     rig.tick()
     rig.answer(command=Command.IDLE, back=1, after=100)  # the tick it was for began 100 us ago
@@ -273,7 +273,7 @@ def test_the_margin_is_time_before_the_latch():
 
 
 def test_the_watchdog_holds_then_ramps_out():
-    """0.25 of the force a tick at ramp = 4: 4.8 ms at T = 1.2 ms."""
+    """With ramp = 4, the force falls by a quarter per tick, to zero in 4.8 ms at T = 1.2 ms."""
     rig = armed()
     rig.answer((1001, -999))
     rig.tick()
@@ -298,7 +298,7 @@ def test_silent_hosts_are_held_equally_long():
 
 
 def test_holding_keeps_the_present_force():
-    """The slew rate was still letting it rise: nothing moves without a fresh frame."""
+    """Without a new frame the force stays, even if the slew rate kept it below the request."""
     rig = armed(slew=(100, 100))
     rig.answer((1000, -1000))
     rig.tick()

@@ -1,4 +1,4 @@
-"""A device that does not do what it was told, or whose ticks are not T: found; one that obeys over a bad line: not."""
+"""Find devices that disobey or whose ticks do not last T; do not accuse one that obeys over a bad line."""
 
 from contextlib import nullcontext
 
@@ -55,10 +55,10 @@ def state(tick, applied=(0, 0), phase=Phase.ARMED, t_us=0):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_device_that_obeys_is_never_found_out(seed):
-    """Random forces through the device's own machine, forces and STATEs lost: ramp, slew, cap and hold all occur."""
+    """Random forces, of which some are lost, as some STATEs are, make the device ramp in, slew, cap and hold."""
     rng = np.random.default_rng(seed)
     device, told = Device(info_of(scenario_of())), CommandMonitor(CONFIG)
-    device.k = 65000  # it wraps around
+    device.k = 65000  # the tick number wraps around
     device.configure(CONFIG)
     last, held = None, 0
     for now in range(0, 2000 * T_US, T_US):
@@ -136,7 +136,7 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
 
 
 def hand_driven(scenario, rungs):
-    """A session at the first STATEs after arming, and what sends it one: `lie` is what the device's clock says."""
+    """Return a session that was just armed and a function that sends it a STATE; `lie` replaces the device's clock."""
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
     session.start(t)
     session.met(info_of(scenario), t)
@@ -170,13 +170,13 @@ def test_tick_leaps_skip_no_check(scenario, rungs):
     assert (session.stage, session.cause) == (Stage.STOPPED, "the tick number leapt by 300, the watchdog allows 5")
     assert gain.value < 0.03
     session, send = hand_driven(scenario, rungs)
-    assert session.stage == Stage.ARMING  # a leap before the first force is none of its business
+    assert session.stage == Stage.ARMING  # a leap before the first force stops it, too
     send(Phase.ARMED, ticks=300)
     assert session.stage == Stage.STOPPED
 
 
 def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
-    """It applies what it is told and counts no miss, but whether answers come in time nobody knows any more."""
+    """The device obeys and counts no miss, but without margins nobody knows whether answers come in time."""
     session, send = hand_driven(scenario, rungs)
     for _ in range(250):
         send(Phase.ARMED)
@@ -191,7 +191,7 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
 
 
 def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
-    """A force is judged from one tick to the next: where a fifth of the ticks is untold, nobody can."""
+    """Forces are judged from tick to tick, which is impossible where a fifth of the ticks has no STATE."""
     session, send = hand_driven(scenario, rungs)
     for _ in range(250):
         send(Phase.ARMED)
@@ -226,7 +226,7 @@ def test_emergency_stops_repeat_until_latched(scenario, rungs):
 @pytest.mark.parametrize("configuring", [False, True])
 @pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
 def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
-    """Whatever its status says; one that goes on for 50 ms once it was asked to be configured is a fault."""
+    """STOP answers a force without arming, whatever the status; 50 ms of it after CONFIG stop the session."""
     session, port = Session(scenario, SafetyLimits((12.0, 12.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
@@ -245,7 +245,7 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
 
 
 def test_fake_device_clocks_are_found(scenario, rungs):
-    """The device's clock says T, its STATEs come every 2 T: 10 % of 200 ticks are behind after 20 of them."""
+    """The device's clock reports T while STATEs come every 2 T: after 20 of them, 10 % of 200 ticks are behind."""
     session, send = hand_driven(scenario, rungs)
     assert session.link.last
     begun = session.link.last.t_us
@@ -259,7 +259,7 @@ def test_fake_device_clocks_are_found(scenario, rungs):
 
 
 def run_clock(ticks):
-    """A clock whose ticks last so long [us], and which wraps around."""
+    """Note ticks of these lengths [us] on a clock that wraps around."""
     pace, t = _ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
     for lasts in ticks:
         pace.note(round(t) & 0xFFFFFFFF, 1)
@@ -278,7 +278,7 @@ def test_one_freeze_is_no_drift_and_many_are():
     with pytest.raises(SafetyStop, match="by its own clock"):
         run_clock([T_US + 4000 * (n in (50, 60)) for n in range(_BLOCK)])
     with pytest.raises(SafetyStop, match="by its own clock"):
-        run_clock([T_US, -5000, T_US])  # a clock that goes back
+        run_clock([T_US, -5000, T_US])  # the clock goes back
 
 
 def test_gaps_within_the_watchdog_are_allowed():
@@ -291,7 +291,7 @@ def test_gaps_within_the_watchdog_are_allowed():
 
 @pytest.mark.parametrize("misses", [0, 1])
 def test_a_measurement_without_answers_ends(scenario, misses):
-    """Whether or not the device counts what it does not hear."""
+    """The measurement ends whether or not the device counts missed answers."""
     session, most = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
     session.met(info_of(scenario), 0)
@@ -312,7 +312,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
 
 
 def test_skipped_answers_are_older_than_the_youngest():
-    """A USB frame of 1 ms with T = 0.3 ms: one margin for three FORCEs, of which none is missed."""
+    """In USB frames of 1 ms with T = 0.3 ms, one margin stands for three FORCEs, none of which is missed."""
     answers = AnswerAges(15, 300.0)
     for k in range(3, 300, 3):
         answers.note(k - 3, 3500)
@@ -332,12 +332,12 @@ def test_lost_answers_have_no_age():
         if measurement.note(state, None if lost else 14_800, missed):
             break
     ages = measurement.result.values
-    assert ages.count(200) >= len(ages) - 2  # a skip whose latch is still to come may stand for an answer
+    assert ages.count(200) >= len(ages) - 2  # a lost answer counts until its latch is missed
     assert measurement.result.missing == pytest.approx(len(ages) / 9, abs=2)
 
 
 def measured(scenario, faults, needed, seed=0):
-    """Measure a link in virtual time: the session, and the true ages [us] of all answers and of those of a round 2."""
+    """Measure a link in virtual time. Return the session, the true ages [us] of all answers, and those of a round 2."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=needed))
     emulator, true, exact = Emulator(scenario, faults), [], None
     accept = emulator.device.accept
@@ -358,13 +358,13 @@ def measured(scenario, faults, needed, seed=0):
     return session, true, exact
 
 
-BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T, and between two bursts
+BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T and the time between two bursts
 
 
 @pytest.mark.parametrize("where", ["down", "both"])
 @pytest.mark.parametrize(("T", "every"), BURSTS)
 def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
-    """The emulator itself notes how old every FORCE was: no certified delay is shorter, nor two ticks longer."""
+    """The measured delay covers the greatest age that the emulator noted, by at most one tick more."""
     direction = "" if where == "both" else f"{where}:"
     session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 400)
     ages = session.measurement.result
@@ -378,7 +378,7 @@ def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
 def test_answers_that_overtake_each_other_are_timed(scenario):
     """A late answer that comes together with a younger one leaves no trace, so a second round tells them apart.
 
-    Without it the first link was measured at 2.7 ms, which needs 6 ticks of 0.5 ms in place of 7.
+    Without the second round, the first link was measured at 2.7 ms, which needs 6 ticks of 0.5 ms in place of 7.
     """
     rng = np.random.default_rng(3)
     links = [(5e-4, "down:jitter=0.0005", "down:burst=0.0017")]
@@ -423,7 +423,7 @@ def test_ages_while_forces_act_count_skipped_answers(scenario):
     tune = chirp(2, scenario.T, 10, 1.0, (3, 200), 0.5)
     Rehearsal(session, emulator, lambda ages: [tune], faults).run_until_armed(0.6)
     shown = outcome("identify", session, recorder, 0).link.age_us
-    assert shown["p50"] == pytest.approx(np.median(true), abs=501)  # 5, 6, 7 and 8 ms, a quarter each
+    assert shown["p50"] == pytest.approx(np.median(true), abs=501)  # the ages are 5, 6, 7 and 8 ms, a quarter each
     assert shown["p99"] == pytest.approx(np.percentile(true, 99), abs=60)
 
 
