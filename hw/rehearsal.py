@@ -164,10 +164,10 @@ class Rehearsal:
         return self.session
 
     def run_until_armed(self, seconds: float) -> Session:
-        """Run until `seconds` after arming, or until shortly after the end of a session that is never armed."""
-        while self.armed_us is None and not self._over:
+        """Run until `seconds` after arming, or until shortly after the end of the session if that is earlier."""
+        while not self._over and (self.armed_us is None or self.now <= self.armed_us + 1e6 * seconds):
             self._turn()
-        return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
+        return self.session
 
     def run_to_the_end(self, most: float) -> Session:
         """Run until shortly after the end of the session, or for `most` seconds of virtual time."""

@@ -228,7 +228,7 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
     return session
 
 
-@pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
+@pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
 def test_handles_that_are_let_go_finish(scenario, rungs, hand):
     """A hand on the handle is asked to let go; it is no wrong scale. With 0.25 kg it halves the motion at most."""
     session = ended_live(scenario, rungs, hand, lets_go=2.5)
@@ -236,9 +236,8 @@ def test_handles_that_are_let_go_finish(scenario, rungs, hand):
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
 
 
-@pytest.mark.parametrize("hand", [(0.5, 20.0, 1500.0), (0.4, 3.0, 100.0)])
-def test_handles_that_stay_held_never_finish(scenario, rungs, hand):
-    session = ended_live(scenario, rungs, hand)
+def test_handles_that_stay_held_never_finish(scenario, rungs):
+    session = ended_live(scenario, rungs, (0.4, 3.0, 100.0))
     assert session.stage == Stage.STOPPED
     assert session.cause == (
         "axis 1 did not move as a free handle does at the end of the session: a hand held it, or its motor or encoder "
@@ -289,11 +288,12 @@ def test_the_expected_motion_is_the_closed_form():
 # noise
 
 
-@pytest.mark.parametrize("noise", [0.3, 0.5, 1.0])
+@pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
-    """Live encoders with noise are armed; dead ones with the same noise are found, before and while forces act."""
-    alive, _ = session_with(scenario, rungs, f"axis1:noise={noise}", seconds=0.8)
-    assert alive.stage == Stage.ARMED
+    """Dead encoders with noise are found, before and while forces act.
+
+    tests/checks/faults.py arms live encoders with the same noise, and has dead ones with a noise of 0.5 counts.
+    """
     dead, _ = session_with(scenario, rungs, "axis1:freeze", f"axis1:noise={noise}")
     assert (dead.stage, dead.cause[:36]) == (Stage.STOPPED, "encoder of axis 1 does not follow: i")
     later, _ = session_with(

@@ -65,10 +65,10 @@ def test_faults_of_two_axes_have_two(kind):
 
 
 def one_of_each_kind():
-    """Return one case of those that differ by axis or sign alone, each time another one."""
+    """Return one case of those that differ by numbers alone and end in the same stage, each time another one."""
     kinds = {}
     for case in CASES:
-        kinds.setdefault(re.sub(r"-|(axis|encoder|motor|handle) \d", r"\1", case.name), []).append(case)
+        kinds.setdefault((re.sub(r"-|\b([\d.]+|inf|nan)\b", "", case.name), case.stage), []).append(case)
     return [alike[i % len(alike)] for i, alike in enumerate(kinds.values())]
 
 
@@ -89,8 +89,8 @@ def test_every_fault_ends_where_it_must(case, scenario, rungs):
 
 def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
     rehearsal = rehearsal_of(scenario, rungs, "motor=-1", "unplug@0.5")
-    assert rehearsal.run_until_armed(0.6).stage == Stage.STOPPED
-    assert rehearsal.now >= 1e6 * 0.6
+    rehearsal.run_until_armed(0.6)
+    assert rehearsal.run(1e-6 * rehearsal.armed_us + 0.6).stage == Stage.STOPPED
 
 
 def test_free_handles_arm_in_the_table(scenario, rungs):
@@ -458,18 +458,15 @@ def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
     assert part.reserved_J <= part.energy_J
 
 
-@pytest.mark.parametrize(
-    "faults", [pytest.param((), marks=pytest.mark.slow), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"]
-)
-def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path, faults):
-    """And the replay repeats what the budget did, bit by bit."""
+def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path):
+    """Over a line that becomes lossy; the replay repeats what the budget did, bit by bit."""
     for module in ("control", "recording"):
         monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
     taken = {}
     for budget in (0.01, 10.0):
         recorder = Recorder(2)
         settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
-        run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
+        run = rehearsal_of(scenario, rungs, "down:drop=0.02@0.5", recorder=recorder, settings=settings)
         run.run_to_the_end(1.3)
         report = outcome("I", run.session, recorder, 0)
         (part,) = report.energy_budget
