@@ -228,10 +228,19 @@ class _EmulatedPlant:
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
         f, m, n = np.minimum(np.maximum(f, -self._limit), self._limit), self.scenario.channels, self.scene.model.nq
+        held, size = self._held(share), len(self.s)
+        if not self.coulomb:
+            self.s = held @ np.concatenate([self.s, self._w, f])
+            return self._note_speed(self.s[n : n + m])
+        A, B, slip = held[:, :size], self.coulomb * held[:, -m:], _SLIP / self.scenario.lever
+        pushed = held[:, size:] @ np.concatenate([self._w, f])
         for _ in range(self._substeps):
-            friction = self.coulomb * np.tanh(self.s[n : n + m] * self.scenario.lever / _SLIP) if self.coulomb else 0.0
-            self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])
-            self.fastest = max(self.fastest, *map(abs, self.s[n : n + m].tolist()))
+            self.s = A @ self.s + pushed + B @ np.tanh(self.s[n : n + m] / slip)
+            self._note_speed(self.s[n : n + m])
+        return None
+
+    def _note_speed(self, v: Array) -> None:
+        self.fastest = max(self.fastest, *map(abs, v.tolist()))
 
     def _hold(self, share: float) -> Array:
         held = hold(self._plant, share * self.scenario.T / self._substeps)

@@ -132,35 +132,29 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
     origin, phase = draw.uniform(size=len(many)), draw.uniform(0, 2 * np.pi, (2, len(many)))
     x, v, y, w, z, felt, wound = (np.zeros(len(many)) for _ in range(7))
     h, out, before = T / substeps, np.zeros((len(signal), len(many))), 0.0
-    dahl, lags, followed, remembered = bristle > 0, lag > 0, -np.expm1(-h / np.maximum(lag, 1e-9)), memory / relax
-    reach, free, ends, turns = c / np.maximum(bristle, 1e-9), gap == 0, late * substeps, 2 * np.pi / period
+    dahl, remembered, slack, free = bristle > 0, memory / relax, gap / 2, gap == 0
+    followed = np.where(lag > 0, -np.expm1(-h / np.maximum(lag, 1e-9)), 1.0)
+    reach, turns = c / np.maximum(bristle, 1e-9), 2 * np.pi / period
+    old = [i < late * substeps for i in range(substeps)]  # whether the force of the last tick still acts
+    pushes, pulls, damper, spring = h / m1, h / m2, hand[:, 1], hand[:, 2]
     for n, force in enumerate(signal):
         seen = x + eccentric * np.sin(2 * np.pi * x / turn + phase[0])
         out[n] = step * np.round(seen / step + origin)
         shake = tremor * np.sin(2 * np.pi * 9.3 * n * T) * (1 + np.sin(2 * np.pi * 0.7 * n * T))
         outside = constant + drift * n * T
         for i in range(substeps):
-            now = np.where(i >= ends, force, before)
-            felt = np.where(lags, felt + (now - felt) * followed, now)
+            now = np.where(old[i], before, force) if old[i].any() else force
+            felt = felt + (now - felt) * followed
             stretch, speed = x - y, np.abs(v)
-            contact = np.sign(stretch) * np.maximum(np.abs(stretch) - gap / 2, 0.0)
-            link = k * contact + np.where(free | (contact != 0), d * (v - w), 0.0)
+            contact = stretch - np.minimum(np.maximum(stretch, -slack), slack)
+            link = k * contact + (free | (contact != 0)) * d * (v - w)
             z = np.minimum(np.maximum(z + h * v, -reach), reach)
             dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / stribeck) ** 2))))
             wound = wound + h * (v - wound / relax)  # [m] of the Maxwell element's spring
-            total = (
-                felt
-                + outside
-                - link
-                - b * v / (1 + speed / thin)
-                - remembered * wound
-                - drag * v * speed
-                - dry
-                - cable * x
-            )
-            total = total + cogging * np.sin(turns * x + phase[1])
-            v = v + h * total / m1
-            w = w + h * (link - hand[:, 1] * w - hand[:, 2] * y + shake) / m2
+            total = felt + outside - link - v * (b / (1 + speed / thin) + drag * speed)
+            total = total - remembered * wound - dry - cable * x + cogging * np.sin(turns * x + phase[1])
+            v = v + pushes * total
+            w = w + pulls * (link - damper * w - spring * y + shake)
             x, y = x + h * v, y + h * w
         before = force
     return out
