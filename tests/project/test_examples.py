@@ -22,8 +22,8 @@ SAYS = {
     ],
     "unstable_and_certified": ["without coupling: unstable", "guaranteed for .* and this environment: stable"],
     "neural_environment": [
-        r"budget 1e\+09 J: limited 0 of 5000",
-        r"budget 0.01 J: limited [34]\d{3} of 5000",
+        r"budget 1e\+09 J: limited 0 of [25]\d{3}",
+        r"budget 0.01 J: limited [1-4]\d{3} of [25]\d{3}",
         "behind a coupling certified for any environment",
         "no passive hand is given more than 0.01 J",
     ],
@@ -63,6 +63,7 @@ SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoper
 SHORTER = {
     "limits_of_any_coupling": ("(0.7, 1.0, 1.4)", "(1.0, 1.4)"),
     "mujoco_two_fingers": ("duration = 4.0", "duration = 1.0"),
+    "neural_environment": ("0.01, 6.0, 32", "0.01, 3.0, 32"),
     "unstable_and_certified": ("12.0, 4, 1", "12.0, 1, 1"),
     "your_own_device": ("SECONDS = 2.0", "SECONDS = 0.5"),
 }

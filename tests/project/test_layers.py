@@ -50,6 +50,11 @@ def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@cache
+def _nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(_tree(path)))
+
+
 #: names of conditions, with which only the files AT_HOME may compare
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
 AT_HOME = ("design/conditions", "design/environments", "design/result")
@@ -60,7 +65,7 @@ def test_no_code_asks_for_a_conditions_name():
     asking = []
     for path in FILES:
         place = path.relative_to(ROOT).as_posix().removesuffix(".py")
-        for node in () if place in AT_HOME else ast.walk(_tree(path)):
+        for node in () if place in AT_HOME else _nodes(path):
             if isinstance(node, ast.Compare | ast.match_case):
                 parts = [getattr(part, of, None) for part in ast.walk(node) for of in ("value", "id", "attr")]
                 if any(w in CONDITIONS for w in parts if isinstance(w, str)):
@@ -167,7 +172,7 @@ def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
 
 def test_replaced_fields_exist():
     """replace() of dataclasses and structs takes any name, so that pyright cannot see a wrong one."""
-    nodes = [(path, node) for path in FILES for node in ast.walk(_tree(path))]
+    nodes = [(path, node) for path in FILES for node in _nodes(path)]
     fields = {n.target.id for _, n in nodes if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
     wrong = [
         f"{path.name}:{node.lineno}: {keyword.arg}"
