@@ -1,4 +1,4 @@
-"""Encoders that do not follow: found on every axis, at arming and while forces act; a hand that holds still: not."""
+"""Find encoders that do not follow, on every axis, at arming and under force; do not stop a hand that holds still."""
 
 from pathlib import Path
 from runpy import run_path
@@ -41,7 +41,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
 
 @pytest.mark.parametrize(("axis", "kind"), checkered([1, 2], ["freeze", "toggle"]))
 def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
-    """Before the gain has risen at all: nobody has felt more than the test force."""
+    """The encoder is found before the gain rises, so nobody feels more than the test force."""
     session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith(f"encoder of axis {axis} does not follow: it moved by ")
@@ -56,7 +56,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
 @pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.13), (1e-4, 0.25)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
-    """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
+    """Encoders of 1 to 100 um answer at most this force, held by the scenario's hands or free."""
     still = scenario if held else nobody(scenario)
     forces = []
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))
@@ -68,7 +68,7 @@ def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
 
 
 def played(test, motion, ticks=6000):
-    """Play a test to encoders with `motion`(k, applied so far) -> counts; what it asked for (ticks, m) [N]."""
+    """Run a test on encoders of counts `motion`(k, applied so far); return the requested forces (ticks, m) [N]."""
     forces, applied = [], np.zeros((ticks, 2), int)
     for k in range(ticks):
         counts = motion(k, applied[:k])
@@ -81,7 +81,7 @@ def played(test, motion, ticks=6000):
 
 
 def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6):
-    """Two free masses under the applied forces, twice summed: independent of the model in the test."""
+    """Return the motion of two free masses: the forces summed twice, independently of the model in the test."""
 
     def motion(k, applied):
         v = np.cumsum(applied * STEP / mass * T, axis=0)
@@ -95,7 +95,7 @@ UNITS = Units((1e-6, 1e-6), (STEP, STEP), (10**6, 10**6))
 
 
 def free_pair(mass=0.25):
-    """Two rigid devices, as good as undamped, without hands."""
+    """Return a scenario of two rigid, almost undamped devices without hands."""
     device = {"kind": "rigid", "mass": mass, "damping": 1e-6}
     return nobody(load().replace(device=[device] * 2))
 
@@ -130,7 +130,7 @@ def test_the_test_force_stays_within_the_cap(cap):
 
 
 def cut(test, most):
-    """Play a test to encoders that stand still, with forces that are cut to `most` [N]."""
+    """Run a test on encoders that stand still under forces that are cut to `most` [N]."""
     sent = (0, 0)
     for k in range(6000):
         asked = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, (0, 0), sent), 1)
@@ -172,7 +172,7 @@ HANDS = [lambda t, f=f, a=a: a * np.sin(2 * np.pi * f * t + f) for f, a in ((0.5
 @pytest.mark.parametrize("hand", [*REACH, *HANDS])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_moving_hand_hides_no_sign(hand, sign):
-    """Reaches of 10 cm in 0.4 s, and 5 cm at 2 Hz: far more than the test force moves a handle."""
+    """Reaches of 10 cm in 0.4 s and swings of 5 cm at 2 Hz move a handle far more than the test force does."""
     alone = masses((sign, sign))
     moved = lambda k, applied: tuple(n + round(hand(k * T) / 1e-6) for n in alone(k, applied))  # noqa: E731
     if sign < 0:
@@ -191,7 +191,7 @@ def test_a_moving_hand_is_no_motor(hand, closing):
 
 @pytest.mark.parametrize(("axis", "at"), checkered([1, 2], [0.7, 0.9]))
 def test_motors_that_died_never_finish(scenario, rungs, axis, at):
-    """Under hands that move at full amplitude; the same session without the fault finishes."""
+    """Hands move at full amplitude. The same session without the fault finishes."""
     for faults, stage in ((("motor=1",), Stage.FINISHED), ((f"axis{axis}:motor=0@0.6",), Stage.STOPPED)):
         session, rehearsal = session_with(scenario, rungs, *faults, stop=at, seconds=at + 1.0)
         assert session.stage == stage, session.cause
@@ -207,7 +207,7 @@ def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
 
 
 def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
-    """A live session: a `hand` (mass, damping, stiffness) takes both handles at 0.7 s, the end comes at 0.9 s.
+    """Run a session: a `hand` (mass, damping, stiffness) takes both handles at 0.7 s, a person ends it at 0.9 s.
 
     The hand lets go at `lets_go` [s].
     """
@@ -230,7 +230,7 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
 
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
 def test_handles_that_are_let_go_finish(scenario, rungs, hand):
-    """A hand on the handle is asked to let go; it is no wrong scale. With 0.25 kg it halves the motion at most."""
+    """A hand is asked to let go, and is not taken for a wrong scale. One of 0.25 kg at most halves the motion."""
     session = ended_live(scenario, rungs, hand, lets_go=2.5)
     assert session.stage == Stage.FINISHED, session.cause
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
@@ -250,7 +250,7 @@ WRONG = ["motor=-1", "motor=0.3", "motor=3", "scale=0.3", "reverse", "late=2", "
 
 @pytest.mark.parametrize("fault", WRONG)
 def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
-    """A fault after full gain, hidden by a firm hand until it lets go."""
+    """A firm hand hides a fault after full gain until it lets go."""
     session = ended_live(scenario, rungs, (0.5, 20.0, 1500.0), f"{fault}@0.8", lets_go=1.5)
     assert session.stage == Stage.STOPPED, session.cause
     assert "a hand held it" not in session.cause
@@ -258,14 +258,14 @@ def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
 
 @pytest.mark.parametrize("at", [0.05, 0.3])
 def test_a_stop_before_the_end_test_is_no_finish(scenario, rungs, at):
-    """At 0.05 s the encoders are tested, and no gain has risen; at 0.3 s it has."""
+    """At 0.05 s the encoders are tested and the gain is still 0; at 0.3 s it has risen."""
     session, _ = session_with(scenario, rungs, stop=at, seconds=1.5)
     assert (session.stage == Stage.FINISHED) == (at == 0.3), session.cause
     assert at == 0.3 or "before the motors of the last arming were tested" in session.cause
 
 
 def test_devices_of_three_axes_run_without_hands():
-    """Six channels of two free devices: the first tick of each moves its mass alone by F T^2 / 2 m."""
+    """In each of six channels, the first tick moves the free mass by F T^2 / 2 m, and a heavy hand halves this."""
     space = load("omega-space")
     session = session_for(space, LinkSettings(held=False))
     for axis, mass in enumerate(session._expected.mass):
@@ -277,7 +277,7 @@ def test_devices_of_three_axes_run_without_hands():
 
 
 def test_the_expected_motion_is_the_closed_form():
-    """A mass from rest under forces that change at every tick: x is summed twice, in closed form."""
+    """The motion of a free mass under forces that change at every tick equals the closed-form double sum."""
     expected, draw = Expected(free_pair(), False), np.random.default_rng(1)
     x = v = 0.0
     for force in draw.normal(0.0, 0.3, 200):
@@ -334,7 +334,7 @@ def test_still_encoders_under_force_are_dead(newton, found):
 
 @pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
 def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
-    """People who begin in either direction; the axis with the dead encoder is named, within 0.5 s."""
+    """Whichever way people begin, the axis with the dead encoder is named within 0.5 s."""
     turned = tuple(
         replace(h, voluntary=replace(h.voluntary, phase=h.voluntary.phase + np.pi * (sign < 0))) for h in scenario.human
     )
@@ -355,7 +355,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_the_impulse_decides(axis, sign, newton, after):
-    """1 N for 100 ms, 5 N for 20 ms: an impulse of 0.1 N s, since the last motion; less than 1 N never."""
+    """An impulse of 0.1 N s since the last motion stops: 1 N for 100 ms, 5 N for 20 ms. Less than 1 N never does."""
     monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
@@ -373,7 +373,7 @@ def test_the_impulse_decides(axis, sign, newton, after):
 
 
 def test_coarse_encoders_get_more_time():
-    """8 sqrt(q M F) with 0.1 mm, 2.5 kg and 5 N is 0.283 N s, 57 ms: 48 ticks."""
+    """The allowed 8 sqrt(q M F) is 0.283 N s for 0.1 mm, 2.5 kg and 5 N, which lasts 57 ms or 48 ticks."""
     monitor = monitor_of(1e-4)
     monitor.check((0,), (0,), 1)
 
@@ -389,11 +389,11 @@ def test_coarse_encoders_get_more_time():
 def test_a_motion_of_two_counts_begins_anew():
     monitor = monitor_of(1e-6)
     for k in range(2000):
-        monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N up and down, two counts every 18 ms
+        monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N on and off, two counts every 18 ms
 
 
 def test_no_still_hold_is_stopped():
-    """Some of the 10,000 holds of tests/benchmarks/still_holds.py, which runs them all."""
+    """The test draws 300 holds; tests/benchmarks/still_holds.py draws 10,000."""
     still_holds = run_path(str(Path(__file__).parent.parent / "benchmarks/still_holds.py"))["still_holds"]
     assert still_holds(300, seed=1)[0] == 0
 
@@ -403,7 +403,7 @@ def test_no_still_hold_is_stopped():
 
 @pytest.mark.parametrize("place", [0.03, -0.03])
 def test_handles_off_centre_are_left_in_peace(scenario, rungs, place):
-    """Both free at 30 mm, of either sign: counted from there no force acts; counted from the middle newtons do."""
+    """Free handles at 30 mm feel less than 0.5 N if positions count from there, more than 3 N if from the middle."""
     still = nobody(scenario)
     session, rehearsal = session_with(still, rungs, place=place, seconds=0.6, held=False)
     assert session.stage == Stage.ARMED
@@ -428,7 +428,7 @@ def test_faults_of_missing_axes_are_refused(scenario):
 
 
 def test_weak_motors_have_smaller_thresholds():
-    """A knob of 20 mN m at 20 mm: a dead encoder under 15 mN m is found as one under 3 N is at a strong motor."""
+    """The dead encoder of a knob of 20 mN m, held at 20 mm, is found within 1 s under 15 mN m."""
     knob = monitor_of(1e-4, 1e-6, cap=(0.02,), slew=40.0, lever=0.02)
     with pytest.raises(SafetyStop, match="axis 1 does not follow"):
         [knob.check((0,), (15_000,), 1) for _ in range(round(1.0 / T))]

@@ -1,4 +1,4 @@
-"""hw/firmware against hw/device_state.py, byte for byte, and the example sketch on a board that is only memory."""
+"""Compare hw/firmware with hw/device_state.py byte for byte, and run the example sketch on a stub board."""
 
 import ctypes
 import os
@@ -74,7 +74,7 @@ def info(axes: int, period_ns: int = 1_200_000) -> Info:
 
 
 class Firmware:
-    """The C side with the interface of hw.device_state.Device."""
+    """The C firmware with the interface of hw.device_state.Device."""
 
     def __init__(self, library, about: Info) -> None:
         self.lib, self.axes = library, about.axes
@@ -109,7 +109,7 @@ class Firmware:
 
 
 class Traffic:
-    """A host with lapses and a line with faults: what is done to a device between two of its ticks, from a seed."""
+    """Random events between a device's ticks, from a seed: those of a host with lapses and a line with faults."""
 
     def __init__(self, seed: int, device: Device) -> None:
         self.rng, self.hand, self.device = random.Random(seed), random.Random(~seed), device
@@ -124,7 +124,7 @@ class Traffic:
         return Config(self.theta, rng.randint(0, 4), rng.randint(1, 6), rng.choice((0, 0, 3, 100)), cap, slew)
 
     def force(self) -> Force:
-        """What a good host would say now."""
+        """Return what a correct host would send now."""
         d, rng = self.device, self.rng
         source = d.k
         command, force = rng.choice((Command.IDLE, Command.ARM)), (0,) * d.info.axes
@@ -133,7 +133,7 @@ class Traffic:
         return Force(command, shifted(source, d.config.theta if d.config else self.theta), source, force)
 
     def oddity(self) -> bytes:
-        """A well-formed message that is wrong here and now, or a wrong frame."""
+        """Return a well-formed message that is wrong at this moment, or a wrong frame."""
         rng, d, good = self.rng, self.device, self.force()
         axes, (code, size) = rng.randint(1, 8), rng.choice(list(_READ))
         late = rng.choice((-1, -2, 1, 2, 300, 0x8000, rng.randint(0, 0xFFFF)))
@@ -167,7 +167,7 @@ class Traffic:
         return rng.choice(choices)()
 
     def between_ticks(self, now: int) -> list[tuple]:
-        """Operations ("R", now, bytes), ("E",), ("F",), ("D", held)."""
+        """Return operations: receive ("R", now, bytes), e-stop ("E",), fault ("F",), deadman ("D", held)."""
         rng, d, ops, data = self.rng, self.device, [], b""
         if d.phase in (Phase.SILENT, Phase.STOPPED, Phase.ESTOP) and rng.random() < 0.3:
             data += encode(self.config())
@@ -188,12 +188,12 @@ def shifted(tick: int, by: int) -> int:
 
 
 def framed(message) -> bytes:
-    """encode() without its checks."""
+    """Encode a message without the checks of encode()."""
     return enclosed(pack(message))
 
 
 def enclosed(payload: bytes) -> bytes:
-    """A frame around any payload."""
+    """Return a frame around any payload."""
     blocks = (payload + struct.pack("<I", crc32(payload))).split(b"\0")
     return b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
 
@@ -215,7 +215,7 @@ def mutated(rng: random.Random, frame: bytes) -> bytes:
 
 
 def episode(seed: int, ticks: int, silent: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
-    """Plays traffic to the Python device: its info, the operations, its answers to ("T", now, counts), its states."""
+    """Play traffic to the Python device. Return info, operations, answers to ticks ("T", now, counts) and states."""
     rng = random.Random(seed)
     about = info(rng.randint(1, 8), rng.choice((100_000, 333_333, 1_200_000, 1_200_000, 2_000_001)))
     device, now, period = Device(about), rng.choice((0, 2**32 - 50_000)), about.period_ns // 1000
@@ -264,7 +264,7 @@ def episodes():
 
 
 def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
-    """Otherwise the comparison below would not mean what it says."""
+    """The comparison of C and Python below covers only what this traffic visits."""
     phases, causes = zip(*set().union(*(seen for *_, seen in episodes)), strict=True)
     assert set(phases) == set(Phase)
     assert set(causes) == set(Cause)
@@ -301,7 +301,7 @@ def test_c_and_python_agree_byte_for_byte(library, episodes):
 @pytest.mark.slow
 @needs_gcc
 def test_no_sanitizer_complains(tmp_path, episodes):
-    """The same traffic, with the same answers, through an executable with AddressSanitizer and UBSan."""
+    """An executable with AddressSanitizer and UBSan gives the same answers to the same traffic."""
     program = tmp_path / "harness"
     sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DHARNESS_MAIN"]
     try:
@@ -318,7 +318,7 @@ def test_no_sanitizer_complains(tmp_path, episodes):
 
 
 def written(about: Info, script: list[tuple]) -> bytes:
-    """A script as the harness reads it from standard input."""
+    """Return a script as the harness reads it from standard input."""
     columns = zip(about.osp_damping, about.encoder_step, about.force_step, about.hard_limit, about.range, strict=True)
     out = [struct.pack("<III", about.serial, about.period_ns, about.axes)]
     out += [struct.pack("<5I", *axis) for axis in columns]
@@ -361,7 +361,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 @needs_gcc
 def test_the_headers_need_no_library_or_heap(tmp_path):
-    """Only C99 headers that every compiler has; an object file's undefined symbols say what it calls."""
+    """The headers include only standard C99 headers, and the object file's undefined symbols show what it calls."""
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
         '#include "haptic_frame.h"',
@@ -374,7 +374,7 @@ def test_the_headers_need_no_library_or_heap(tmp_path):
     build(GCC, *flags, "-c", HARNESS / "harness.c", "-o", tmp_path / "harness.o")
     symbols = subprocess.run(["nm", "-u", tmp_path / "harness.o"], capture_output=True, text=True, check=True).stdout
     needed = {line.split()[-1].removeprefix("_") for line in symbols.splitlines()}
-    assert needed == {"memcpy", "memset", "strncpy"}  # strncpy: the harness itself
+    assert needed == {"memcpy", "memset", "strncpy"}  # only the harness calls strncpy
     assert not re.search(r"\b(float|double)\b", text.split("#include", 1)[1])
 
 
@@ -390,7 +390,7 @@ SKETCH_PINS = {
 
 
 class Sketch:
-    """example.ino on the stub board, looped every 50 us."""
+    """example.ino on the stub board; its loop runs every 50 us."""
 
     def __init__(self, path: Path) -> None:
         self.lib = ctypes.CDLL(str(path))
@@ -403,7 +403,7 @@ class Sketch:
         self.lib.stub_feed(data, ctypes.c_size_t(len(data)))
 
     def run(self, us: int) -> list:
-        """The messages of the next `us` microseconds."""
+        """Run for `us` microseconds and return the messages."""
         for _ in range(us // 50):
             self.now += 50
             self.lib.stub_loop(ctypes.c_ulong(self.now))
@@ -427,7 +427,7 @@ def compiled_sketch(tmp_path_factory):
 
 @pytest.fixture
 def sketch(compiled_sketch, tmp_path):
-    """A board just switched on: a library under a new name has memory of its own."""
+    """Return a board that was just switched on: a library under a new name has its own memory."""
     return Sketch(Path(shutil.copy(compiled_sketch, tmp_path)))
 
 
@@ -440,7 +440,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
     assert sketch.lib.stub_resolution() == 12  # a step of force is a step of the PWM
     assert about.hard_limit == (4095, 4095)
     strongest = [n * step / 1e6 for n, step in zip(about.hard_limit, about.force_step, strict=True)]
-    assert strongest == pytest.approx([12.0] * 2, rel=1e-3)  # which the host allows it to be short of
+    assert strongest == pytest.approx([12.0] * 2, rel=1e-3)  # the host accepts a shortfall of 0.1 %
     sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     ack, state = sketch.run(1200)
     assert ack.refused == Refused.ACCEPTED
@@ -451,7 +451,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
     assert [sketch.pin(p) for p in SKETCH_PINS["pwm"]] == [2048, 4095]
     assert [sketch.pin(p) for p in SKETCH_PINS["direction"]] == [0, 1]
     assert sketch.pin(SKETCH_PINS["enable"]) == 1
-    *_, state = sketch.run(12_000)  # no host: the watchdog
+    *_, state = sketch.run(12_000)  # without a host, the watchdog acts
     assert (state.phase, state.cause, state.applied) == (Phase.STOPPED, Cause.WATCHDOG, (0, 0))
     assert sketch.pin(SKETCH_PINS["enable"]) == 0
 
@@ -460,7 +460,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
 def test_the_sketch_counts_edges_and_obeys_its_button(sketch):
     sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
-    for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # A after B: falling counts, the last one back
+    for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # edges of A, of which the last counts back
         sketch.lib.stub_set_pin(SKETCH_PINS["encoder B"], level_b)
         sketch.lib.stub_set_pin(SKETCH_PINS["encoder A"], level_a)
     (state,) = sketch.run(1200)
@@ -492,7 +492,7 @@ def test_the_sketch_never_waits_for_the_host(sketch):
 @needs_gxx
 @pytest.mark.parametrize("room", [1, 31, 63])
 def test_small_write_buffers_send_whole_frames(sketch, room):
-    """A pass of the loop every 50 us: 24 pieces in a period. What has no time to leave is dropped whole."""
+    """The loop runs every 50 us, 24 times in a period. A frame that has no time to leave is dropped whole."""
     sketch.lib.stub_room(room)
     sketch.feed(Hello(7))
     (about,) = [m for m in sketch.run(10_000) if isinstance(m, Info)]
@@ -506,7 +506,7 @@ def test_small_write_buffers_send_whole_frames(sketch, room):
 
 @needs_gxx
 def test_only_ticks_feed_the_boards_watchdog(sketch):
-    """Ticks feed it; a loop that turns on a clock that stands still, or one that hangs, does not."""
+    """Ticks feed the watchdog. A loop whose clock stands still, or that hangs, does not."""
     sketch.run(100_000)
     assert not sketch.lib.stub_bites()
     text = (HEADER / "example.ino").read_text()
@@ -515,12 +515,12 @@ def test_only_ticks_feed_the_boards_watchdog(sketch):
     assert loop.index("not due yet") < loop.index("watchdogFeed();") > loop.index("writeForces(force);")
 
 
-# the rules of docs/protocol.md that no frame shows, on both sides
+# Python and C follow the rules of docs/protocol.md that no single frame shows
 
 
 @pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
 def device(request):
-    """Two axes of either side, ticked by hand, with what it last said."""
+    """Return the Python or the C device with two axes, ticked by hand."""
     make = Device if request.param == "python" else lambda about: Firmware(request.getfixturevalue("library"), about)
     return Hand(make(info(2)))
 
@@ -558,7 +558,7 @@ class Hand:
 @pytest.mark.parametrize(("theta", "hold", "ramp"), [(0, 4, 5), (1, 4, 5), (2, 4, 5), (3, 0, 1), (15, 2, 8)])
 def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
     device.armed(theta, hold, ramp)
-    device.answer(Command.RUN, (1000, -1000), theta)  # the last one
+    device.answer(Command.RUN, (1000, -1000), theta)  # the last answer
     forces = []
     due = max(1, theta)  # with theta = 0 the answer to a tick is missed when the next one begins
     for _ in range(due + hold + ramp + 1):
@@ -570,7 +570,7 @@ def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
 
 
 def test_a_ramp_is_the_same_at_zero_force(device):
-    """RAMP at zero force lasts as long as any other, and refuses a CONFIG as any other."""
+    """A RAMP at zero force lasts as long as any other, and refuses a CONFIG, too."""
     device.armed(theta=1, ramp=5, force=(0, 0))
     device.tell(Stop(0))
     phases = []
@@ -591,11 +591,11 @@ def test_emergency_stops_replace_earlier_causes(device):
     state = device.state()
     assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_HOST)
     device.device.estop()
-    assert device.state().cause == Cause.ESTOP_HOST  # of emergency stops the first stays, too
+    assert device.state().cause == Cause.ESTOP_HOST  # the first emergency stop stays
 
 
 def test_late_double_and_mistimed_forces_are_counted(device):
-    """Late: echo and a margin below zero, no force. Double and wrong theta: nothing at all. None counts as an error."""
+    """A late FORCE sets only echo and a negative margin; a double one or a wrong theta nothing. None is an error."""
     device.armed(theta=2)
     before = device.state()
     k = device.k
@@ -609,7 +609,7 @@ def test_late_double_and_mistimed_forces_are_counted(device):
     device.tell(Force(2, shifted(k, 2), k, (600, 0)), after=200)
     device.tell(Force(2, shifted(k, 1), k, (700, 0)), after=300)
     state = device.state()
-    assert (state.echo, state.margin_us) == (k, 2300)  # of the first one
+    assert (state.echo, state.margin_us) == (k, 2300)  # those of the first FORCE
     assert device.state().applied == (500, 0)
     assert state.crc_errors == before.crc_errors
 
@@ -623,7 +623,7 @@ def test_a_force_before_config_is_dropped_silently(device):
 
 
 def test_a_hello_of_another_version_is_answered(device):
-    """It is for the host to refuse; so it can say why."""
+    """The host refuses the version; the answer lets it say why."""
     device.tell(Hello(9))
     (about,) = device.tick()
     assert (type(about), about.version) == (Info, 2)
@@ -653,12 +653,12 @@ def test_configs_keep_counters_and_forget_forces(device):
     device.tell(Config(3, 4, 5, 0, (9, 9), (9, 9)))
     state = device.state()
     assert (state.crc_errors, state.tick) == (1, before.tick + 1)
-    assert state.misses == before.misses + 1  # disarmed, this tick had no force
+    assert state.misses == before.misses + 1  # this tick had no FORCE
     assert (state.echo, state.margin_us, state.applied) == (0, -32768, (0, 0))
 
 
 def test_text_costs_one_frame_at_most(device):
-    """Boot messages, and the noise of another baud rate, up to the next delimiter."""
+    """Boot messages, or noise of another baud rate, spoil frames only up to the next delimiter."""
     device.device.receive(b"Booting v1.2 ...\r\n", 0)
     device.tell(Hello())
     assert device.tick() == []

@@ -1,4 +1,4 @@
-"""The adapter through the published package, with a C stub in the place of the maker's shared library."""
+"""Run the adapter through the published package, with a C stub in place of the maker's shared library."""
 
 import importlib.util
 import json
@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGE = importlib.util.find_spec("forcedimension_core")
 pytestmark = [
-    pytest.mark.skipif(PACKAGE is None, reason="forcedimension-core is not for this Python"),
+    pytest.mark.skipif(PACKAGE is None, reason="forcedimension-core is not installed"),
     pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: the C stub is not compiled here"),
 ]
 
@@ -85,7 +85,7 @@ print(json.dumps(said))
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """What a session through the real binding says."""
+    """Return the results of sessions through the real binding."""
     folder = tmp_path_factory.mktemp("sdk") / "lib" / "release" / f"lin-{platform.machine()}-gcc"
     folder.mkdir(parents=True)
     sources = [path.read_text() for path in Path(PACKAGE.origin).parent.rglob("*.py")]
@@ -117,7 +117,7 @@ def test_axes_without_channel_are_named(session):
 
 def test_the_watchdog_is_set_in_expert_mode(session):
     assert session["guarded"]
-    assert session["watchdogs"] == [160, 160]  # times 125 us: 20 ms
+    assert session["watchdogs"] == [160, 160]  # 160 x 125 us is 20 ms
 
 
 def test_forces_reach_the_axes_they_are_for(session):

@@ -1,4 +1,4 @@
-"""The four calls of a device: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
+"""Test the four calls of a device over a stand-in for the Force Dimension SDK and over the serial link."""
 
 import sys
 from contextlib import ExitStack, nullcontext
@@ -38,7 +38,7 @@ def scenario():
 
 
 class StandIn:
-    """The calls of forcedimension_core.dhd over the scenario's own devices and hands, in time that only it moves.
+    """The calls of forcedimension_core.dhd over the scenario's devices and hands, in a time that only they advance.
 
     The plant is integrated exactly between any two calls, so that a force acts from the instant it is written.
     """
@@ -56,7 +56,7 @@ class StandIn:
     # the clock
 
     def clock(self):
-        self.now += 1e-6  # looking takes time, so that waiting awake ends
+        self.now += 1e-6  # reading the clock takes time, so that a busy wait ends
         return self.now
 
     def sleep(self, seconds):
@@ -135,7 +135,7 @@ class StandIn:
 
 
 def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None):
-    """A session of Live with the stand-in, from the handshake to the end."""
+    """Run a session of Live with the stand-in from the handshake to the end."""
     session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
@@ -154,14 +154,14 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 
 @pytest.mark.slow
 def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
-    """Handshake, delay, certificate, forces, ramp, replay: the same session as over the serial link."""
+    """The session has handshake, delay, certificate, forces, ramp and replay, as over the serial link."""
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still while it is armed
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still during arming
     session, recorder, (made,) = held_session(scenario, sdk)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     assert session.info.firmware == "omega.3"
     assert session.info.serial == 4711
-    # forces acted, and each within the latency that is certified
+    # forces acted, 98 % of them within the certified latency
     (t1, t2), _ = made.scenario.latency
     assert 0 < t1 < 93e-6 < t2 < 300e-6  # 40 us to read, 50 to write, 3 to look at the clock
     assert T <= (made.scenario.T_max or T) < 1.2 * T
@@ -169,10 +169,10 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     assert np.abs(link["applied"]).max() > 1000
     age = 1e6 * T - link["margin_us"][link["received"]]
     assert np.mean(age <= 1e6 * t2) > 0.98
-    # the force that answers a sample acts before the next one, not a period later
+    # every force of the record was written to the device
     sent = {round(force / 4e-4) for _, ID, force in sdk.log if ID == 0}
     assert set(link["sent"][:, 0].tolist()) <= sent | {0}
-    # zero force and motors off at the end, whatever was open is closed
+    # at the end forces are zero, motors are off and every device is closed
     assert sdk.force.tolist() == [0.0, 0.0]
     assert sdk.enabled == {0: False, 1: False}
     assert sdk.open == []
@@ -184,7 +184,7 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
 
 @pytest.mark.slow
 def test_certificates_say_that_the_host_clocks(scenario):
-    """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
+    """Certificates name T_max and a latency below one sample; no whole tick is charged for the link."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
     assert made.assessment.loop.theta == scenario.theta  # no tick is added for the link
     assert made.link == 0
@@ -198,7 +198,7 @@ def test_certificates_say_that_the_host_clocks(scenario):
 
 
 def test_host_clocks_charge_microseconds_not_ticks(scenario):
-    """The same coupling: 0.13 ms after a sample, and a tick after it."""
+    """The same coupling needs less damping 0.13 ms after a sample than a tick after it."""
     judged, link = timed(scenario.replace(theta=(0, 1)), Ages((50,) * 50 + (130,) * 50), 1.0, 0.0, at_once=True)
     assert judged.latency[1] == pytest.approx((50e-6, 130e-6))
     assert link == 0
@@ -209,7 +209,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     constant = certified_coupling(judged.replace(latency=((130e-6, 130e-6),) * 2), "I", None, None, 0, given)
     latest, ranged = (
         max(one.assessment.requirements["this-environment"].required) for one in (constant, host)
-    )  # a range costs at least its latest end, and less than both parts of a period at their longest, 0.637433
+    )  # a range needs at least what its latest end needs, but less than both longest parts of a period: 0.637433
     assert latest - 1e-6 <= ranged < 0.637433
     assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 
@@ -226,7 +226,7 @@ def test_a_force_that_takes_too_long_is_refused(scenario, read, write, holds):
 
 
 def test_forces_later_than_certified_end_in_a_ramp(scenario):
-    """0.4 ms in place of 0.1, still within the tick: late, for the certificate is for less."""
+    """Forces after 0.4 ms in place of 0.1 ms are within the tick, but later than certified."""
     sdk = StandIn(scenario)
 
     def watch(session):
@@ -265,7 +265,7 @@ def test_a_device_that_is_unplugged_is_lost(scenario):
 
 
 def test_saturated_motors_are_device_faults(scenario):
-    """What they then push is not what was certified."""
+    """The force of a saturated motor is not the certified one."""
     sdk = StandIn(scenario)
 
     def watch(session):
@@ -278,7 +278,7 @@ def test_saturated_motors_are_device_faults(scenario):
 
 def test_the_emergency_stop_is_at_once(scenario):
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still while it is armed
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still during arming
     held = []
 
     def watch(session):
@@ -314,7 +314,7 @@ def test_a_missing_library_is_one_line(monkeypatch):
 
 
 def test_the_package_without_the_makers_sdk_says_so(monkeypatch):
-    """The package is there and raises, as it does where libdrd is not found."""
+    """The package is installed and raises, as it does without libdrd."""
 
     class Finder:
         @staticmethod
@@ -380,7 +380,7 @@ def test_a_host_clock_has_no_baud_rate(scenario):
 
 
 class Line:
-    """An emulated device at the end of a line: it ticks when it is waited for."""
+    """An emulated device at the end of a line. It ticks at every read."""
 
     def __init__(self, device):
         self.device, self.now, self.out, self.gone = device, 0, b"", False
@@ -418,11 +418,11 @@ def test_the_serial_link_has_the_same_four_calls():
     assert (state.phase, state.applied) == (Phase.ARMED, (70, -80))
     device.stop(Reason.DONE)
     assert device.exchange(None).phase == Phase.RAMP
-    answers = [device.configure(config) for _ in range(200)]  # told that it is running, and asked again each 0.1 s
+    answers = [device.configure(config) for _ in range(200)]  # the running device refuses; asked again each 0.1 s
     assert set(answers[: answers.index(Refused.ACCEPTED)]) == {None}
     line.gone = True
     with pytest.raises(PortLost, match="hung up"):
-        [device.exchange(None) for _ in range(300)]  # first what has come in before
+        [device.exchange(None) for _ in range(300)]  # earlier messages come first
 
 
 def test_silent_lines_are_asked_again():
@@ -434,7 +434,7 @@ def test_silent_lines_are_asked_again():
 
 
 def test_floods_of_frames_do_not_stop_time_outs():
-    """INFO for ever: every call comes back, so that the session's time-outs end it."""
+    """With endless INFO every call still returns, so that the session's time-outs can end it."""
     flood = FakePort()
     flood.wait, flood.read = lambda seconds: True, lambda: encode(info_of(scenario_of())) * 50
     device = SerialDevice(flood)

@@ -30,11 +30,11 @@ from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 
-STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
+STEP = 5e-6  # [m] half of an Omega's encoder step of 0.01 mm
 
 
 def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
-    """A chirp of 1 N and a release, recorded through the whole link."""
+    """Record a chirp of 1 N and a release through the whole link."""
     recorder = Recorder(scenario.channels)
     session = Session(
         scenario.replace(delta=(1e-6,) * scenario.channels),
@@ -47,16 +47,16 @@ def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
     rehearsal = Rehearsal(session, Emulator(nobody(scenario), coulomb=coulomb), lambda ages: [excitation], faults)
     rehearsal.run_until_armed(excitation.seconds + 0.1)
     assert session.stage == Stage.ARMED
-    assert np.abs(recorder.link()["sent"]).max() <= 2500  # the chirp's own amplitude is the cap: 1 N in 0.4 mN
+    assert np.abs(recorder.link()["sent"]).max() <= 2500  # the chirp's amplitude, 1 N in steps of 0.4 mN
     return recorder, session
 
 
 @pytest.mark.slow
 def test_known_parameters_come_back():
-    """A compliant and a rigid device with dry friction, neither of them the ones the search begins with.
+    """Identify a compliant and a rigid device with dry friction that differ from the start of the search.
 
-    All to 0.2 %. The bound of the lighter axis is a hundredth below; that of the heavier one more, since which law dry
-    friction has is not known, and the record does not exclude all.
+    Parameters are found to 0.2 %. The bound of the lighter axis is at most 1 % low, that of the heavier one 5 %, since
+    the record does not exclude every law of dry friction.
     """
     scenario = load()
     compliant = msgspec.structs.replace(
@@ -87,7 +87,7 @@ def test_known_parameters_come_back():
 
 
 def played(force, T, mass, b, c, substeps=64):
-    """One mass with dry friction, by semi-implicit Euler in small steps: nothing of the fit's own integration."""
+    """Simulate a mass with dry friction by small semi-implicit Euler steps, independently of the fit's integration."""
     x, v, out, h = 0.0, 0.0, [], T / substeps
     for f in force.tolist():
         out.append(x)
@@ -109,7 +109,7 @@ def test_dry_friction_is_told_from_viscous():
 
 
 def test_a_knob_is_identified_in_radians():
-    """A knob of 10 g cm2 with 0.2 mN m s/rad and 0.1 mN m of dry friction, which a hand holds at 20 mm."""
+    """A knob of 100 g cm2 has 0.2 mN m s/rad and 0.1 mN m of dry friction, and a hand holds it at 20 mm."""
     T, lever, count = 1.2e-3, 0.02, 1e-4
     force = chirp(1, T, 1, 0.2 * lever, (3.0, 60.0), 1.5).signal[:, 0]
     at_hand = played(force / lever, T, 1e-5 / lever**2, 2e-4 / lever**2, 1e-4 / lever, substeps=16)
@@ -139,14 +139,14 @@ HANDS = {
 DASHPOTS = {"faint": (0.0, 0.08, 0.0), "firm": (0.0, 0.3, 0.0)}
 
 
-#: cases between others: `make validate` runs them, too
+#: These cases lie between others; only `make validate` runs them.
 BETWEEN = ("thins at 0.3 m/s", "memory of 3 ms, 2 N s/m", "memory of 2 ms, 0.5 N s/m", "trace of 30 ms, 0.1 N s/m")
 BETWEEN += ("dry friction that bends at 0.1 m/s", "Stribeck up to 0.06 m/s")
 BETWEEN += ("thins at 0.1 m/s", "memory of 3 ms, 20 N s/m", "resting", "finger")
 BETWEEN += ("memory of 10 ms, 1 N s/m", "trace of 10 ms, 0.02 N s/m", "constant 0.001", "coulomb 0.05, slip 0.0005")
 
 
-#: two seconds each, where others of their kind take one
+#: These cases take two seconds each, others of their kind one.
 SLOW = (
     "memory of 3 ms, 0.5 N s/m",
     "dashpot of 8 N s/m behind a spring, 3 ms, on a light handle",
@@ -167,8 +167,8 @@ def test_rigs_that_are_not_ideal_have_bounds(odd, name):
     assert odd[name].stiffness == pytest.approx(1.0 if name == "cable 1" else 0.0, abs=0.1)
 
 
-#: friction that is not b v at all speeds or frequencies: what it is in terms of the rig, and its least damping
-#: [N s/m] over speeds up to the record's (0.5 m/s) and over all frequencies, by its definition
+#: Friction that is not b v at all speeds or frequencies: the rig's parameters, and the least damping [N s/m] by
+#: definition over all frequencies and speeds up to the record's 0.5 m/s.
 NOT_VISCOUS = {
     **{f"thins at {v0:g} m/s": ({"thin": v0}, 1 / (1 + 0.5 / v0)) for v0 in (0.1, 0.3, 1.0)},
     "memory of 3 ms, 20 N s/m": ({"memory": 20.0, "relax": 3e-3}, 1.0),
@@ -196,7 +196,7 @@ NOT_VISCOUS = {
 
 @pytest.fixture(scope="module")
 def records():
-    """Rigs, positions (ticks, rigs) [m] and forces (ticks,) [N] by the benchmark's plant: nothing of our emulator."""
+    """Return {name: (rig, positions [m])}, forces (ticks,) [N] and the benchmark, whose plant is not our emulator's."""
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
     rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"]()
     rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in (HANDS | DASHPOTS).items()]
@@ -206,7 +206,7 @@ def records():
 
 
 class _Made(dict):
-    """Results by name, each worked out when it is first asked for."""
+    """Results by name, each computed at its first use."""
 
     def __init__(self, make):
         self._make = make
@@ -218,14 +218,14 @@ class _Made(dict):
 
 @pytest.fixture(scope="module")
 def odd(records):
-    """The friction of rigs with one imperfection each, and of hands that only damp."""
+    """Return the estimated friction of a rig by its name."""
     rigs, signal, bench = records
     return _Made(lambda name: friction(rigs[name][1], signal, bench["T"], rigs[name][0].step))
 
 
 @pytest.fixture(scope="module")
 def judged(records):
-    """What the command finds, or why it finds nothing."""
+    """Return the command's friction of a rig by its name, or why there is none."""
     rigs, signal, bench = records
     return _Made(lambda name: bench["judged"](*rigs[name], signal)[0])
 
@@ -233,7 +233,7 @@ def judged(records):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(NOT_VISCOUS))
 def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
-    """Dry friction is left out of the truth, as of the bound: what bends with speed is viscous at no level."""
+    """Neither truth nor bound includes dry friction: friction that bends with speed is viscous at no level."""
     found, least = judged[name], NOT_VISCOUS[name][1]
     if isinstance(found, str):
         assert re.search("energy of a stroke does not grow|damping falls with frequency", found)
@@ -249,12 +249,12 @@ def test_thinning_and_memory_are_refused(judged, name):
 
 @pytest.mark.parametrize(("name", "share"), [("viscous", 0.85), ("viscous, half the mass", 0.93)])
 def test_viscous_friction_keeps_most_of_its_bound(judged, name, share):
-    """Less what the encoder's 5 um may hide of a memory of 2 ms, which a mass hides with its square."""
+    """The bound lacks what encoder steps of 5 um may hide of a memory of 2 ms. A lighter device hides less."""
     assert share < judged[name].delta <= 1.0
 
 
 def test_the_swing_reaches_its_speed_within_its_travel():
-    """By the closed form of a mass with a damper under a cosine; a weak motor stays slower."""
+    """The force is the closed form for a damped mass under a cosine; a weak motor gives its limit."""
     scenario = load("omega-pair-rigid")
     swing = Swing.of(scenario, 0.5, 0.03)
     device, w = scenario.device[0], 2 * np.pi * swing.hz
@@ -269,17 +269,17 @@ def test_the_swing_reaches_its_speed_within_its_travel():
 
 @pytest.mark.parametrize("name", _marked(HANDS))
 def test_hands_on_the_handle_are_detected(judged, name):
-    """Its damping, 0.1 to 3 N s/m, is not the device's; its spring says that it is there."""
+    """A hand's damping, 0.1 to 3 N s/m, is not the device's. The hand's spring reveals it."""
     assert re.search(r"handle is sprung by .* does a hand or a finger rest on it", judged[name])
 
 
 def sitting(odd, *names):
-    """One record of as many axes."""
+    """Return the estimates of one sitting, one axis for each name."""
     return [Estimate(odd[name], None, Viscosity(0.5, 0.0, 0.0, odd[name].delta, 1e-3, False)) for name in names]
 
 
 def test_damping_hands_are_detected_by_two_sittings(odd):
-    """Its 0.3 N s/m are nowhere in the record that has them: that one's bound alone is 30 % above the truth of 1."""
+    """One record does not reveal a hand's 0.3 N s/m: its bound is about 30 % above the truth of 1."""
     assert odd["firm"].delta == pytest.approx(1.29, abs=0.01)
     for sittings in ([("firm", "ideal"), ("ideal", "ideal")], [("ideal", "ideal"), ("firm", "ideal")]):
         with pytest.raises(
@@ -299,7 +299,7 @@ def test_damping_hands_are_detected_by_two_sittings(odd):
 
 
 def test_undetectable_hands_add_no_damping(odd):
-    """8 % more damping may be a device's own scatter; the least bound counts, so one record without it is enough."""
+    """8 % more damping may be a device's scatter. The least bound counts, so one record without the hand is enough."""
     assert odd["faint"].delta > 1.05
     for order in (("faint", "ideal"), ("ideal", "faint")):
         (found,), words = settled([sitting(odd, name) for name in order])
@@ -312,7 +312,7 @@ def test_undetectable_hands_add_no_damping(odd):
 
 @pytest.mark.slow
 def test_damping_in_one_sitting_is_refused(tmp_path, monkeypatch):
-    """In virtual time, a dashpot of 0.3 N s/m at the handles in the first one: two records of three agree."""
+    """In the first sitting a dashpot of 0.3 N s/m is at the handles. Two sittings disagree, two of three agree."""
     sittings = {}  # only the first sitting has a hand, so the second one also serves as the third
 
     def recorded(args, scenario, settings, out, number):
@@ -333,12 +333,12 @@ def test_damping_in_one_sitting_is_refused(tmp_path, monkeypatch):
         told = "; ".join([*report["warnings"], report.get("reason", "")])
         assert re.search(r"axis 1: 1.6\d*, 1.3\d*, .* a hand damped it in 1" if code == 0 else "damped it in one", told)
     for axis in report["axes"]:
-        assert 0.2 < axis["friction"]["delta"] <= 1.37  # so short a record excludes no memory that is large
+        assert 0.2 < axis["friction"]["delta"] <= 1.37  # so short a record cannot exclude a large memory
         assert axis["friction"]["coulomb"] == pytest.approx(0.02, rel=0.05)
 
 
 def test_a_device_of_three_axes_is_one_table():
-    """Each axis in the place of its number, a clamped one with some number, the bound of the slowest record."""
+    """The table has each axis at its place, some number for a clamped one, and the speed of the slowest record."""
     for clamped, figures in (((), (1.0, 1.1, 1.2)), (("y",), (1.0, 1.0, 1.1))):
         device = RigidDevice(axes=3, clamped=clamped)
         axes = [
@@ -360,7 +360,7 @@ def test_a_device_of_three_axes_is_one_table():
 
 @pytest.mark.parametrize(("axis", "sign"), checkered([0, 1], [1, -1]))
 def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
-    """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
+    """Each handle must move by 5 mm. A person then has 5 s (here 0.2 s) to let go, anew after each move back."""
     monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 200_000)
     scenario = nobody(load("omega-pair-rigid"))
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=60, elsewhere=(0, 0)))
@@ -416,7 +416,7 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("viscous", "suspicious"), [(1.37, False), (1.49, False), (1.52, True)])
 def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
-    """A hand that damps looks like the device: only the declared 1.37 N s/m can say so, with 10 % allowed."""
+    """A damping hand looks like the device. Only damping of 10 % above the declared 1.37 N s/m reveals it."""
     scenario = load()
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
     estimate = SimpleNamespace(viscous=viscous)
@@ -428,15 +428,16 @@ def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
 
 @pytest.fixture(scope="module")
 def coarse():
-    """A rigid device with the encoder of example.ino, a standstill after the release and little friction."""
+    """Return T, step, force and position of a rigid device with little friction and the encoder of example.ino."""
     T, step = 1.2e-3, 1e-5
     force = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5).signal[:, 0]
     return T, step, force, played(force, T, 0.3, 0.5, 0.02)
 
 
 def test_bounds_hold_wherever_the_encoder_stands(coarse):
-    """Five origins within a step. All bounds must be below the truth: with the standstill as 1000 samples, half were
-    above. Nor may they be far below, or they would be of no use: 2 %.
+    """For five origins within a step, bounds are below the truth by at most 2 %.
+
+    With the standstill as 1000 samples, half of them were above.
     """
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):
@@ -460,7 +461,7 @@ def test_a_bound_never_exceeds_what_is_declared(coarse):
 
 
 def test_ambiguous_friction_gives_no_bound():
-    """A short record of small motions, a few encoder steps long: most of it is a standstill."""
+    """A short record of motions of a few encoder steps is mostly a standstill."""
     T, step = 1.2e-3, 5e-5
     force = chirp(1, T, 1, 1.0, (8.0, 60.0), 0.5).signal[:, 0]
     x = step * np.round(played(force, T, 0.5, 0.3, 0.05) / step + 0.3)
