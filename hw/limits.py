@@ -83,7 +83,7 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    #: [m/s] fastest motion while forces act; with it and a cap of 2 N, one drifting encoder leaves a handle below 1 m/s
+    #: [m/s] fastest motion while forces act; one drifting encoder under 2 N then leaves a handle below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors

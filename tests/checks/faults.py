@@ -368,21 +368,28 @@ def _lively(scenario: Scenario) -> Scenario:
     return scenario.replace(human=people)
 
 
+def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
+    """Return the scenario without a hand at the device that has the fault, while a hand moves the other one."""
+    faulty = 1 if any("axis2:" in fault for fault in case.faults) else 0
+    hands = list(scenario.human)
+    hands[faulty] = nobody(scenario).human[faulty]
+    return scenario.replace(human=tuple(hands))
+
+
 def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case, with free handles if `free`. `made` are couplings for a link of one tick, and softer ones."""
+    """Run one case; with `free` nobody holds the faulty device. `made` are couplings for one tick, and softer ones."""
     info = info_of(scenario)
+    scenario = _without_hand(scenario, case) if free and not case.free else scenario
     cap = tuple(d.force_limit for d in scenario.device)
     session = Session(
         scenario,
         SafetyLimits(cap, continuous=tuple(map(min, case.continuous, cap)), thermal=1.0),
-        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not (free or case.free)),
+        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not case.free),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
-    emulator = Emulator(
-        nobody(scenario) if free or case.free else scenario, faults, case.info(info) if case.info else info
-    )
+    emulator = Emulator(nobody(scenario) if case.free else scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick
     rehearsal = Rehearsal(
         session,
@@ -439,7 +446,7 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str
     return wrong
 
 
-_DEFAULT_CAP = 2.0  # [N] of hw.bridge
+_DEFAULT_CAP = 1.3  # [N] of hw.bridge
 _MOST_SPEED = 1.0  # [m/s] that no fault may exceed at a free handle
 
 

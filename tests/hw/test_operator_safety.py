@@ -124,7 +124,7 @@ def test_a_file_that_is_touched(tmp_path):
 def test_a_first_session_is_gentle(scenario):
     args = _parser().parse_args(["--rehearse"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
-    assert limits.cap == (2.0, 2.0)
+    assert limits.cap == (1.3, 1.3)
     assert limits.speed == 0.7
     args = _parser().parse_args(["--rehearse", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits

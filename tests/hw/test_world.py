@@ -97,7 +97,16 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
 @pytest.mark.parametrize("budget", [pytest.param(0.002, marks=pytest.mark.validate), 0.02])
 def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
     """A motor with negative damping: forces are whole steps of 0.4 mN, and the account still holds."""
-    words = ("--scenario", str(driven(tmp_path)), "--duration", "1.5", "--energy-budget", str(budget))
+    words = (
+        "--scenario",
+        str(driven(tmp_path)),
+        "--duration",
+        "1.5",
+        "--force-cap",
+        "2",
+        "--energy-budget",
+        str(budget),
+    )
     _, report, shown = session(tmp_path, capsys, *words)
     (world,) = report["world"]
     assert report["scene"]["active"] == ["actuator 0"]
