@@ -22,7 +22,7 @@ def report(tmp_path_factory):
     place = tmp_path_factory.mktemp("accuracy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yardstick, "_REPEATS", 1)
-        code = main(["--duration", "3", "--out", str(place / "o"), "--json", str(place / "r.json")])
+        code = main(["--duration", "2", "--out", str(place / "o"), "--json", str(place / "r.json")])
     assert (place / "o" / "accuracy.png").stat().st_size > 10_000
     return code, json.loads((place / "r.json").read_text())
 

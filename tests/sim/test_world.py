@@ -107,7 +107,7 @@ def test_without_gravity_energy_never_rises(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_packaged_world_runs_and_is_guaranteed(name):
-    loop = load(f"world-{name}").replace(duration=0.5)
+    loop = load(f"world-{name}").replace(duration=0.3)
     trace = simulate(loop, certified(loop), engine="exact")
     world, again = trace.meta["world"], simulate(loop, certified(loop), engine="exact")
     assert trace.meta["guaranteed"]
@@ -117,7 +117,7 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
     )
     energies = {"given_J", "port_least_J", "released_J", "created_J"}
     assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks", "warnings"} | energies
-    assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (500, 0, 0)
+    assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (300, 0, 0)
     assert trace.meta["scene"]["active"] == []
     assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
     np.testing.assert_array_equal(trace.f, again.f)
