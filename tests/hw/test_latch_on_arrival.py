@@ -1,4 +1,4 @@
-"""A device that latches a force as soon as it comes: what moves it, what is measured, and what is certified for it."""
+"""A device latches forces on arrival: its motion, the measurement and the certificate take account of this."""
 
 import json
 from itertools import pairwise
@@ -23,14 +23,14 @@ from haptic_loop.sim.run import outside_forces
 from haptic_loop.sim.scenario import InputError
 
 LAB = load("omega-pair").replace(theta=(0, 0))
-TAU = 130  # [us] of an emulated link
+TAU = 130  # [us] delay of an emulated link
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
 def test_the_last_force_holds_until_the_answer(share):
-    """The trace's positions, again, from its forces alone, by exponentials before and after each latch.
+    """Recompute the trace's positions from its forces, by matrix exponentials before and after each latch.
 
-    Motor 2 adds a share of force 1 to its own, which is too small for the test at arming.
+    Motor 2 adds a share of force 1 to its own. The share is too small for the test at arming to find.
     """
     session = session_for(LAB, LinkSettings(measure=60))
     session.record = recorder = Recorder(2)
@@ -89,7 +89,7 @@ def test_a_link_slower_than_a_period_is_refused():
 def test_certificates_cover_the_spread_of_ticks():
     ages = Ages((130,) * 100, 0, (1200,) * 50 + (1201,) * 49 + (3000,))
     even, link = timed(LAB, ages, 0.9, 100.0)
-    assert (even.T_max, link) == (None, 1)  # a microsecond is what their clock can tell
+    assert (even.T_max, link) == (None, 1)  # the clock's resolution is a microsecond
     spread, _ = timed(LAB, Ages((130,) * 100, 0, (1150,) * 60 + (1320,) * 40), 0.99, 100.0)
     assert spread.T_max == pytest.approx(1.32e-3)
     needs = [
@@ -105,7 +105,7 @@ def test_certificates_cover_the_spread_of_ticks():
 
 
 def test_what_one_overlong_tick_may_cost():
-    """The most of -f v - delta v^2 over v is f^2/(4 delta), for every second that it lasts."""
+    """The greatest power -f v - delta v^2 over all v is f^2/(4 delta)."""
     v = np.linspace(-3, 3, 100_001)
     most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))
     assert _overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)

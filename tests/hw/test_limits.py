@@ -1,4 +1,4 @@
-"""What the host never does: limits, finite numbers, jumps, gains; and the arithmetic of the line."""
+"""The host limits forces, jumps and gains, refuses nan, and computes the time on the line."""
 
 import math
 
@@ -32,7 +32,7 @@ INFO = Info(PROTOCOL, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400
 
 @given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))
 def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
-    """Python's max and min let nan through as the cap: shape never does, whatever comes."""
+    """Python's max and min turn nan into the cap; shape never does."""
     before = tuple(
         max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
     )
@@ -48,7 +48,7 @@ def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
 
 @given(st.tuples(*[numbers] * 5), st.tuples(*[st.floats(-4, 4)] * 5), st.floats(0, 1))
 def test_vectors_keep_within_their_cap_and_slew(asked, previous, gain):
-    """The first channel stands for itself, the others are a plane and a plane."""
+    """Channel 1 is limited alone, channels 2 and 3 and channels 4 and 5 as vectors."""
     limits = SafetyLimits((2.0, 6.0, 6.0, 3.0, 3.0), vectors=((1, 3), (3, 5)))
     if not all(map(math.isfinite, asked)):
         return
@@ -123,12 +123,12 @@ def test_limits_cannot_be_loosened(field, least, most):
 
 
 def test_devices_are_sent_limited_forces():
-    """0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN; 4 ticks held and 5 ms to zero."""
+    """The host sends 0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN, 4 ticks of hold and 5 to zero."""
     config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
     assert (config.cap, config.slew) == ((30_000, 7500), (6000, 6000))
     slow = SafetyLimits((12.0, 3.0)).configuration(INFO._replace(period_ns=10_000_000), 0)
-    assert (slow.hold, slow.ramp, slow.ramp_in) == (1, 1, 25)  # 20 ms without a force are the most
+    assert (slow.hold, slow.ramp, slow.ramp_in) == (1, 1, 25)  # at most 20 ms from the last answer to zero
 
 
 def test_no_cap_above_twelve_newtons():
@@ -158,7 +158,7 @@ def test_values_at_a_limit_are_allowed():
     LIMITS.check_jump((3e-3, 0.0), (0.0, 0.0), 1)
     LIMITS.check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0))
     Units.of(INFO).check_range((10**5, -(10**5)))
-    assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # the limiter leaves its forces there
+    assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # the limiter leaves forces at the cap
 
 
 def test_the_gain_stays_within_its_ends():
@@ -186,7 +186,7 @@ def test_no_stage_is_both_an_end_and_driving():
 
 @pytest.mark.parametrize(
     ("baud", "microseconds"), [(921_600, 520.8), (2_000_000, 240.0), (115_200, 4166.7)]
-)  # section 14's figures
+)  # docs/protocol.md has 521 us
 def test_wire_time_is_what_the_frames_take(baud, microseconds):
     seconds, text = _wire_time(baud, 2)
     assert 1e6 * seconds == pytest.approx(microseconds, abs=0.1)
@@ -260,7 +260,7 @@ def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
 
 
 def test_force_steps_obey_the_slew_limit():
-    """Else one step, the least that can be sent, would be the jump that the limit is there against."""
+    """Otherwise the smallest change of force, one step, would exceed the slew limit."""
     slow = SafetyLimits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
     assert slow.objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), None) == []
     (reason,) = slow.objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), None)
@@ -269,7 +269,7 @@ def test_force_steps_obey_the_slew_limit():
 
 def test_shaking_encoders_are_found():
     limits = SafetyLimits((12.0,))
-    limits.check_jolt((2e-3,), (0.0,), (0.0,))  # a jump that the other check allows, too
+    limits.check_jolt((2e-3,), (0.0,), (0.0,))  # 2 mm is no jump either
     limits.check_jolt((4e-3,), (2e-3,), (0.0,))  # at constant speed
     with pytest.raises(SafetyStop, match=r"encoder 1 shakes: its speed changed by 5\.8 mm in a tick, allowed are 3 mm"):
         limits.check_jolt((2.9e-3,), (0.0,), (2.9e-3,))
@@ -317,7 +317,7 @@ def test_cap_and_slew_cover_channels_and_signs(channel, sign):
         assert shaped.force == on(channel, sign * sent)
         assert (shaped.clipped, shaped.slowed) == (clipped, slowed)
     half = LIMITS.shape(on(channel, sign * 2.0), (0.0, 0.0), 0.5, T, on(channel, sign * 0.25))
-    assert half.force == on(channel, sign * 1.25)  # the gain is for the controller, not for the test of an encoder
+    assert half.force == on(channel, sign * 1.25)  # the gain scales the controller's force, not the encoder test's
 
 
 @pytest.mark.parametrize("channel", [0, 1])
@@ -331,7 +331,7 @@ def test_invalid_forces_are_found_on_both_channels(channel, value):
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
 def test_motor_heat_grows_with_squared_force(channel, sign):
-    """At twice what it stands for long, after tau ln(4/3); at 0.99 of it, never. Cold again after a while."""
+    """At twice its continuous force a motor is hot after tau ln(4/3), at 0.99 of it never. Missed ticks count."""
     limits = SafetyLimits((12.0, 12.0), continuous=(2.0, 2.0), thermal=5.0)
     heat, ticks = Heat(limits, T), 0
     for _ in range(20_000):
@@ -347,7 +347,7 @@ def test_motor_heat_grows_with_squared_force(channel, sign):
         push(Heat(limits, T))
     assert ticks * T == pytest.approx(5.0 * math.log(4 / 3), abs=2 * T)
     at_once = Heat(limits, T)
-    at_once.check(on(channel, sign * 3.0), 500)  # ticks that were missed count too
+    at_once.check(on(channel, sign * 3.0), 500)  # 500 ticks at once
     one_by_one = Heat(limits, T)
     for _ in range(500):
         one_by_one.check(on(channel, sign * 3.0), 1)
@@ -389,7 +389,7 @@ def test_too_long_watchdog_periods_are_refused():
 
 
 def test_force_steps_are_judged_by_the_output():
-    """Eight bits of PWM for 12 N: fine for a cap of 2 N, too coarse for one of 0.5 N; twelve bits are not."""
+    """Eight bits of PWM for 12 N are fine for a cap of 2 N, too coarse for 0.5 N; twelve bits are fine for both."""
     eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
     twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)
     assert SafetyLimits((2.0, 2.0)).objections(eight, load(), None) == []

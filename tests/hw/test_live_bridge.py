@@ -42,14 +42,14 @@ from tests.sessions import rehearsal_of
 
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
-PACE = 0.2  # seconds of a session per second: the patience of a session (1 s of silence) is 5 s of the machine
-PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.02, 0.01)  # of attempts: at the last one, 6 ms without a STATE are 0.6 s
+PACE = 0.2  # session seconds per real second: the session's time-out of 1 s of silence takes 5 s
+PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.02, 0.01)  # of attempts: at the last, 6 ms without a STATE take 0.6 s
 AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
 
 
 @pytest.fixture(scope="module")
 def emulator():
-    """One device for several sessions, one after the other."""
+    """Run one emulated device for several successive sessions."""
     emulator = EmulatorProcess(f"--pace={PACE}")
     yield emulator
     assert emulator.end()["phase"] in AT_REST
@@ -66,7 +66,7 @@ def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
 
 
 def commanded(capsys, scenario):
-    """The report of a short session of the command, in slower and slower motion until it is armed."""
+    """Run short sessions of the command, slower and slower until one is armed, and return its report."""
     for pace in PACES:
         options = ["--arm", "--no-dead-man", "--scenario", scenario, "--measure", "60", "--duration", "0.1"]
         with emulated("--nobody", f"--pace={pace}", f"--scenario={scenario}") as path:
@@ -83,7 +83,7 @@ def commanded(capsys, scenario):
 
 
 def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
-    """A session over a serial line, a report, a trace that replays bit by bit."""
+    """A session over a serial line leaves a report and a trace that replays bit by bit."""
     monkeypatch.chdir(tmp_path)
     report = commanded(capsys, "omega-pair")
     assert decisive(report)["certified"]
@@ -91,7 +91,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
 
 
 def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
-    """The scene steps in the session's own loop, behind its shell, and its report keeps the account."""
+    """The scene steps in the session's loop behind its shell, and the report keeps the account of energy."""
     monkeypatch.chdir(tmp_path)
     report = commanded(capsys, "world-ball")
     (world,) = report["world"]
@@ -143,7 +143,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     assert report["session"]["cause"] == "SIGINT"
     gain = np.load("out/bridge-I/trace.npz")["link_gain"]
     falling = gain[int(np.flatnonzero(gain == 1.0)[-1]) :]
-    falling = falling[falling > 0]  # then the motors are tested once more
+    falling = falling[falling > 0]  # at gain 0 the motors are tested once more
     assert falling.size * 1.2e-3 == pytest.approx(0.1, abs=0.01)  # s
     assert (np.diff(falling) < 0).all()
     assert falling[-1] < 0.02
@@ -192,7 +192,7 @@ def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
 
 
 class BridgeOnTerminal:
-    """hw.bridge with a terminal of its own, measuring for as long as the machine likes: nothing is armed."""
+    """Run hw.bridge on its own terminal, with a measurement that outlasts the test: nothing is armed."""
 
     def __init__(self, out, port):
         self.master, self.slave = os.openpty()
@@ -222,7 +222,7 @@ class BridgeOnTerminal:
         return termios.tcgetattr(self.slave)
 
     def read_until(self, word, patience=120.0):
-        """What it shows, until it shows `word` or is gone."""
+        """Return the output until it contains `word` or the process ends."""
         shown, end = b"", time.monotonic() + patience
         while word not in shown and time.monotonic() < end:
             if select.select([self.master], [], [], 0.05)[0]:
@@ -240,7 +240,7 @@ class BridgeOnTerminal:
 
 @pytest.mark.slow
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
-    """With the line of status drawn and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
+    """The bridges draw the status line and read single keys. SIGQUIT comes by its key. All run at once to save time."""
     names = ("SIGQUIT", "SIGTERM", "SIGHUP")
     with ExitStack() as devices:
         ports = [devices.enter_context(emulated("--pace=0.05")) for _ in names]
@@ -266,7 +266,7 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     ids=["once", "all"],
 )
 def test_a_device_is_identified_over_the_line(tmp_path, paces):
-    """Half a second a sweep, nobody at the handles: a bound below the emulated device's 1.37 N s/m, or why not."""
+    """Sweeps of 0.5 s on free handles give a bound of at most the emulated device's 1.37 N s/m, or a reason."""
     for pace in paces:
         options = ["--arm", "--seconds", "0.5", "--travel", "10", "--measure", "60", "--sittings", "1"]
         with emulated("--nobody", f"--pace={pace}") as path:
@@ -302,7 +302,7 @@ class Designing:
 
 @pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
 def test_keys_typed_during_design_do_not_arm(typed, stage):
-    """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
+    """A key waits in the terminal's buffer during design and is read before arming is possible; other keys count."""
     keyboard, person = os.pipe()
     session = Designing()
 
@@ -405,7 +405,7 @@ def test_only_a_uart_has_a_baud_rate(options, baud):
 
 
 def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
-    """By its own name, or by a link as socat makes them; the port opens all the same."""
+    """The port opens without a baud rate, by the terminal's name or by a link as socat makes it."""
     master, slave = os.openpty()
     link = tmp_path / "haptic"
     link.symlink_to(os.ttyname(slave))
@@ -423,7 +423,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 
 @pytest.mark.parametrize("module", [bridge, identify])
 def test_varying_delays_of_scenarios_are_refused(module, scenario, tmp_path, monkeypatch):
-    """The link has the delays that it has; a table that nothing reads would promise something else."""
+    """A real link has its own delays, so a table that nothing reads would be misleading."""
     monkeypatch.setattr(
         module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )

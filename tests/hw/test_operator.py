@@ -1,4 +1,4 @@
-"""Who arms a session, and when: the live rule, in virtual time."""
+"""Who arms a live session, and when, in virtual time."""
 
 import pytest
 
@@ -17,13 +17,13 @@ def rehearsal_of(scenario, rungs, operator, *faults):
 
 
 def stages(session):
-    """Those that were entered; a remark in the log is none."""
+    """Return the stages that were entered, without the log's remark on positions."""
     return [event.stage for event in session.log if not event.cause.startswith("positions count from")]
 
 
 @pytest.mark.parametrize("start", [0, 0.05, 0.2, 0.2496, 0.26, 0.5])
 def test_a_session_arms_by_itself_once(scenario, rungs, start):
-    """Whenever the answers get late, in ramp-in or after: that is the end where nobody arms the softer coupling."""
+    """Late answers, in ramp-in or after it, end a session where nobody arms the softer coupling."""
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
     session = rehearsal.run_until_armed(2.0)
     assert session.stage == Stage.REFUSED
@@ -47,11 +47,11 @@ def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
     rehearsal.run_until_armed(1.5)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     at = {event.stage: event.t_us for event in session.log}
-    assert at[Stage.DISARMING] - at[Stage.ARMED] == pytest.approx(300_000, abs=2400)  # looked at once a tick
+    assert at[Stage.DISARMING] - at[Stage.ARMED] == pytest.approx(300_000, abs=2400)  # the time is checked once a tick
 
 
 def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
-    """In a ramp-out it must not arm what comes after it."""
+    """A key pressed in a ramp-out must not arm the next coupling."""
     operator = Operator(False, 5.0)
     rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.5")
     session = rehearsal.run(0.5)

@@ -1,4 +1,4 @@
-"""Who has to be there, what outlives a killed process, and what the bridge asks of the machine."""
+"""Test the deadman, limits, the incident log after a kill, the pre-flight of the machine, and rehearsals."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def rehearsal_of(scenario, rungs, operator):
 
 @pytest.mark.parametrize("until", [0.0, 0.4, 0.9])
 def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
-    """A second after somebody showed up last, by the planned ramp of 100 ms."""
+    """The session ramps out in 100 ms, one second after the last sign of a person."""
     shown = []
 
     def there():
@@ -69,7 +69,7 @@ def test_holding_the_deadman_continues_the_session(scenario, rungs):
 
 
 def test_the_deadman_at_the_device(scenario, rungs):
-    """It arms while the switch is held only, and ramps out at the first STATE that says it is not."""
+    """The session arms only while the switch is held, and ramps out at the first STATE that reports it released."""
     faults = (FaultInjection.parse("letgo@0.7"),)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
@@ -166,7 +166,7 @@ def rehearsal_until_finished(scenario, rungs):
 
 
 def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
-    """A cap of 10 mN: more than half of the forces at full gain are at it."""
+    """With a cap of 10 mN, more than half of the forces at full gain are cut."""
     recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
     session.record = recorder
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
@@ -181,7 +181,7 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
 
 @pytest.mark.parametrize(("cut", "stage"), [(400, "finished"), (450, "stopped")])
 def test_a_second_of_clipped_forces_counts(scenario, rungs, cut, stage):
-    """As after a sign that changed: of 833 ticks in a second more than half, however long the session was."""
+    """A session has not finished if more than half of the 833 ticks of any second were clipped, however long it was."""
     recorder, session = Recorder(2), rehearsal_until_finished(scenario, rungs)
     state = session.link.last
     for k in range(4000):
@@ -215,7 +215,7 @@ def test_impossible_limits_are_refused(scenario, options, words):
 
 
 def test_the_incident_log_survives_sigkill(tmp_path):
-    """A session in a process of its own, killed while forces act: every stage up to then is on the disk."""
+    """A child process with a session is killed: every stage up to then is on the disk."""
     code = (
         "import time; from pathlib import Path\n"
         "from haptic_loop.hw.session_report import IncidentLog\n"
@@ -258,7 +258,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
 
 @pytest.mark.slow
 def test_doubts_reach_log_and_picture(tmp_path, capsys):
-    """Forces of 0.05 N at most are cut for most of a second: report, incidents and title say stopped."""
+    """At a cap of 0.05 N, forces are cut for most of a second: report and incident log state the same doubt."""
     words = "--rehearse --force-cap 0.05 --duration 1.5 --measure 60 --out"
     assert bridge.main([*words.split(), str(tmp_path)]) == 1
     report = json.loads((tmp_path / "report.json").read_text())["session"]
@@ -271,7 +271,7 @@ def test_doubts_reach_log_and_picture(tmp_path, capsys):
 
 
 def test_the_preflight_says_what_the_machine_can_do():
-    """In a child, since real-time scheduling and locked memory stay with a process."""
+    """The test uses a child process, since real-time scheduling and locked memory stay with a process."""
     code = "from haptic_loop.hw.transport import preflight; print(preflight(['/dev/null']))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     begun = time.monotonic()
@@ -293,7 +293,7 @@ def test_a_busy_machine_is_told_what_to_do(monkeypatch):
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory):
-    """Twice the same, with an energy budget: report and trace."""
+    """Rehearse twice with an energy budget. Return reports, traces and folders."""
     found = []
     for name in ("one", "two"):
         out = tmp_path_factory.mktemp(name)
@@ -315,7 +315,7 @@ def test_rehearsals_have_a_sessions_stages_and_files(rehearsed):
         "incidents.jsonl",
     }
     assert report["link"]["missed_percent"] == 0
-    (budget,) = report["energy_budget"]  # it stands by while the coupling is certified
+    (budget,) = report["energy_budget"]  # it limits nothing while the coupling is certified
     assert (budget["start_J"], budget["limited_ticks"], budget["ticks"]) == (0.01, 0, report["run"]["samples"])
     assert replay.main([str(out / "trace.npz")]) == 0
 

@@ -1,4 +1,4 @@
-"""Frames against a textbook COBS and a bitwise CRC of the tests' own, the example of docs/protocol.md, and fuzz."""
+"""Compare frames with a textbook COBS, a bitwise CRC and the example of docs/protocol.md, and fuzz the decoder."""
 
 import os
 import random
@@ -49,7 +49,7 @@ def crc_bitwise(data: bytes) -> int:
 
 
 def cobs_textbook(data: bytes) -> bytes:
-    """Cheshire and Baker's encoder, byte by byte, with its 254-byte blocks."""
+    """Encode byte by byte after Cheshire and Baker, in blocks of up to 254 bytes."""
     out, block = bytearray(), bytearray()
     for byte in [*data, 0]:
         if byte:
@@ -121,14 +121,14 @@ def test_no_more_axes_than_the_protocol_carries():
 
 
 def test_two_axes_fit_the_periods_they_should():
-    """Start bit, eight bits, stop bit: 115200 baud cannot carry 1.2 ms both ways, 921600 and 2 Mbaud can."""
+    """At ten bits a byte, 115200 baud cannot carry both frames in 1.2 ms; 921600 baud and 2 Mbaud can."""
     both = wire_bytes(State, 2) + wire_bytes(Force, 2)
     assert [round(both * 10 / baud * 1e6) for baud in (115_200, 921_600, 2_000_000)] == [4167, 521, 240]
 
 
 @given(st.binary(max_size=250))
 def test_stuffing_and_crc_equal_their_definitions(data):
-    """Any payload framed by the tests' own code is read; if it is no message it is unknown, not damaged."""
+    """Any payload framed by the test is a message, malformed or too long, but never a CRC error."""
     raw = data + crc_bitwise(data).to_bytes(4, "little")
     decoder = Decoder()
     got = decoder.feed(cobs_textbook(raw) + b"\0")
@@ -151,7 +151,7 @@ def test_the_documents_example_is_what_the_code_sends():
     pairs = re.findall(r"^# (\w+\(.*\))\n((?:[0-9a-f]{2} ?)+)$", text, re.M)
     assert [called.split("(")[0] for called, _ in pairs] == ["Hello", "Info", "Config", "Ack", "State", "Force", "Stop"]
     for called, line in pairs:
-        message = eval(called)  # our own page, of constructors only
+        message = eval(called)  # the page is ours and has constructors only
         assert encode(message).hex(" ") == line
         assert Decoder().feed(bytes.fromhex(line)) == [message]
     assert f"{config_crc(eval(pairs[2][0])):#010x}" in pairs[3][0]
@@ -198,7 +198,7 @@ def test_the_pieces_do_not_matter(sent, rng):
 
 
 def test_one_and_two_bit_errors_are_detected():
-    """All 248 single and 30628 double flips of a STATE frame: none is taken for a message, though COBS spreads them."""
+    """None of the 248 single and 30628 double bit flips of a STATE frame gives a message, though COBS spreads them."""
     frame = encode(STATE)
     bits = range(8 * (len(frame) - 1))
     whole = int.from_bytes(frame[:-1], "little")
@@ -244,7 +244,7 @@ def test_unknown_types_and_lengths_are_malformed(payload):
 
 
 def test_a_status_without_a_name_is_malformed():
-    """So that State.phase and State.cause cannot fail on what a decoder gave."""
+    """This keeps State.phase and State.cause from failing on a decoded STATE."""
     for status in range(256):
         got = Decoder().feed(encode(STATE._replace(status=status)))
         if got:
@@ -271,7 +271,7 @@ def disarmed() -> Device:
 
 
 def rides_on(device: Device, data: bytes, now: int, k: int) -> None:
-    """Feeds a piece and ticks; the motors must carry nothing."""
+    """Feed a piece of data and tick; the motors must carry no force."""
     device.receive(data, now)
     forces, sent = device.tick(now, (k, -k))
     assert forces == (0, 0)
@@ -281,7 +281,7 @@ def rides_on(device: Device, data: bytes, now: int, k: int) -> None:
 def test_a_million_random_bytes_move_no_motor():
     rng, host = random.Random(1), Decoder()
     silent, device = Device(INFO), disarmed()
-    rounds = int(os.environ.get("HAPTIC_FUZZ_ROUNDS", "1"))  # 100 of them are a hundred million bytes: some minutes
+    rounds = int(os.environ.get("HAPTIC_FUZZ_ROUNDS", "1"))  # 100 rounds take some minutes
     for _ in range(rounds):
         noise = rng.randbytes(1_000_000)
         assert host.feed(noise) == []
@@ -295,7 +295,7 @@ def test_a_million_random_bytes_move_no_motor():
 
 
 def mutations(rng: random.Random, frame: bytes):
-    """Damaged copies of a frame, its delimiter left off: bits, bytes, holes, insertions, cuts, halves swapped."""
+    """Yield copies of a frame without delimiter with wrong bits or bytes, holes, insertions, cuts or swapped halves."""
     while True:
         data = bytearray(frame)
         for _ in range(rng.choice((1, 1, 2, 5))):
@@ -318,7 +318,7 @@ def mutations(rng: random.Random, frame: bytes):
 
 
 def test_mutated_commands_arm_nothing_and_move_nothing():
-    """Damaged ARM and RUN frames for the very next tick, at a device that would obey them whole."""
+    """No damaged ARM or RUN frame for the next tick has an effect; an intact ARM frame then arms the device."""
     device, rng = disarmed(), random.Random(2)
     for n in range(20_000):
         good = Force(
@@ -332,7 +332,7 @@ def test_mutated_commands_arm_nothing_and_move_nothing():
 
 
 def test_mutated_frames_only_bring_devices_to_rest():
-    """They count as missed: the last force is held, ramped down, and stays at zero."""
+    """Damaged frames count as missed: the last force is held, ramped down, and stays at zero."""
     rng = random.Random(3)
     for _ in range(300):
         device = disarmed()

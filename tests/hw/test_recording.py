@@ -1,4 +1,4 @@
-"""What a session leaves: its trace, the replay that repeats it bit by bit, and traces that are none."""
+"""The trace of a session replays bit by bit, and other or changed traces are refused."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def test_missing_samples_are_filled_by_a_straight_line():
 
 @pytest.fixture(scope="module")
 def trace(scenario, rungs, tmp_path_factory):
-    """A session over a line that loses STATEs, as files."""
+    """Return the files and the recorder of a session over a line that loses STATEs."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, "up:drop=0.05@0.3", recorder=recorder)
     session = rehearsal.run_until_armed(1.0)
@@ -162,7 +162,7 @@ def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
     "name", ["t", "f", "link_tick", "link_margin_us", "link_status", "link_sent", "meta", "digest"]
 )
 def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
-    """Also where no force of the replay would show it; so is one that is cut off."""
+    """A change is refused even where no replayed force would show it, and so is a trace that is cut off."""
     with np.load(trace[0][0]) as archive:
         arrays = {key: archive[key] for key in archive.files}
     other = {"meta": np.array(str(arrays["meta"]).replace("true", "false", 1)), "digest": np.array("")}
@@ -191,9 +191,9 @@ def test_damaged_traces_are_one_line(trace, tmp_path):
 
 @pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
 def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
-    """Growth is told before the first force that the cap or the slew rate changed, as the counters saw it.
+    """Steady ticks end at the first force that the cap or the slew rate changed, as the counters saw it.
 
-    To two ticks: a force that is cut by less than a step is the same force.
+    They agree to two ticks, since a force that is cut by less than a step is sent unchanged.
     """
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((cap, cap), slew), FAST)
@@ -213,15 +213,16 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
 
 
 class Dared(CertifiedCoupling):
-    """A coupling that passes for certified: what a certificate keeps out has to be seen once."""
+    """A coupling that claims to be certified, so that a session can show growth without a certificate."""
 
     certified = True
 
 
 @pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
 def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
-    """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
-    one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
+    """Without coupling the file gives the exact engine's growth rate, to 2e-3 1/s since forces are rounded.
+
+    With the certified coupling nothing grows. Only ticks at full gain before the first cut force count.
     """
     scenario = scenario_of()  # people who begin slowly
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
@@ -269,7 +270,7 @@ springs = [{ between = ["left", "right"], stiffness = 800.0, damping = 1.0 },
 
 @pytest.mark.slow
 def test_sessions_limit_vectors(tmp_path):
-    """By the limiter of the proof; the channels keep their names, and a replay computes the same forces."""
+    """The proof's limiter acts on force vectors, channels keep their names, and a replay computes the same forces."""
     scenario = parse(PLANAR)
     settings = LinkSettings(measure=60, test_encoders=False)
     session, recorder = session_for(scenario, settings, 0.3), Recorder(4)
@@ -296,7 +297,7 @@ def test_the_report_is_json_and_names_its_end(trace):
     assert report["session"]["stage"] == "finished"
     assert [e["stage"] for e in report["session"]["log"]][-2:] == ["disarming", "finished"]
     assert report["link"]["counters"]["gaps"] > 10
-    assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # what the rehearsal's line takes
+    assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # the rehearsal's line takes 130 us
     assert decisive(report)["certified"]
 
 
@@ -306,7 +307,7 @@ def test_results_of_nothing():
 
 
 def test_result_of_holds_the_last_known_force(trace):
-    """Where no STATE came, the trace shows the force that was known last."""
+    """Where no STATE came, the trace shows the last known force."""
     _, recorder = trace
     link = recorder.link()
     result = recorder.trace(Units((1e-6,) * 2, (4e-4,) * 2, (10**5,) * 2), 1.2e-3, {})

@@ -1,4 +1,4 @@
-"""Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, limits and budget."""
+"""Test whole sessions in virtual time: faults, the exact engine's run, delays in the design, limits and budget."""
 
 import re
 from itertools import pairwise
@@ -38,7 +38,7 @@ from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 
 def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
-    """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
+    """The host cannot remove the force of a deaf device, but it says so, and the session has not finished."""
     planned = _rehearse_case(
         Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop"), lasts=1.3), scenario, rungs
     )[0]
@@ -52,7 +52,7 @@ def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
 
 
 def test_rehearsals_wait_for_deaf_devices(tmp_path, capsys):
-    """A device must rest 30 ms after STOP; a rehearsal that ends before that would call it finished."""
+    """A device must rest 30 ms after STOP; a rehearsal that ends before that would call the session finished."""
     words = ["--rehearse", "--case", "I", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)]
     assert bridge.main([*words, "--fault", "stuck"]) == 1
     assert re.search(r"stopped .* the device still drives 30 ms after STOP", capsys.readouterr().out)
@@ -65,7 +65,7 @@ def test_faults_of_two_axes_have_two(kind):
 
 
 def one_of_each_kind():
-    """Return one case of those that differ by numbers alone and end in the same stage, each time another one."""
+    """Return one case of each group that differs by numbers alone, and vary its place in the group."""
     kinds = {}
     for case in CASES:
         kinds.setdefault((re.sub(r"-|\b([\d.]+|inf|nan)\b", "", case.name), case.stage), []).append(case)
@@ -80,9 +80,9 @@ def one_of_each_kind():
     ],
 )
 def test_every_fault_ends_where_it_must(case, scenario, rungs):
-    """Stage, cause, time to zero force, counters, no force above the cap, no second arming.
+    """Stage, cause, time to zero force and counters are right; no force exceeds the cap; nothing arms again.
 
-    Two of three cases are slow. `python -m tests.checks.faults`, a part of `make validate`, has every axis and sign.
+    Two of three cases are slow. `python -m tests.checks.faults`, a part of `make validate`, runs all cases.
     """
     assert _rehearse_case(case, scenario, rungs)[1].wrong == ()
 
@@ -94,7 +94,7 @@ def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
 
 
 def test_free_handles_arm_in_the_table(scenario, rungs):
-    """Its speeds of free handles are those of sessions that nobody holds."""
+    """The table's speeds of free handles are those of sessions that nobody holds."""
     session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 
@@ -115,7 +115,7 @@ def test_harmless_faults_leave_forces_alone(scenario, rungs):
 
 
 def test_repeating_devices_count_as_lost(scenario, rungs):
-    """Time-outs are looked at between bytes: the same STATE for ever is no life."""
+    """Repeating one STATE for ever is no sign of life: the time-out acts all the same."""
     rehearsal = rehearsal_of(scenario, rungs)
     session = rehearsal.run_until_armed(0.7)
     assert session.stage == Stage.ARMED
@@ -181,7 +181,7 @@ def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
 
 
 def test_random_bytes_move_nothing(scenario):
-    """A megabyte of noise, and real frames with one byte changed: no crash, no stage but waiting, no FORCE."""
+    """A megabyte of noise and frames with one wrong byte cause no crash, no change of stage and no FORCE."""
     rng = np.random.default_rng(5)
     session, port = session_with(scenario), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
@@ -201,10 +201,10 @@ def test_random_bytes_move_nothing(scenario):
 
 
 def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
-    """Both devices over the whole link against sim's exact engine with ideal encoders and forces.
+    """Both devices over the whole link move as in sim's exact engine with ideal encoders and forces.
 
-    Tolerances: positions to one encoder step (rounding is half of one; what rounded forces add stays below the other
-    half), forces to K of one encoder step, B of half a step per tick twice over, and one force step.
+    Positions agree to one encoder step: rounding is half a step, and rounded forces add less than the other half.
+    Forces agree to K times an encoder step, B times an encoder step per tick, and one force step.
     """
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
@@ -226,7 +226,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
 
 
 def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
-    """An independent loop: held plant by expm, encoders rounded, F of the whole delay, forces rounded to steps."""
+    """The session equals a separate loop: held plant, rounded encoders, F with the whole delay, rounded forces."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(1.5)
@@ -243,7 +243,7 @@ def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
         s = held.A @ s + held.B @ np.concatenate([w[k], f * 4e-4])
         counts.append(x)
         applied.append(-f)
-    # a rounding of a force may fall the other way where the sums are associated otherwise: none did in this run
+    # another order of the sums could round a force the other way; in this run it never does
     np.testing.assert_array_equal(applied, link["applied"][first:])
     np.testing.assert_allclose(np.array(counts) * 1e-6, link["x"][first:], rtol=0, atol=1e-15)
 
@@ -269,16 +269,16 @@ def test_softer_couplings_are_softer_and_certified(scenario, rungs):
 
 
 def test_the_host_and_the_link_share_the_delay(scenario, rungs):
-    """What the host runs, delayed by the link, is the F that was certified."""
+    """The host's controller, delayed by the link, is the F that was certified."""
     z = np.exp(1j * np.linspace(0.01, 3, 50))
     F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
     on_host = rungs[0].controller((12.0, 12.0)).F.at(z) * z[:, None, None] ** -rungs[0].link
-    np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
+    np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # the sums have different orders
 
 
 @pytest.mark.slow
 def test_long_delays_wait_in_the_host(scenario):
-    """Of 16 and 17 ticks, 15 are the line's: the host's forces come one and two ticks after their displacement."""
+    """Of delays of 16 and 17 ticks, 15 are the line's, so the host delays its forces by one and two ticks."""
     (made,) = certified_couplings(scenario.replace(theta=(16, 17)), "I", None, None, 1, spare=0)
     controller = made.controller((12.0, 12.0))
     answers = np.array([controller.step((1e-3 * (k == 0), 1e-3 * (k == 0))) for k in range(4)])
@@ -303,7 +303,7 @@ def test_nothing_uncertified_is_loaded(scenario, rungs):
 
 
 def test_reserves_take_over_after_arming(scenario, rungs):
-    """10 % late answers: ramp-out, the coupling for one tick more, disarmed; only arm() brings the forces back."""
+    """After 10 % late answers the session ramps out and loads the next coupling; only arm() brings forces back."""
     faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
     rehearsal = Rehearsal(session_with(scenario), Emulator(scenario), lambda ages: rungs, faults)
     session = rehearsal.run_until_armed(1.2)
@@ -322,14 +322,14 @@ def test_reserves_take_over_after_arming(scenario, rungs):
 
 @pytest.fixture(scope="module")
 def optimal_rungs(scenario):
-    """By their first bases."""
+    """Return optimal couplings of the first bases, without the search over larger ones."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)
         return certified_couplings(scenario, "I", "optimal", None, 1, spare=1)
 
 
 def assert_in_reserve(rungs):
-    """Each is softer where its delay is longer, stiffer nowhere, and needs less than the one before would there."""
+    """Check that each reserve is softer where its delay is longer, stiffer nowhere, and needs less damping there."""
     for before, reserve in pairwise(rungs):
         loop, slower = (made.scenario.loop("I") for made in (before, reserve))
         later = np.greater(slower.theta, loop.theta)
@@ -365,11 +365,11 @@ def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
     assert all(r.certified for r in rungs)
     assert_in_reserve(rungs)
     with pytest.raises(SafetyStop, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
-        certified_couplings(scenario, "I", str(path), None, 2)  # the one asked for is armed first, or none
+        certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
 
 
 def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
-    """Late answers, a ramp to zero, the reserve armed by a person; and the trace of both replays bit by bit."""
+    """After late answers and a ramp, a person arms the reserve. The trace of both couplings replays bit by bit."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
     session = rehearsal.run_until_armed(1.2)
@@ -386,7 +386,7 @@ def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs,
     assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
 
 
-# faults to order
+# faults that are injected
 
 
 @pytest.mark.parametrize(
@@ -419,7 +419,7 @@ def test_a_wrong_fault_is_one_line(text, words):
 
 
 def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
-    """A cap of 0.3 N: the limiter keeps every force within it, a third of the ticks are limited, and |f| <= cap."""
+    """With caps of 0.3 and 0.2 N, the limiter keeps all forces within the caps and limits over a third of the ticks."""
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
     session.record = recorder
@@ -435,7 +435,7 @@ def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
 
 
 class _Thief:
-    """A controller that pushes along the motion, as far from a certificate as can be."""
+    """A controller that pushes along the motion, so that it gives energy all the time."""
 
     def __init__(self, T):
         self.T, self._before = T, np.zeros(2)
@@ -459,7 +459,7 @@ def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
 
 
 def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path):
-    """Over a line that becomes lossy; the replay repeats what the budget did, bit by bit."""
+    """The budget limits an active controller over a lossy line, and the replay repeats this bit by bit."""
     for module in ("control", "recording"):
         monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
     taken = {}
@@ -486,7 +486,7 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
 
 
 def test_a_rehearsed_wall_pushes_and_never_pulls():
-    """Coupling and wall in series, by bisection: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap)."""
+    """Forces solve coupling and wall in series: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap)."""
     scenario = load_scenario("one-wall")
     session = rehearse(scenario, seconds=3.0)
     assert (session.stage, session.assessment.guarantee.condition) == ("finished", "any-environment")

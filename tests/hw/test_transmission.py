@@ -23,13 +23,13 @@ T, STEP, FAR = 1.2e-3, 5e-6, 1e9
 
 
 def signals(seconds=1.5):
-    """The forces of a free record, and of two clamped ones [N], in steps of 0.4 mN."""
+    """Return the forces [N] of a free record and of two clamped ones, in steps of 0.4 mN."""
     whole = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds).signal[:, 0]
     return [4e-4 * np.round(level * whole / 4e-4) for level in (1.0, 1.0, 0.5)]
 
 
 def record(force, m1, m2, k, b, delta, ground=0.0, lag=0.0):
-    """Encoder positions (N,) [m] of two masses, exact for held forces; a spring from the handle to `ground` [N/m].
+    """Return encoder positions (N,) [m] of two masses, exact for held forces; `ground` [N/m] is a spring at the handle.
 
     A current loop of first order with time constant `lag` [s] stands before the motor.
     """
@@ -49,7 +49,7 @@ def record(force, m1, m2, k, b, delta, ground=0.0, lag=0.0):
 
 
 def bounds(m1, m2, k, b, delta, lag=0.0, clamp=FAR):
-    """What comes of a rig whose handle is clamped by a mass of 1000 t, or by a spring `clamp` [N/m]."""
+    """Return the bounds of a rig whose handle is clamped by a mass of 1000 t, or by a spring `clamp` [N/m]."""
     free, *clamped = signals()
     x = record(free, m1, m2, k, b, delta, 0.0, lag)
     heavy, ground = (1e6, 0.0) if clamp == FAR else (m2, clamp)
@@ -91,7 +91,7 @@ def test_a_soft_clamp_hides_no_stiffness(clamp):
 
 @pytest.mark.slow
 def test_play_and_presliding_friction_are_refused():
-    """By the plant of the benchmark, which has both."""
+    """The plant of the benchmark simulates both."""
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
     odd = ({"gap": 1e-5}, {"coulomb": 0.03, "bristle": 2000.0})
     free, *clamped = signals(0.5)
@@ -107,7 +107,7 @@ def test_play_and_presliding_friction_are_refused():
 
 
 def test_written_bounds_are_rounded_outwards():
-    """A table of devices.toml is read as a device whose simulated values lie within its bounds."""
+    """A written table is read as a device with bounds that are no tighter than those found."""
     found, known = bounds(*RIGS[0]), load("omega-pair-known")
     axis = SimpleNamespace(
         viscous=1.37, delta=1.36, viscosity=SimpleNamespace(speed=0.5), friction=SimpleNamespace(mass=1)

@@ -1,4 +1,4 @@
-"""MuJoCo worlds behind the protocol of a device: the account at the contacts, from what was sent."""
+"""Test MuJoCo worlds over the device protocol, and the account of energy at their contacts."""
 
 import json
 
@@ -32,7 +32,7 @@ def session(tmp_path, capsys, *words):
 
 
 def driven(tmp_path):
-    """A scene whose motor gives energy for ever."""
+    """Write a scene whose motor always gives energy, and return its scenario file."""
     (tmp_path / "driven.xml").write_text(DRIVEN)
     (tmp_path / "loop.toml").write_text(
         """name = "driven"
@@ -56,7 +56,7 @@ links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
 def account(trace, link, coupling, T):
     """Return the least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell.
 
-    Forces that test a motor are not the scene's.
+    Forces that test a motor are left out, since the scene does not send them.
     """
     V: Lti = coupling.compliance(T)
     f = -4e-4 * link["sent"] * ~link["test"].any(axis=1, keepdims=True)
@@ -81,7 +81,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
 
 
 def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
-    """Without a repetition of the step, these are the ticks on which the scene's force is at the cap."""
+    """Without repetitions of the step, the unsettled ticks are those with a force at the cap."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
     _, report, shown = session(tmp_path, capsys, *words)
@@ -96,7 +96,7 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", [pytest.param(0.002, marks=pytest.mark.validate), 0.02])
 def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
-    """A motor with negative damping: forces are whole steps of 0.4 mN, and the account still holds."""
+    """The scene's motor has negative damping and forces are whole steps of 0.4 mN; the account still holds."""
     words = (
         "--scenario",
         str(driven(tmp_path)),
@@ -129,7 +129,7 @@ def read_coupling_of(trace):
 
 
 def in_the_ball_world(*faults):
-    """A session of 0.5 s in the world with a ball and two three-axis devices; of both, what was given [J]."""
+    """Run a session with a ball and two three-axis devices. Return it and the total energy given at every tick [J]."""
     scenario, rows = load("world-space"), []
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_for(scenario, LinkSettings(measure=60), 2.0)
@@ -149,7 +149,7 @@ def in_the_ball_world(*faults):
 
 @pytest.mark.slow
 def test_motors_in_worlds_are_tested_at_last():
-    """Within W0; the account is that of the devices, by their motion and the applied forces."""
+    """The devices give at most W0 and what was released, by their motion and the applied forces."""
     session, given = in_the_ball_world()
     assert session.stage == Stage.FINISHED, session.cause
     assert given.max() <= 2e-3 + session.worlds[0].port.released
