@@ -441,12 +441,13 @@ def _force_settings(spec: Any, h: float, gravity: bool) -> None:
 
 
 def _off_rest(model: mujoco.MjModel) -> None:
-    """Lengthen tendon springs by 1e-12 of their length: MuJoCo ignores the stiffness of a spring exactly at rest."""
+    """Lengthen tendon springs by 1e-12 of their length, or from 0 to 1e-12: MuJoCo ignores a spring exactly at rest."""
     if not model.ntendon:
         return
     exact = (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(axis=1)
     exact &= model.tendon_lengthspring[:, 0] == model.tendon_lengthspring[:, 1]
-    model.tendon_lengthspring[exact] *= 1 + 1e-12
+    length = model.tendon_lengthspring[exact]
+    model.tendon_lengthspring[exact] = np.where(length == 0, 1e-12, length * (1 + 1e-12))
 
 
 def _blockdiag(blocks: Sequence[Array]) -> Array:

@@ -275,6 +275,17 @@ def test_linear_scenes_linearise_to_their_network(tmp_path):
         assert np.abs(ours - E).max() < 1e-12 * np.abs(E).max()
 
 
+@pytest.mark.parametrize("ref", ["0", "0.1"])
+def test_a_fixed_tendon_at_rest_pulls_back(tmp_path, ref):
+    """A joint with 1 kg on a tendon spring of 1e5 N/m has the speed v / (1 + k h^2/m) after a discrete step."""
+    joint = f'<joint name="j" type="slide" axis="1 0 0" ref="{ref}"/>'
+    load = f'<body name="load" pos="0.2 0 0">{joint}<geom size=".01" mass="1" contype="0" conaffinity="0"/></body>'
+    text = f'<mujoco><option gravity="0 0 0"/><worldbody><body name="tip">{FREE}</body>{load}</worldbody>'
+    text += '<tendon><fixed stiffness="1e5"><joint joint="j" coef="1"/></fixed></tendon></mujoco>'
+    A, _, _, _ = world(tmp_path, text, ["tip"], [1000.0]).linear()
+    assert A[3, 3] == pytest.approx(1 / (1 + 1e5 * T**2), abs=1e-6)
+
+
 def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
     """`linear` equals mjd_transitionFD of the same step without the springs G, at a pose in contact."""
     scene = world(tmp_path, scene_of_the_lemma(1, 1, 0.9, "0.01 1", None))
