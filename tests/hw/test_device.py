@@ -263,7 +263,7 @@ def test_the_margin_is_time_before_the_latch():
     assert slow.margin == 32_767  # the margin is 45,000; the wire carries no more
     rig = Rig()
     rig.tick()
-    rig.answer(command=Command.IDLE, back=1, after=100)  # the tick it was for began 100 us ago
+    rig.answer(command=Command.IDLE, back=1, after=100)  # the tick of this FORCE began 100 us ago
     rig.tick()
     assert rig.state.margin_us == -100
     assert rig.state.misses == 3

@@ -55,7 +55,7 @@ def state(tick, applied=(0, 0), phase=Phase.ARMED, t_us=0):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_device_that_obeys_is_never_found_out(seed):
-    """Random forces, of which some are lost, as some STATEs are, make the device ramp in, slew, cap and hold."""
+    """Random forces make the device ramp in, slew, cap and hold, while some forces and STATEs are lost."""
     rng = np.random.default_rng(seed)
     device, told = Device(info_of(scenario_of())), CommandMonitor(CONFIG)
     device.k = 65000  # the tick number wraps around
@@ -170,7 +170,7 @@ def test_tick_leaps_skip_no_check(scenario, rungs):
     assert (session.stage, session.cause) == (Stage.STOPPED, "the tick number leapt by 300, the watchdog allows 5")
     assert gain.value < 0.03
     session, send = hand_driven(scenario, rungs)
-    assert session.stage == Stage.ARMING  # a leap before the first force stops it, too
+    assert session.stage == Stage.ARMING  # a leap before the first force stops the session, too
     send(Phase.ARMED, ticks=300)
     assert session.stage == Stage.STOPPED
 
@@ -364,7 +364,7 @@ BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T
 @pytest.mark.parametrize("where", ["down", "both"])
 @pytest.mark.parametrize(("T", "every"), BURSTS)
 def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
-    """The measured delay covers the greatest age that the emulator noted, by at most one tick more."""
+    """The measured delay is at least the greatest age that the emulator noted, and at most one tick longer."""
     direction = "" if where == "both" else f"{where}:"
     session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 400)
     ages = session.measurement.result

@@ -56,7 +56,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
 @pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.13), (1e-4, 0.25)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
-    """Encoders of 1 to 100 um answer at most this force, held by the scenario's hands or free."""
+    """Encoders of 1 to 100 um answer a force of at most `most` [N], held by the scenario's hands or free."""
     still = scenario if held else nobody(scenario)
     forces = []
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))
@@ -81,7 +81,7 @@ def played(test, motion, ticks=6000):
 
 
 def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6):
-    """Return the motion of two free masses: the forces summed twice, independently of the model in the test."""
+    """Return a `motion` of two free masses: forces are summed twice, independently of the model in the test."""
 
     def motion(k, applied):
         v = np.cumsum(applied * STEP / mass * T, axis=0)
@@ -139,7 +139,7 @@ def cut(test, most):
 
 @pytest.mark.parametrize("closing", [False, True])
 def test_a_force_cut_short_is_no_test(closing):
-    """An energy budget that allows 0.1 N of 1 N does not show that the motor is dead."""
+    """A test force that an energy budget cuts from 1 N to 0.1 N does not show that the motor is dead."""
     with pytest.raises(SafetyStop, match=r"the energy left allows 0.1 of 1 N: motor and encoder of axis 1 are not"):
         cut(arming_test(closing=closing), 0.1)
 

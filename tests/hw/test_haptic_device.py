@@ -38,7 +38,7 @@ def scenario():
 
 
 class StandIn:
-    """The calls of forcedimension_core.dhd over the scenario's devices and hands, in a time that only they advance.
+    """The calls of forcedimension_core.dhd over the scenario's devices and hands, in its own time.
 
     The plant is integrated exactly between any two calls, so that a force acts from the instant it is written.
     """

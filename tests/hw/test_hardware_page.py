@@ -16,7 +16,7 @@ from tests.checks.faults import CASES, _rehearse_case
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 TABLE = re.search(r"^\| fault \| ends in .*\n\|[-|]+\n((?:\|.*\n)+)", PAGE, flags=re.MULTILINE)[1]
 ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.splitlines()]
-#: The cases of rows whose names differ from their case.
+#: Rows of the page whose names differ from those of their cases.
 CALLED = {
     "no FORCE arrives; cable pulled": ("no FORCE arrives", "cable pulled"),
     "encoder 1, encoder 2 dies": ("encoder dies", "encoder 2 dies"),
@@ -63,7 +63,7 @@ def test_the_bridge_runs_without_garbage_collection():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_serial_ports_ask_for_low_latency(known, monkeypatch):
-    """A driver without this mode is no error."""
+    """A driver without a low-latency mode is no error."""
     asked = []
 
     class Serial:

@@ -1,8 +1,8 @@
 """The bridge in real time, through pyserial and a pseudo-terminal, with the emulator in its own process.
 
-Nothing here judges timing: on a busy machine a session may end because the link was too slow, which is an end like
-any other, and is tried again. What must hold on every machine: a named end with its cause, no armed device left, a
-true trace; and of several attempts, in slower and slower motion, one is armed.
+Nothing here judges timing: on a busy machine a session may end because the link was too slow, and is tried again. On
+every machine a session must end with a named cause, leave no armed device, and record a true trace. Of several
+attempts, slower and slower, one must be armed.
 """
 
 import fcntl

@@ -1,4 +1,4 @@
-"""Who arms a live session, and when, in virtual time."""
+"""Check in virtual time who arms a live session, and when."""
 
 import pytest
 

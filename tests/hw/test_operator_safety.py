@@ -249,7 +249,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     standing = [line for line in lines if "gain" in line]
     assert len(standing) >= 2
     assert 2 in [len(line["x_m"]) for line in standing]
-    again = IncidentLog(tmp_path / "log")  # appended to, never begun anew
+    again = IncidentLog(tmp_path / "log")  # the log continues the file
     again.attach(Session(scenario, SafetyLimits((2.0, 2.0))))
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):

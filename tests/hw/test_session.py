@@ -248,7 +248,7 @@ def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
     np.testing.assert_allclose(np.array(counts) * 1e-6, link["x"][first:], rtol=0, atol=1e-15)
 
 
-# delay into design
+# delays in the design
 
 
 @pytest.mark.parametrize(

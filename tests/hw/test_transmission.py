@@ -91,7 +91,7 @@ def test_a_soft_clamp_hides_no_stiffness(clamp):
 
 @pytest.mark.slow
 def test_play_and_presliding_friction_are_refused():
-    """The plant of the benchmark simulates both."""
+    """The plant of the benchmark simulates play and presliding friction."""
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
     odd = ({"gap": 1e-5}, {"coulomb": 0.03, "bristle": 2000.0})
     free, *clamped = signals(0.5)
