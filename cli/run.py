@@ -100,6 +100,7 @@ def _parser() -> options.Parser:
     add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     parser.add_details()
     parser.add_output(picture=True)
+    parser.only("with MuJoCo: leave out --engine exact", lambda args: args.engine != "exact", "integrator", "substeps")
     add("--paper", action="store_true", help="a table of the figures that the paper prints, beside those of this run")
     return parser
 

@@ -111,9 +111,11 @@ def _parser() -> options.Parser:
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
-    """Return the scenario of the options. Raises InputError for friction, or an impossible duration."""
+    """Return the scenario of the options. Raises InputError for friction, missing ranges, or an impossible duration."""
     scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
     require_linear(scenario, "sim.validate", walls=True)
+    if args.environments == "ranges" and scenario.ranges is None:
+        raise InputError("--environments ranges: the scenario has no ranges (docs/scenario.md, [ranges])")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -121,14 +123,13 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
-    """Return the nominal environment, vertices, the worst point and random points of ranges. Raises InputError.
+    """Return the nominal environment, vertices, the worst point and random points of ranges.
 
     Without `--environments ranges` the result is empty, and every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
-    if ranges is None:
-        raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md, [ranges])")
+    assert ranges is not None
     others = (ranges.searched.worst[0].member, *ranges.samples)
     return (*ranges.members, *others[: len(ranges.members)])
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import forked
@@ -103,6 +104,19 @@ def test_published_gains_are_refused_by_their_own_condition(tmp_path):
     assert report["stability"]["exact_growth_rate_per_s"] == pytest.approx(-0.939, abs=1e-3)
     assert report["stability"]["exact_frequency_hz"] == pytest.approx(83.8, abs=0.1)
     assert any("5.72 times the damping" in line for line in report["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("run", "--engine exact --integrator RK4"), ("run", "--engine exact --substeps 4"),
+     ("validate", "--environments ranges")],
+)  # fmt: skip
+def test_impossible_settings_are_refused_before_designs(command, words, monkeypatch):
+    """A design may take minutes."""
+    module = import_module(f"haptic_loop.cli.{command}")
+    monkeypatch.setattr(module, "chosen_by", lambda *asked: pytest.fail("a coupling was designed"))
+    with pytest.raises(InputError, match=words.split()[-2]):
+        module.main(words.split())
 
 
 @pytest.mark.slow

@@ -31,9 +31,9 @@ from pathlib import Path
 
 import hostile_files
 import hostile_words
-import matplotlib.figure  # noqa: F401 - imported once, before the forks
 import numpy as np
-from hostile_cases import BUT, SHORT, Case, furnish, npz, put
+from hostile_cases import BUT, SHORT, Case, furnish, npz, pairs, put
+from matplotlib.figure import Figure
 
 from haptic_loop.cli import options
 from haptic_loop.cli.main import execute
@@ -41,6 +41,7 @@ from haptic_loop.sim import plots
 
 SECONDS = 20  # CPU seconds that a case may take
 RIGID = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))
+STREAMS = {"in": (0,), "out": (1,), "err": (2,), "all": (0, 1, 2)}
 LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the quickest commands
 
 
@@ -65,13 +66,15 @@ def streams() -> Iterator[Case]:
         now = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         resource.setrlimit(resource.RLIMIT_AS, (now + 100_000_000,) * 2)
 
-    for words in LEAST:
-        for name, numbers in (("in", (0,)), ("out", (1,)), ("err", (2,)), ("all", (0, 1, 2))):
-            yield Case(f"{words[0]}: std{name} closed", words, (0, 1), before=closed(*numbers))
-        yield Case(f"{words[0]} --json -: stdout closed", (*words, "--json", "-"), (0, 1), before=closed(1))
-        yield Case(f"{words[0]}: ASCII", words, (0, 1), before=ascii_only)
-        yield Case(f"{words[0]}: full", words, says="No space left", before=full)
-        yield Case(f"{words[0]} --json -: full", (*words, "--json", "-"), says="No space left", before=full)
+    kinds = [
+        *((f": std{name} closed", (), (0, 1), "", closed(*numbers)) for name, numbers in STREAMS.items()),
+        (" --json -: stdout closed", ("--json", "-"), (0, 1), "", closed(1)),
+        (": ASCII", (), (0, 1), "", ascii_only),
+        (": full", (), (BUT,), "No space left", full),
+        (" --json -: full", ("--json", "-"), (BUT,), "No space left", full),
+    ]
+    for words, (name, more, codes, says, before) in pairs(LEAST, kinds):
+        yield Case(words[0] + name, (*words, *more), codes, says, before)
     yield Case("bad input, stderr closed", ("audit", "--scenario", "n\udcff"), before=closed(2))
     huge = lambda: (npz("t.npz", x=np.zeros((10_000_000, 1)), t=np.zeros(3)), little())  # noqa: E731
     yield Case("trace: little memory", ("trace", "t.npz"), (3,), "memory", before=huge)
@@ -227,8 +230,17 @@ def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str
 
 
 def warm(model: Path) -> None:
-    """Run good commands once, so that no case loads, compiles or caches what they need; draw pictures coarsely."""
-    plots.save.__defaults__ = (20,)
+    """Run good commands once, so that no case loads, compiles or caches what they need; draw pictures coarsely.
+
+    tests/sim/test_plots.py draws with the layout, which takes as long as the drawing.
+    """
+    save = plots.save
+
+    def coarse(figure: Figure, path: Path, dpi: int = 20) -> Path:
+        figure.set_layout_engine("none")
+        return save(figure, path, dpi)
+
+    plots.save = coarse
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         os.chdir(shutil.copytree(model, Path(folder, "files"), symlinks=True, ignore=shutil.ignore_patterns("fifo")))
