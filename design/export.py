@@ -145,7 +145,8 @@ def _limited_block(
     limited = "Lengths of a device's force vector" if balls else "Forces"
     about = (
         f"f: the whole discrete process with its limiter; the devices get -f, held for T. {limited} never exceed "
-        f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead.",
+        f"{', '.join(f'{f:g}' for f in force_limit)} N while positions and states are "
+        "finite: the contact slips instead. NaN and infinity stay in the state until the reset.",
         delays,
     )
     return ExportedBlock("process", limiter.open, _DISPLACEMENT, _FORCE, about, limiter)

@@ -5,7 +5,8 @@
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
  *   ha_home   call while the handles stand at their reference; no force acts before
- *   ha_arm    tests each axis by a small force while nobody holds its handle; then raises the gain
+ *   ha_arm    tests each axis by a small force while nobody holds its handle; then raises the gain. Limits that are NaN or
+ *             not positive end it (HA_LIMITS)
  *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN, HA_DEAD), or drops the force at once (every other cause, and during a test)
  *   ha_tick   call once per period; it computes the forces for the next period
  */
@@ -33,7 +34,7 @@ typedef HA_REAL ha_real;
 #define HA_PRESSED 0.5f
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
-enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD, HA_SCALE };
+enum { HA_NONE, HA_ASKED, HA_DEADMAN, HA_LATE, HA_RANGE, HA_SPEED, HA_SIGN, HA_DEAD, HA_SCALE, HA_LIMITS };
 
 /* ticks of a block, and the weights of the recursion p[k + 1] = u p[k] - weight[k] p[k - 1] of polynomials that are orthogonal
  * over these ticks, u from -1 to 1 */
@@ -69,18 +70,25 @@ typedef struct {
     ha_real reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
     ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] range of positions since the last motion */
     ha_real still[PROCESS_CHANNELS];                       /* [m] range in which a sensor rests */
-    uint16_t pressed[PROCESS_CHANNELS];                    /* ticks under a force since the last motion */
+    uint16_t pressed[PROCESS_CHANNELS];                    /* ticks in a row under a force without a motion */
 } ha_runner;
+
+/* Removes the forces, and begins to measure the noise of the sensors. */
+static inline void ha_rest(ha_runner *r)
+{
+    int i;
+    r->phase = HA_READY;
+    r->rested = 0;
+    for (i = 0; i < PROCESS_CHANNELS; i++) r->force[i] = 0;
+}
 
 static inline void ha_home(ha_runner *r)
 {
     int i;
-    r->phase = HA_READY;
+    ha_rest(r);
     r->cause = HA_NONE;
-    r->gain = 0;
     r->known = false;
-    r->rested = 0;
-    for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = r->older[i] = r->force[i] = 0;
+    for (i = 0; i < PROCESS_CHANNELS; i++) r->before[i] = r->older[i] = 0;
 }
 
 static inline void ha_block(ha_runner *r, uint8_t block)
@@ -102,17 +110,11 @@ static inline void ha_arm(ha_runner *r)
 
 static inline void ha_stop(ha_runner *r, uint8_t cause)
 {
-    int i;
     bool ramp = cause == HA_ASKED || cause == HA_DEADMAN || cause == HA_DEAD;
     if (r->phase < HA_TESTING || (r->phase == HA_STOPPING && ramp)) return;
     if (r->phase != HA_STOPPING) r->cause = cause; /* the first cause stays */
-    if (r->phase == HA_RUNNING && ramp) {
-        r->phase = HA_STOPPING;
-        return;
-    }
-    r->phase = HA_READY;
-    r->rested = 0;
-    for (i = 0; i < PROCESS_CHANNELS; i++) r->force[i] = 0;
+    if (r->phase == HA_RUNNING && ramp) r->phase = HA_STOPPING;
+    else ha_rest(r);
 }
 
 /* Measures the noise of the sensors while no force acts: the largest second difference of positions in a window, which a
@@ -123,6 +125,10 @@ static inline void ha_listen(ha_runner *r, const ha_limits *l, const ha_real *x)
     for (i = 0; i < PROCESS_CHANNELS; i++) {
         ha_real bend = x[i] - 2 * r->before[i] + r->older[i];
         if (bend < 0) bend = -bend;
+        if (!(bend <= l->range)) { /* an outlier or NaN: the window begins anew */
+            r->rested = 0;
+            return;
+        }
         if (r->rested == 0 || bend > r->high[i]) r->high[i] = bend;
     }
     if (++r->rested < (uint16_t)(HA_REST / PROCESS_PERIOD)) return;
@@ -215,12 +221,10 @@ static inline void ha_watch(ha_runner *r, const ha_limits *l, const ha_real *x)
     for (i = 0; i < PROCESS_CHANNELS; i++) {
         if (x[i] < r->low[i]) r->low[i] = x[i];
         if (x[i] > r->high[i]) r->high[i] = x[i];
-        if (r->high[i] - r->low[i] > r->still[i]) {
-            r->low[i] = r->high[i] = x[i];
-            r->pressed[i] = 0;
-        } else if (r->force[i] > least || r->force[i] < -least) {
-            if (++r->pressed[i] > (uint16_t)(HA_PRESSED / PROCESS_PERIOD)) ha_stop(r, HA_DEAD);
-        }
+        bool moves = r->high[i] - r->low[i] > r->still[i];
+        if (moves) r->low[i] = r->high[i] = x[i];
+        if (moves || (r->force[i] <= least && r->force[i] >= -least)) r->pressed[i] = 0;
+        else if (++r->pressed[i] > (uint16_t)(HA_PRESSED / PROCESS_PERIOD)) ha_stop(r, HA_DEAD);
     }
 }
 
@@ -230,10 +234,11 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
     const ha_real rise = (ha_real)(PROCESS_PERIOD / HA_RISE), fall = (ha_real)(PROCESS_PERIOD / HA_FALL);
     ha_real most = l->speed * (ha_real)PROCESS_PERIOD, from[PROCESS_CHANNELS], f[PROCESS_CHANNELS];
     int i;
+    if (r->phase == HA_TESTING && !(l->range > 0 && l->speed > 0 && l->cap > 0)) ha_stop(r, HA_LIMITS);
     for (i = 0; i < PROCESS_CHANNELS; i++) {
         ha_real step = x[i] - r->before[i];
-        if (x[i] > l->range || x[i] < -l->range) ha_stop(r, HA_RANGE);
-        if (step > most || step < -most) ha_stop(r, HA_SPEED);
+        if (!(x[i] <= l->range && x[i] >= -l->range)) ha_stop(r, HA_RANGE); /* NaN fails both comparisons */
+        if (!(step <= most && step >= -most)) ha_stop(r, HA_SPEED);
     }
     if (r->phase == HA_RUNNING && r->gain == 0) ha_begin(r, x);
     if (r->phase == HA_RUNNING) ha_watch(r, l, x);
@@ -246,15 +251,11 @@ static inline void ha_tick(ha_runner *r, const ha_limits *l, const ha_real *x)
         process_step(&r->process, from, f);
         r->gain += r->phase == HA_RUNNING ? rise : -fall;
         if (r->gain > 1) r->gain = 1;
-        if (r->gain <= 0) {
-            r->gain = 0;
-            r->phase = HA_READY;
-            r->rested = 0;
-        }
         for (i = 0; i < PROCESS_CHANNELS; i++) {
             ha_real force = -r->gain * f[i]; /* the devices feel -f */
             r->force[i] = force > l->cap ? l->cap : force < -l->cap ? -l->cap : force;
         }
+        if (r->gain <= 0) ha_rest(r);
     }
     for (i = 0; i < PROCESS_CHANNELS; i++) {
         r->older[i] = r->before[i];

@@ -381,7 +381,7 @@ def test_a_hostile_name_stays_inside_the_comment(tmp_path):
         (["{gains}", "--out", "{place}"], "is a folder"),
         (["{gains}", "--seed", "1"], "unknown option --seed"),
         (["{place}/missing.json"], "No such file"),
-        (["{place}/none.json"], "--process exports"),
+        (["{place}/none.json"], "export its process with --process"),
     ],
 )
 def test_bad_input_is_one_line(place, options, message):

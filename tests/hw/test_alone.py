@@ -16,22 +16,29 @@ GCC = shutil.which("gcc")
 pytestmark = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_alone.h is not compiled here")
 FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
 T, MASS, COUNT = 1e-3, 0.08, 2e-5
-READY, RUNNING = 1, 3
-ASKED, SIGN, DEAD, SCALE = 1, 6, 7, 8
-#: A spring of 300 N/m with a little damping replaces the exported file. The board's force is -f.
+READY, RUNNING, STOPPING = 1, 3, 4
+ASKED, RANGE, SIGN, DEAD, SCALE, LIMITS = 1, 4, 6, 7, 8, 9
+#: A spring of 300 N/m with a little damping and an outside force replace the exported file. The board's force is -f.
 SOURCE = """
 #define PROCESS_CHANNELS 2
 #define PROCESS_PERIOD 1e-3
 typedef struct { REAL last[2]; } process_state;
+static double pushed;
 static inline void process_reset(process_state *s) { s->last[0] = s->last[1] = 0; }
 static inline void process_step(process_state *s, const REAL *x, REAL *f) {
-    for (int i = 0; i < 2; i++) { f[i] = 300 * x[i] + (x[i] - s->last[i]) / (REAL)1e-3; s->last[i] = x[i]; }
+    for (int i = 0; i < 2; i++) {
+        f[i] = 300 * x[i] + (x[i] - s->last[i]) / (REAL)1e-3 - (REAL)pushed;
+        s->last[i] = x[i];
+    }
 }
 #define HA_REAL REAL
 #include "haptic_alone.h"
 static ha_runner runner;
-static const ha_limits limits = {0.1, 1.0, 4.0, 2e-5, 0.08};
-void home(void) { ha_home(&runner); }
+static const ha_limits right = {0.1, 1.0, 4.0, 2e-5, 0.08};
+static ha_limits limits;
+void home(void) { limits = right; pushed = 0; ha_home(&runner); }
+void limit(int at, double to) { (at == 0 ? &limits.range : at == 1 ? &limits.speed : &limits.cap)[0] = (REAL)to; }
+void push(double force) { pushed = force; }
 void arm(void) { ha_arm(&runner); }
 void stop(int cause) { ha_stop(&runner, (uint8_t)cause); }
 int tick(const double *x, double *force) {
@@ -164,3 +171,59 @@ def test_a_fast_handle_cuts_the_ramp_short(board):
     bench.tick()
     assert bench.tick() == (READY, ASKED)  # the first cause stays
     assert list(bench.force) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("stopping", [False, True])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_one_invalid_position_drops_the_force(board, wrong, stopping):
+    bench = Bench(board)
+    assert bench.armed() == (RUNNING, 0)
+    bench.hand = 1.0
+    for _ in range(300):
+        bench.tick()
+    if stopping:
+        board.stop(ASKED)
+        bench.tick()
+    assert any(bench.force)
+    bench.seen[1] = wrong
+    told = board.tick(bench.seen, bench.force)
+    assert (told % 16, told // 16) == (READY, ASKED if stopping else RANGE)
+    assert list(bench.force) == [0.0, 0.0]
+    bench.hand, bench.v = 0.0, [0.0, 0.0]
+    assert bench.armed() == (RUNNING, 0)  # nothing invalid is left in the state
+
+
+def test_an_invalid_position_at_rest_is_forgotten(board):
+    """The noise of the sensors is measured anew: a moving handle is not dead after 0.5 s under a force."""
+    bench = Bench(board)
+    bench.seen[:] = 0.0, np.nan
+    board.tick(bench.seen, bench.force)
+    assert bench.armed() == (RUNNING, 0)
+    for k in range(1200):
+        bench.hand = 1.5 * min(1, k / 500) * (1 + 0.02 * np.sin(2 * np.pi * 9 * T * k))
+        assert bench.tick() == (RUNNING, 0)
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
+@pytest.mark.parametrize("limit", range(3), ids=["range", "speed", "cap"])
+def test_limits_that_limit_nothing_are_not_armed(board, limit, value):
+    bench = Bench(board)
+    for _ in range(150):
+        bench.tick()
+    board.limit(limit, ctypes.c_double(value))
+    board.arm()
+    assert bench.tick() == (READY, LIMITS)
+    assert list(bench.force) == [0.0, 0.0]
+
+
+def test_separate_presses_of_a_still_handle_never_add(board):
+    """The force ramps out after 0.5 s without a motion under a force; a pause without a force ends this time."""
+    bench = Bench(board)
+    assert bench.armed() == (RUNNING, 0)
+    for force, ticks in [(2.0, 400), (0.0, 10)] * 4:
+        board.push(ctypes.c_double(force))
+        for _ in range(ticks):
+            assert board.tick(bench.seen, bench.force) == RUNNING
+    board.push(ctypes.c_double(2.0))
+    states = {board.tick(bench.seen, bench.force) for _ in range(700)}
+    assert states == {RUNNING, STOPPING + 16 * DEAD, READY + 16 * DEAD}
