@@ -13,8 +13,6 @@ from functools import partial
 from itertools import count
 from typing import NamedTuple
 
-import numpy as np
-
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.api import COUPLING, bare
@@ -249,7 +247,7 @@ class Rehearsal:
         """Return the time [s] from `seconds` after arming until all motors stay at zero, or None if they never do."""
         assert self.armed_us is not None
         begin = self.armed_us + 1e6 * seconds
-        driving = [m.t_us for m in self.moments if np.any(m.applied)]
+        driving = [m.t_us for m in self.moments if m.applied.any()]
         last = max(driving, default=0)
         if last < begin:
             return 0.0

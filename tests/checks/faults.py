@@ -404,8 +404,8 @@ def _rehearse_case(
     timed = case.within is not None and rehearsal.armed_us is not None
     to_zero = rehearsal.zero_after(_WHEN) if timed else None
     zero_ms = None if to_zero is None else 1e3 * to_zero
-    wrong = tuple(_wrong(case, rehearsal, zero_ms))
-    force = max((float(np.abs(m.applied).max()) for m in rehearsal.moments), default=0.0)
+    force = float(np.abs([m.applied for m in rehearsal.moments]).max(initial=0.0))
+    wrong = tuple(_wrong(case, rehearsal, zero_ms, force))
     told = case.name, str(session.stage), session.cause, force, emulator.plant.fastest
     return rehearsal, _FaultOutcome(*told, zero_ms, case.within, wrong)
 
@@ -422,8 +422,8 @@ def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) 
     return plan
 
 
-def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
-    """Return what went wrong in a case."""
+def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None, force: float) -> list[str]:
+    """Return what went wrong in a case in which the motors had at most `force` [N]."""
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:
         wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")
@@ -437,7 +437,7 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str
     if session.stage != Stage.ARMED and np.any(rehearsal.moments[-1].applied):
         wrong.append("a motor still has a force")
     cap = max(session.limits.cap)
-    if any(np.abs(m.applied).max() > cap for m in rehearsal.moments):
+    if force > cap:
         wrong.append(f"a motor had more than {cap:g} N")
     if session.stage in ENDED:
         session.arm(session.now + 1)
