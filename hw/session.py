@@ -157,7 +157,8 @@ class Session:
         """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
         After the ramp the motors are tested once more, if the settings request encoder tests. A session that was armed
-        ends as stopped if this test is impossible: the user `let_go` of the deadman, or no force acts at the moment.
+        ends as stopped if this test is impossible: the user `let_go` of the deadman, or no force acts at the moment. A
+        session that was never armed ends as stopped, too.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -170,7 +171,9 @@ class Session:
         if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
             self._ramp_out(after, cause)
             return ()
-        if self.armings and self.settings.test_encoders and not let_go:
+        if not self.armings:
+            after, cause = Stage.STOPPED, f"{cause}, before any force acted"
+        elif self.settings.test_encoders and not let_go:
             after, cause = Stage.STOPPED, f"{cause}, before the motors of the last arming were tested at its end"
         return self._end(after, cause, wire.Reason.DONE)
 

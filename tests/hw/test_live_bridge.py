@@ -187,7 +187,7 @@ def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
 
     sent = []
     session, live = run(emulator, scenario, lambda ages: rungs, watch=watch)
-    assert (session.stage, session.cause) == (Stage.FINISHED, name)
+    assert (session.stage, session.cause) == (Stage.STOPPED, f"{name}, before any force acted")
     assert live.signals == [getattr(signal, name)]
 
 

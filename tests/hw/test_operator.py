@@ -77,3 +77,13 @@ def test_other_keys_do_nothing(scenario, rungs, key):
     session = rehearsal.run(0.5)
     assert Operator(False, 1.0).press(key, session, session.now) == ()
     assert session.stage == Stage.DISARMED
+
+
+@pytest.mark.parametrize("encoders", [True, False])
+def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
+    settings = LinkSettings(measure=100, test_encoders=encoders)
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False)
+    assert rehearsal.run(1.0).stage == Stage.DISARMED
+    Operator(False, 5.0).press("q", session, session.now)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")
