@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from haptic_loop import _leave
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED, did_you_mean
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.units import in_unit
@@ -101,9 +102,11 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     try:
+        if signal.getsignal(signal.SIGINT) is _leave:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         # The matrices are small: more BLAS threads only wait for each other and change the last digits.
         with threadpool_limits(1, user_api="blas"), one_command():
-            code = main(sys.argv[1:] if argv is None else argv)
+            code = _run(main, sys.argv[1:] if argv is None else argv)
     except (InputError, SingularLoop) as error:
         code = _say(f"error: {error}", BAD_INPUT)
     except DesignFailed as error:
@@ -130,7 +133,22 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         nobody_reads()
     except OSError as error:
         code = _cannot(error)
+    # If Ctrl-C ended a call of exec(), such as that of dataclass, Python would end by sending itself SIGINT. A later
+    # call makes it forget that.
+    exec("")
     sys.exit(code)
+
+
+def _run(main: Callable[[list[str]], int], argv: list[str]) -> int:
+    """Run the command. An error raised from KeyboardInterrupt, as by a compiled module at its import, is Ctrl-C."""
+    try:
+        return main(argv)
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause := cause.__cause__:
+            if isinstance(cause, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+        raise
 
 
 def _say(message: str, code: int) -> int:

@@ -22,12 +22,14 @@ start quickly.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # typing takes time to import, in which Ctrl-C prints a traceback
 if TYPE_CHECKING:
+    from typing import Any, NoReturn
+
     from haptic_loop.controller.coupling import NoCoupling, SpringDamper
     from haptic_loop.controller.environment import RIGID_WALL, Network, Spring, Wall
     from haptic_loop.controller.loop import Loop
@@ -79,9 +81,9 @@ _HOMES = {
 
 __all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
-_ROOT = Path(__file__).parents[1]
-if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "controller").is_dir():
-    __path__.append(str(_ROOT))  # in a checkout, haptic_loop.sim is the top-level folder sim
+_ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+if os.path.isfile(os.path.join(_ROOT, "pyproject.toml")) and os.path.isdir(os.path.join(_ROOT, "controller")):
+    __path__.append(_ROOT)  # in a checkout, haptic_loop.sim is the top-level folder sim
 
 
 def _command_starts() -> bool:
@@ -94,10 +96,20 @@ def _command_starts() -> bool:
     return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
 
 
+def _leave(number: int, frame: Any) -> NoReturn:
+    """Leave at Ctrl-C before the command begins, when there is nothing to clean up."""
+    try:
+        os.write(2, b"interrupted\n")
+    finally:
+        os._exit(130)
+
+
 # Commands do not use the OpenGL backend that MUJOCO_GL names; sim.view opens a context itself. Importing the backend
 # takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.main.execute installs it again
+        signal.signal(signal.SIGINT, _leave)
 
 
 def __getattr__(name: str) -> Any:

@@ -137,3 +137,27 @@ def test_a_full_standard_output_is_one_line(tmp_path):
         done = subprocess.run(command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr == "error: standard output: No space left on device\n"
+
+
+INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nfor _ in range(1000): pass\nraise SystemExit(5)\n"
+IN_EXEC = "exec('raise KeyboardInterrupt')\n"  # as dataclass does
+IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise ImportError('failed') from error\n"
+
+
+@pytest.mark.parametrize("module", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run", "cli"])
+def test_ctrl_c_while_a_command_is_imported(module, tmp_path):
+    assert interrupted_at(module, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize("code", [INTERRUPT, IN_EXEC, IN_C], ids=["signal", "exec", "compiled"])
+def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
+    assert interrupted_at("sim.run", "mujoco", code, tmp_path) == (130, "interrupted\n")
+
+
+def interrupted_at(command, module, code, folder):
+    """Run a command that imports a file with this code in the place of the module."""
+    (folder / f"{module}.py").write_text(code)
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    words = [sys.executable, "-m", command]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
