@@ -211,9 +211,15 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
 
 
 def _ports(args: argparse.Namespace) -> list[str]:
-    """Return the paths of --port; empty if the host gives the clock, because then no serial port is open."""
-    port: str = args.port or ""
-    return [] if host_clocked(args) else port.split(",")
+    """Return the paths of --port; empty if the host gives the clock, because then no serial port is open.
+
+    Raises:
+        InputError: A path is empty.
+    """
+    paths: list[str] = [] if host_clocked(args) else (args.port or "").split(",")
+    if args.port and "" in paths:
+        raise InputError(f"--port is {args.port!r}: path {paths.index('') + 1} of {len(paths)} is empty")
+    return paths
 
 
 def host_clocked(args: argparse.Namespace) -> bool:

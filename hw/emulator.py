@@ -127,7 +127,7 @@ class FaultInjection:
             require(f"{kind} ({what})", number, low, high, "")
             require("START", begins or 0.0, 0.0, _FOREVER, "s")
             require("DURATION", lasts, 1e-6, _FOREVER, "s")
-            if kind == "leap" and number != int(number):
+            if kind in ("leap", "late") and number != int(number):
                 raise ValueError(f"VALUE is {number:g}, expected a whole number of ticks")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
@@ -395,7 +395,7 @@ class Emulator:
             case "scale":
                 return lambda n: round(fault.value * n)
             case "late":
-                earlier = deque([now], maxlen=1 + round(fault.value))
+                earlier = deque([now], maxlen=1 + int(fault.value))
                 return lambda n: (earlier.append(n), earlier[0])[1]
             case "noise":
                 draw = np.random.default_rng(fault.axis)

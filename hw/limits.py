@@ -104,7 +104,7 @@ class SafetyLimits:
         if self.continuous and len(self.continuous) != len(self.cap):
             raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
         for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
-            require(f"continuous #{i}", most, 1e-3 * r, cap, "N")
+            require(f"continuous #{i} (--continuous-force)", most, 1e-3 * r, cap, "N")
 
     def shape(
         self,
