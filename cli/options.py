@@ -231,7 +231,7 @@ class Parser(argparse.ArgumentParser):
         seed: bool = True,
     ) -> None:
         """Add the options for files, and --seed unless nothing is drawn at random."""
-        output = self.add_argument_group("output", "the folder of a FILE that you name must exist")
+        output = self.add_argument_group("output")
         if picture:
             output.add_argument("--no-plot", action="store_true", help="write no picture")
         self.add_json(output)

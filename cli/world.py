@@ -177,7 +177,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     files = [labelled.save_npz(out / "trace.npz"), labelled.save_csv(out / "trace.csv")]
     written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
-    if not args.no_plot and trace.t.size > 1:
+    if render.is_drawn(args, out / "figure.png", trace.t.size > 1):
         from haptic_loop.sim.plots import Contacts, draw_run, save
 
         around = Contacts(scenario.environment.contacts)

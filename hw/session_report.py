@@ -255,15 +255,16 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
     """Write the trace (if forces acted), its picture and the report."""
-    files = []
-    if len(recorder):
+    files, acted = [], len(recorder) > 0
+    for name, written in (("trace.npz", acted), ("trace.csv", acted), ("figure.png", acted and plot)):
+        if not written:
+            remove(out / name)  # the file of an earlier session
+    if acted:
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
         names = session.scenario.channel_names
         result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay}, names)
         files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
-        if not plot:
-            remove(out / "figure.png")  # the picture of an earlier session
-        else:
+        if plot:
             from haptic_loop.sim.plots import draw_run, save
 
             title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"

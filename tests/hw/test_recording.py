@@ -301,6 +301,16 @@ def test_the_report_is_json_and_names_its_end(trace):
     assert decisive(report)["certified"]
 
 
+def test_a_session_without_forces_keeps_no_older_files(scenario, rungs, tmp_path):
+    recorder, old = Recorder(2), [tmp_path / name for name in ("trace.npz", "trace.csv", "figure.png")]
+    for file in old:
+        file.touch()
+    session = rehearsal_of(scenario, rungs, recorder=recorder).session
+    session.stop("enough", session.now)
+    files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), plot=True)
+    assert files == [*tmp_path.iterdir()] == [tmp_path / "report.json"]
+
+
 def test_results_of_nothing():
     recorder = Recorder(2)
     assert recorder.link()["x"].shape == (0, 2)

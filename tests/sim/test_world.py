@@ -326,11 +326,13 @@ def command(capsys, *words: str) -> tuple[int, str]:
 
 
 def test_a_run_reports_the_account(tmp_path, capsys):
+    (tmp_path / "figure.png").touch()  # the picture of an earlier run
     code, shown = command(
         capsys, "run", "--scenario", "world-ball", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)
     )
     report = json.loads((tmp_path / "report.json").read_text())
     assert code == 0
+    assert not (tmp_path / "figure.png").exists()
     assert "The shell acted on 0 of 200 ticks" in " ".join(shown.split())
     assert report["guaranteed"]
     assert report["world"]["ticks"] == 200
