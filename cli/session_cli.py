@@ -216,9 +216,10 @@ def _ports(args: argparse.Namespace) -> list[str]:
     Raises:
         InputError: A path is empty.
     """
-    paths: list[str] = [] if host_clocked(args) else (args.port or "").split(",")
-    if args.port and "" in paths:
-        raise InputError(f"--port is {args.port!r}: path {paths.index('') + 1} of {len(paths)} is empty")
+    port: str = args.port or ""
+    paths = [] if host_clocked(args) else port.split(",")
+    if port and "" in paths:
+        raise InputError(f"--port is {port!r}: path {paths.index('') + 1} of {len(paths)} is empty")
     return paths
 
 

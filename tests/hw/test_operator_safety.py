@@ -196,7 +196,7 @@ def test_a_second_of_clipped_forces_counts(scenario, rungs, cut, stage):
         (["--force-cap", "13"], "--force-cap is 13, allowed are 0.05 to 12"),
         (["--max-speed", "0"], "--max-speed is 0, allowed are 0.001 to 2.5"),
         (["--continuous-force", "1,2,3"], "--continuous-force has 3 entries"),
-        (["--continuous-force", "5"], "continuous #1 is 5"),
+        (["--continuous-force", "5"], "continuous #1 (--continuous-force) is 5"),
         (["--thermal-time", "nan"], "--thermal-time is nan"),
         (["--port", "/nowhere", "--deadman", "key"], "--deadman key needs a terminal"),
     ],
