@@ -550,7 +550,8 @@ class EncoderTest:
     this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion in shape
     (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder gives the
     wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
-    comes later than expected shows a hidden delay, because friction and hands advance its phase.
+    comes later than expected shows a hidden delay, because friction and hands advance its phase. Dry friction makes
+    weak motions small, so only the strongest force finds a motion too small.
 
     At the end of a session (`closing`) unknown hands may hold the handles, except in rehearsals (`held`). A verdict
     then needs two blocks in a row that agree, and blocks are repeated until the person lets go, at most for 5 s. A
@@ -681,9 +682,13 @@ class EncoderTest:
         if follows[axis] and size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
+        small = size[axis] < 1 / _TEST_RATIO
+        if follows[axis] and small and self._block < _BLOCKS - 1:
+            return False  # dry friction hides much of a weak motion; a stronger force overcomes it
         if follows[axis] and not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
-            raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong")
+            brake = ", or dry friction brakes it" if small else ""
+            raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong{brake}")
         if follows[axis] and others:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
         if follows[axis] and late > _LATE + self._at_once:

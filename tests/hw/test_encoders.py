@@ -165,6 +165,32 @@ def test_motions_off_by_two_are_refused(scale, refused):
         played(arming_test(), masses(scale=scale))
 
 
+def rubbing(friction, mass=0.25, q=1e-6):
+    """Return a `motion` of two free masses with dry friction [N] that sticks: each tick, friction stops or brakes."""
+    x, v = np.zeros(2), np.zeros(2)
+
+    def motion(k, applied):
+        if k:
+            v[:] += applied[-1] * STEP / mass * T
+            v[:] = np.sign(v) * np.maximum(np.abs(v) - friction / mass * T, 0.0)
+            x[:] += v * T
+        return tuple(round(one / q) for one in x)
+
+    return motion
+
+
+@pytest.mark.parametrize(("friction", "closing"), [(0.17, False), (0.34, False), (0.34, True)])
+def test_stronger_forces_overcome_dry_friction(friction, closing):
+    """A friction of 68 % of a test force leaves 0.4 of its motion, which is no wrong mass."""
+    played(arming_test(closing=closing), rubbing(friction))
+
+
+def test_friction_hides_no_wrong_sign():
+    rubs = rubbing(0.17)
+    with pytest.raises(SafetyStop, match="axis 1 has the wrong sign"):
+        played(arming_test(), lambda k, applied: tuple(-n for n in rubs(k, applied)))
+
+
 REACH = [lambda t: 0.1 * min(t / 0.4, 1.0) ** 3 * (10 - 15 * min(t / 0.4, 1.0) + 6 * min(t / 0.4, 1.0) ** 2)]
 HANDS = [lambda t, f=f, a=a: a * np.sin(2 * np.pi * f * t + f) for f, a in ((0.5, 0.1), (1.0, 0.05), (2.0, 0.05))]
 
