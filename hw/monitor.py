@@ -551,7 +551,8 @@ class EncoderTest:
     (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder gives the
     wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
     comes later than expected shows a hidden delay, because friction and hands advance its phase. Dry friction makes
-    weak motions small, so only the strongest force finds a motion too small.
+    weak motions small, so only the strongest force finds a motion too small. Coarse counts leave the delay uncertain,
+    so a stronger force follows until its error is below the limit, or the delay is not tested (`remarks`).
 
     At the end of a session (`closing`) unknown hands may hold the handles, except in rehearsals (`held`). A verdict
     then needs two blocks in a row that agree, and blocks are repeated until the person lets go, at most for 5 s. A
@@ -578,6 +579,7 @@ class EncoderTest:
         self._at_once, self._strongest = at_once, [min(cap, _TEST_FORCE * limits.lever) for cap in limits.cap]
         self._T, self._units, self._still, self._expected, self._closing = T, units, still, expected, closing
         self._axis, self._last = -1, None
+        self.remarks: list[str] = []  # what the test could not judge
         self._unknown_hands = closing and not expected.held
         self._blocks = _BLOCKS + round(_LETTING_GO / (4 * _TEST_HALF)) * self._unknown_hands
         self._next_axis()
@@ -623,11 +625,15 @@ class EncoderTest:
         """Return what the person must do so that the axis can pass its test, or None."""
         return f"let go of the handle of axis {self._axis + 1}" if self._block >= _BLOCKS else None
 
-    def _compare(self) -> tuple[Array, Array, float, float, bool]:
+    def _compare(self) -> tuple[Array, Array, float, float, float, bool]:
         """Compare all motions with the expected one.
 
-        Returns size and fit (m,) of all motions, and for the tested axis the size at any phase, the delay [ticks], and
-        whether its motion has the shape of the expected handle but not that of a handle in a heavy hand.
+        Returns size and fit (m,) of all motions, and for the tested axis the size at any phase, the delay and its
+        error [ticks], and whether its motion has the shape of the expected handle but not that of one in a heavy hand.
+
+        The delay is -a/s in the fit s x + a x' of the expected motion x. The row p of the pseudoinverse that yields a
+        turns rounding errors of q/sqrt(12) into a standard error |p| q/sqrt(12)/|s|. The stated error |p| q/|s| is 3.5
+        of them; 1 % of 4000 simulated blocks exceed 3.1. Noise counts by its range, 3.5 standard deviations or more.
         """
         t, expected, loaded, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
@@ -641,11 +647,14 @@ class EncoderTest:
         own = np.maximum((moved**2).sum(axis=0) - rounding, rounding)
         fit = size**2 * power / own
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
-        same, ahead = np.linalg.lstsq(np.stack([wanted, rate], axis=1), moved[:, self._axis], rcond=None)[0]
+        inverse = np.linalg.pinv(np.stack([wanted, rate], axis=1))
+        same, ahead = inverse @ moved[:, self._axis]
         late = -float(ahead / same) if same else 0.0  # [ticks]
+        noise = self._units.encoder_step[self._axis] * max(1.0, self._still[self._axis] / 2)  # [m]
+        doubt = float(np.linalg.norm(inverse[1]) * noise / abs(same)) if same else math.inf  # [ticks]
         alike = (heavy @ moved[:, self._axis]) ** 2 / ((heavy @ heavy or 1.0) * own[self._axis])
         swing = float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power))
-        return size, fit, swing, late, bool(fit[self._axis] > _FIT > alike)
+        return size, fit, swing, late, doubt, bool(fit[self._axis] > _FIT > alike)
 
     def _counted(self, i: int) -> float:
         """Return the range of encoder i in this block [counts]."""
@@ -669,7 +678,8 @@ class EncoderTest:
 
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
-        axis, name, (size, fit, swing, late, free) = self._axis, f"axis {self._axis + 1}", self._compare()
+        weak, most = self._block < _BLOCKS - 1, _LATE + self._at_once
+        axis, name, (size, fit, swing, late, doubt, free) = self._axis, f"axis {self._axis + 1}", self._compare()
         moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
@@ -677,13 +687,13 @@ class EncoderTest:
         self._swings = self._swings or (moves[axis] and swing > _ALIVE)
         if others and not moves[axis]:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
-        if held and follows[axis] and (abs(size[axis]) < 1 / _TEST_RATIO or late > _LATE + self._at_once):
+        if held and follows[axis] and (abs(size[axis]) < 1 / _TEST_RATIO or (doubt < _LATE and late > most)):
             return False
         if follows[axis] and size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
         small = size[axis] < 1 / _TEST_RATIO
-        if follows[axis] and small and self._block < _BLOCKS - 1:
+        if follows[axis] and small and weak:
             return False  # dry friction hides much of a weak motion; a stronger force overcomes it
         if follows[axis] and not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
@@ -691,11 +701,18 @@ class EncoderTest:
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong{brake}")
         if follows[axis] and others:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
-        if follows[axis] and late > _LATE + self._at_once:
+        if not follows[axis]:
+            return False
+        if weak and (doubt >= _LATE or abs(late - most) < doubt):
+            return False  # a larger motion shows the delay better
+        if doubt >= _LATE:
+            coarse = f"counts of {1e3 * self._units.encoder_step[axis]:.3g} mm show it to {doubt:.1f} ticks only"
+            self.remarks.append(f"a hidden delay of {name} is not tested: {coarse}")
+        elif late > most:
             raise SafetyStop(
                 f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
             )
-        return follows[axis]
+        return True
 
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""

@@ -319,6 +319,8 @@ class Session:
             self._ramp_out(Stage.STOPPED, dead)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
+            for remark in self.drive.remarks:
+                self._log(remark)
         if self.stage == Stage.DISARMING and self.drive.ended:
             return self._ramped_out()
         if (request := self.drive.request) and request != self.request:

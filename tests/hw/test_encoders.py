@@ -53,7 +53,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
     assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
 
 
-@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.13), (1e-4, 0.25)])
+@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.13), (1e-4, 0.5)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     """Encoders of 1 to 100 um answer a force of at most `most` [N], held by the scenario's hands or free."""
@@ -62,7 +62,7 @@ def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))
     devices = tuple(replace(d, encoder_step=step) for d in still.device)
     session.record = lambda row: forces.append(row.test or (0.0, 0.0))
-    Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.8)
+    Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(1.1)
     assert session.stage == Stage.ARMED
     assert 0 < np.abs(forces).max() <= most
 
@@ -100,8 +100,9 @@ def free_pair(mass=0.25):
     return nobody(load().replace(device=[device] * 2))
 
 
-def arming_test(cap=12.0, closing=False):
-    return EncoderTest(SafetyLimits((cap, cap)), T, UNITS, (1, 1), Expected(free_pair(), False), closing=closing)
+def arming_test(cap=12.0, closing=False, q=1e-6):
+    units = Units((q, q), (STEP, STEP), (10**6, 10**6))
+    return EncoderTest(SafetyLimits((cap, cap)), T, units, (1, 1), Expected(free_pair(), False), closing=closing)
 
 
 def test_axes_are_tested_one_after_another():
@@ -189,6 +190,29 @@ def test_friction_hides_no_wrong_sign():
     rubs = rubbing(0.17)
     with pytest.raises(SafetyStop, match="axis 1 has the wrong sign"):
         played(arming_test(), lambda k, applied: tuple(-n for n in rubs(k, applied)))
+
+
+def later(motion, ticks):
+    """Return `motion` read `ticks` ticks late."""
+    return lambda k, applied: motion(max(0, k - ticks), applied[: max(0, k - ticks)])
+
+
+@pytest.mark.parametrize("q", [5e-5, 1e-4, 2e-4, 3e-4])
+def test_coarse_counts_are_no_hidden_delay(q):
+    """At 1 N the free mass swings by 9 counts of 0.1 mm, whose rounding shifts its delay by at most 0.72 ticks.
+
+    That is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks; coarser ones are named instead.
+    """
+    test = arming_test(q=q)
+    played(test, masses(q=q))
+    played(arming_test(closing=True, q=q), masses(q=q))
+    if q <= 1e-4:
+        assert not test.remarks
+        with pytest.raises(SafetyStop, match=r"axis 1 answers .* ticks later"):
+            played(arming_test(q=q), later(masses(q=q), 2))
+    else:
+        assert all(f"delay of axis {i} is not tested" in told for i, told in enumerate(test.remarks, 1))
+        assert len(test.remarks) == 2
 
 
 REACH = [lambda t: 0.1 * min(t / 0.4, 1.0) ** 3 * (10 - 15 * min(t / 0.4, 1.0) + 6 * min(t / 0.4, 1.0) ** 2)]
