@@ -1,4 +1,4 @@
-"""Devices with several axes: matrix levels Delta_i in the loop, its conditions, proofs, designs and limiter."""
+"""Test devices with several axes: matrix levels Delta_i in loops, conditions, proofs, designs and limiter."""
 
 from fractions import Fraction
 from itertools import pairwise
@@ -95,7 +95,7 @@ def test_impossible_axes_are_refused(fields: dict[str, object], words: list[str]
 
 
 class Plane(Networks):
-    """Springs, dampers and masses of m contact axes by their matrices."""
+    """An environment of m contact axes that is given by its matrices of masses, dampers and springs."""
 
     walls = ()
 
@@ -177,12 +177,12 @@ def hermitian_part(M: np.ndarray) -> np.ndarray:
 
 
 def window(weights: list[float]) -> np.ndarray:
-    """|sum of w_k z^-k|^2 at Z."""
+    """Return |sum of w_k z^-k|^2 at Z."""
     return np.abs(sum(w * Z ** -float(k) for k, w in enumerate(weights))) ** 2
 
 
 def of_devices(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """A number per device and frequency times Delta_i^-1, (k, 4, 4)."""
+    """Return a number per device and frequency times Delta_i^-1, (k, 4, 4)."""
     out = np.zeros((Z.size, 4, 4))
     for own, values, level in zip(LOOP.devices, (first, second), LEVELS, strict=True):
         out[:, own, own] = values[:, None, None] * np.linalg.inv(level)
@@ -190,7 +190,7 @@ def of_devices(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def least_multiple(least: np.ndarray, of: np.ndarray) -> float:
-    """The least s with s of >= least at every frequency."""
+    """Return the least s with s `of` >= `least` at every frequency."""
     return max(np.linalg.eigvals(np.linalg.solve(of, least)).real.max(axis=1))
 
 
@@ -221,7 +221,7 @@ def test_any_environment_with_switching_takes_levels() -> None:
 
 
 def test_a_multiplier_stays_below_full_levels() -> None:
-    """With psi = 1: E-hat + Phi passive, V-hat of level (Phi^-1 - s^-1 Delta^-1)^-1, in the matrices as printed."""
+    """With psi = 1 E-hat + Phi is passive, and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1, as printed."""
     soft = Plane(4, MASS.matrices[0], MASS.matrices[1], 0.25 * SPRINGS)
     loop = msgspec.structs.replace(LOOP, environment=soft, psi=(1, 1, 0, 0))
     design = design_by_kind(loop, "moving-average")
@@ -275,10 +275,10 @@ def test_limiter_has_one_weight_per_device() -> None:
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment", LimitedForces()])
 def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> None:
-    """A proof exists just above the requirement and none just below."""
+    """A proof exists above the requirement; 2 % below it, a sweep of an environment condition refuses."""
     least = required_damping(LOOP, BUILT, condition).ratio
     enough = scaled(LOOP, float(f"{1.02 * least:.6g}"))
-    if not isinstance(condition, str):  # its lag is a share of the damping
+    if not isinstance(condition, str):  # the limiter's rho is a share of the damping
         enough, condition = LOOP, condition
     proof = prove(enough, BUILT, condition)
     assert proof.proof == "rational"
@@ -287,7 +287,7 @@ def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> Non
 
 
 def test_rigid_wall_with_a_stiffness_matrix() -> None:
-    """s = (theta + 1/2) T times the largest eigenvalue of Delta^-1/2 K Delta^-1/2."""
+    """The ratio s is (theta + 1/2) T times the largest eigenvalue of Delta^-1/2 K Delta^-1/2."""
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
     loop = Loop(1e-3, (2, 2), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1])
@@ -338,7 +338,7 @@ def turned(loop: Loop, Q: np.ndarray) -> Loop:
 
 @pytest.mark.parametrize("turns", [40, pytest.param(200, marks=pytest.mark.validate)])
 def test_turning_the_axes_changes_nothing(turns: int) -> None:
-    """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i for each device."""
+    """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i per device keeps each requirement."""
     rng = np.random.default_rng(3)
     asked = [
         (LOOP, "this-environment", None),
@@ -395,9 +395,9 @@ KNOWN = _with(environment=MASS, known_devices=(BOUNDS,) * 4)
 
 
 def period_forms(share: float, beta: np.ndarray) -> np.ndarray:
-    """L of Theorem B with full levels, on (dx, v, v+) (12, 12): the least integral of v'C0 v + c2 v'^2.
+    """Return L of Theorem B with full levels, on (dx, v, v+) (12, 12): the least integral of v'C0 v + c2 v'^2.
 
-    With d = tanh, C0 = C - beta^2 P/4 and functions of the matrix K = (C0/c2)^(1/2) from scipy.
+    C0 = share Delta_i - beta^2 P/4; scipy computes K = (C0/c2)^(1/2) and tanh(K T/2).
     """
     m, P = 4, BOUNDS.transmission_stiffness_max**2 / BOUNDS.transmission_damping_min
     out, one = np.zeros((3 * m, 3 * m)), np.eye(2)
@@ -469,7 +469,7 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
     ],
 )
 def test_full_levels_meet_walls(known: bool, condition: str) -> None:
-    """A spring-damper of full levels before a wall is proved; it uses all of the damping, or is the stiffest."""
+    """The spring-damper before a wall is proved; it uses 99 % of the damping or has the largest stiffness."""
     coordinates = ("a.x", "a.y")
     wall = Wall(("a", "ground"), 1000.0, 1.0, normal=(0.6, 0.8))
     springs = Spring(("a.x", "ground"), 300.0, 0.5), Spring(("a.y", "ground"), 100.0, 0.5)
@@ -494,7 +494,7 @@ def test_full_levels_take_ranges() -> None:
 
 
 def test_turned_filters_keep_a_symmetric_compliance() -> None:
-    """A general V in other coordinates: Q V Q' to its digits, and V(1) is symmetric exactly."""
+    """A general V in other coordinates equals Q V Q' to its digits, and V(1) is exactly symmetric."""
     V = Lti.diag(Lti([[0.37]], [[1.0]], [[2.1e-4]], [[6e-4]], 1e-3), Lti([[-0.2]], [[0.7]], [[1.3e-4]], [[9e-4]], 1e-3))
     after, z = Compliance(V).turned(TURN), np.exp(1j * np.array([0.1, 1.0, 3.0]))
     np.testing.assert_allclose(after.V.at(z), TURN @ V.at(z) @ TURN.T, rtol=1e-5, atol=1e-9)
@@ -557,9 +557,9 @@ def test_a_vector_has_one_limit() -> None:
 
 
 def most_energy(share: float, seed: int, count: int = 200, ticks: int = 1500) -> np.ndarray:
-    """The largest energy of lossless hands over that at the start, (count,); their devices have share Delta.
+    """Return the largest energy of lossless hands relative to that at the start, (count,).
 
-    M x'' + share Delta x' + K x = -f with full random M and K, held forces, and the matrix exponential of a period.
+    M x'' + share Delta x' + K x = -f with full random M and K is sampled with held forces by the matrix exponential.
     """
     rng, m, T = np.random.default_rng(seed), 4, LOOP.T
     law = LOOP.law(BUILT, np.repeat([0.5, 0.4], 2), LOOP.per_channel((7.0, 11.0)), LOOP.devices)
@@ -590,13 +590,13 @@ def most_energy(share: float, seed: int, count: int = 200, ticks: int = 1500) ->
 
 @pytest.mark.slow
 def test_limited_hands_in_space_get_no_energy() -> None:
-    """Of 200 lossless hands none gains energy at 1.02 of the requirement 0.518330, and some do at 0.6 of it."""
+    """No lossless hand of 200 gains energy at 1.02 of the requirement 0.518330; at 0.6 of it five or more do."""
     assert (most_energy(1.02 * 0.518330, 1) <= 1 + 1e-9).all()
     assert (most_energy(0.6 * 0.518330, 1) > 1.001).sum() >= 5
 
 
 def test_energy_budget_of_a_level() -> None:
-    """It reserves r(f) = T f' Delta^-1 f/4 for a force, and keeps nothing else from it."""
+    """The budget reserves r(f) = T f' Delta^-1 f/4 for a force, and does not scale a force that it can pay."""
     budget = EnergyBudget(LOOP.Delta(), LOOP.T, Packets(np.zeros(4, dtype=int)), start=1.0)
     force = np.array([[3.0], [-2.0], [1.0], [4.0]])
     np.testing.assert_allclose(budget.limit(force, 0 * force), force, rtol=1e-12)
@@ -628,7 +628,7 @@ def test_stiffest_coupling_attains_the_matrix_bound() -> None:
 
 @pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
 def test_designs_turn_with_the_axes(condition: str) -> None:
-    """The scalar design of diagonal levels, and that of the same loop in other coordinates, where levels are full."""
+    """The design of diagonal levels and that of the same loop in turned axes, with full levels, are equally good."""
     straight = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), CORNER, axes=(2,))
     Q = np.zeros((4, 4))
     Q[:2, :2] = Q[2:, 2:] = TURN
@@ -673,10 +673,10 @@ def test_switching_search_shares_a_multiplier() -> None:
 
 
 def switching_room(loop: Loop, coupling: ForceFilter, alpha: tuple[float, ...]) -> float:
-    """Least eigenvalue of the switching block at Z, relative to Delta/T, assembled by hand.
+    """Return the least eigenvalue of the switching block at Z, relative to Delta/T, assembled by hand.
 
-    He[mean G/(z-1)] + Delta/T - alpha W/2 - h^2/(2 alpha) G* W^-1 G with W = Delta/mean(diag Delta) and mean of the
-    lines of delay lo and hi; the error of a device's delayed force is bounded in the metric W^-1.
+    The block is He[mean G/(z-1)] + Delta/T - alpha W/2 - h^2/(2 alpha) G* W^-1 G with W = Delta/mean(diag Delta) and
+    the mean of z^-lo and z^-hi; the error of a device's delayed force is bounded in the metric W^-1.
     """
     assert loop.varying_delay
     lo, hi = (np.array(n) for n in (loop.varying_delay.lo, loop.varying_delay.hi))
@@ -734,7 +734,7 @@ def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
 
 
 def _chains(stiffness: float, c: float) -> Loop:
-    """Two delayed chains of eight masses, more states than a storage matrix is found for, on one device of two axes."""
+    """Return two delayed chains of eight masses on one device of two axes; a storage matrix needs fewer states."""
     springs = [Spring(("a.x", "x0"), stiffness, 0.05), Spring(("a.y", "y0"), 0.7 * stiffness, 0.05)]
     for axis in "xy":
         nodes = [*(f"{axis}{i}" for i in range(8)), "ground"]

@@ -1,4 +1,4 @@
-"""Devices whose motor mass and transmission are known: the agreed figures, each step of the proof, and attacks."""
+"""Test devices of known motor mass and transmission: reference figures, the steps of the proof, and attacks."""
 
 from fractions import Fraction
 from functools import cache, partial
@@ -58,29 +58,29 @@ def one(T, delta, theta=0, device=DEVICE, **more) -> Loop:
 
 
 def wall(K, B, theta, T) -> Lti:
-    """A spring-damper to ground that answers `theta` samples late."""
+    """Return a spring-damper to ground whose force is `theta` samples late."""
     return taps([0.0] * theta + [K + B / T, -B / T], T)
 
 
 def known_device_block(F, cost, beta):
-    """F(1) and the block of Theorem B on (dx, v)."""
+    """Return F(1) and the block of Theorem B on (dx, v)."""
     made = compose(F, loop_of(F.T, (1.0,) * F.inputs), late=False, hands=KnownMotor(cost, beta))
     return made.static["F(1)"], made.free
 
 
 def known_device_any_block(V, theta, cost, beta):
-    """V(1) and the block on (dx, v, df_e)."""
+    """Return V(1) and the block on (dx, v, df_e)."""
     made = compose_any(V, loop_of(V.T, (1.0,) * V.inputs, theta), hands=KnownMotor(cost, beta))
     return made.static["V(1)"], made.free
 
 
 def sweep_of(F, loop) -> Sweep:
-    """The sweep of Theorem B around the map F of one environment."""
+    """Return the sweep of Theorem B around the map F of one environment."""
     return Sweep(loop, [F], lambda G, values, hands: compose(G, loop, late=False, hands=hands))
 
 
 def sweep_any(V, loop) -> Sweep:
-    """The sweep before any passive environment behind the coupling V."""
+    """Return the sweep for any passive environment behind the coupling V."""
     return Sweep(loop, [V], lambda G, values, hands: compose_any(G, loop, hands=hands))
 
 
@@ -100,14 +100,14 @@ def test_constants_of_one_period():
 
 @cache
 def best_for(coupling: str) -> _Best:
-    """The best beta for the paper's loop without coupling, or with published gains."""
+    """Return the best beta for the paper's loop without coupling, or with published gains."""
     made, present = {"none": (NoCoupling(), 1.72293), "I": (PUBLISHED["I"], 1.39871)}[coupling]
     return sweep_of(KNOWN.F(made), KNOWN).best(present / 1.37)
 
 
 @pytest.mark.parametrize(("coupling", "required", "beta"), [("none", 1.3120, 3.255e-5), ("I", 0.96294, 3.375e-5)])
 def test_required_damping_of_the_papers_loop(coupling, required, beta):
-    """One beta for both channels gives these figures; a beta per channel gives next to nothing more."""
+    """A beta per channel and one common beta both require the stated damping."""
     found = best_for(coupling)
     assert found.share * 1.37 == pytest.approx(required, rel=5e-5)
     common = sweep_of(KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"]), KNOWN)
@@ -143,14 +143,14 @@ def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present)
 
 
 def chi_by_hand(z, n, loop, beta):
-    """l Lam^-1 l*/4, with the matrix of L on (dx, v) inverted numerically."""
+    """Return l Lam^-1 l*/4 (k,); the matrix Lam of L on (dx, v) is inverted numerically."""
     inverse = np.linalg.inv(cost_by_hand(z, loop, beta))
     left = np.stack([(z**n - 1) / (z - 1), beta * z**n], axis=1)
     return np.einsum("ki,kij,kj->k", left, inverse, np.conj(left)).real / 4
 
 
 def cost_by_hand(z, loop, beta):
-    """The Hermitian matrix (k, 2, 2) of L on (dx, v)."""
+    """Return the Hermitian matrix (k, 2, 2) of L on (dx, v)."""
     T, (device,) = loop.T, loop.known_devices
     P, b, m = (
         device.transmission_stiffness_max**2 / device.transmission_damping_min,
@@ -160,7 +160,7 @@ def cost_by_hand(z, loop, beta):
     c0, c2 = loop.delta[0] - beta**2 * P / 4, beta * m - beta**2 * b / 4
     rate = np.sqrt(c0 / c2)
     q = 2 / rate * np.tanh(rate * T / 2)
-    mean, step = (1 + z) / 2, z - 1  # of v over the period, and its change, as multiples of v
+    mean, step = (1 + z) / 2, z - 1  # v times these is its mean over the period and its change
     rows = [(np.sqrt(c0 * q), 0, mean), (np.sqrt(c0 / (T - q)), 1, -q * mean), (np.sqrt(c2 / q), 0, step)]
     Lam = sum(
         scale**2 * np.array([[d * d * np.ones_like(z), d * v], [d * np.conj(v), np.abs(v) ** 2]])
@@ -170,7 +170,7 @@ def cost_by_hand(z, loop, beta):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Each step of the proof, by computations of their own.
+# Each step of the proof, checked with separate computations.
 
 
 def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
@@ -193,7 +193,7 @@ def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_least_cost_of_a_period(seed):
-    """Against a discretised minimisation, which approaches it from above with the square of its step."""
+    """A discretised minimum approaches the least cost from above, with an error of second order in its step."""
     rng = np.random.default_rng(seed)
     T, beta = 1e-3, 5e-5 * rng.uniform(0.1, 0.9)
     loop = one(T, 1.3)
@@ -208,9 +208,10 @@ def test_the_least_cost_of_a_period(seed):
 
 
 def test_the_cost_is_concave_in_damping_and_beta():
-    """So tangents bound a block from above, and the search for beta and multipliers bounds the requirement from below.
+    """The form in (dx, vb, dv) is concave along random lines.
 
-    As a form in (dx, vb, dv), along random lines.
+    Tangents therefore bound a block from above, and the search for beta and multipliers bounds the requirement from
+    below.
     """
     rng, loop = np.random.default_rng(8), one(1e-3, 1.0)
 
@@ -256,10 +257,10 @@ def test_the_cost_bounds_every_period_of_a_range():
 
 
 def rubbing_motor(rng, promised, delta, beta, ticks, T, mass=None):
-    """Simulate a motor with friction behind whose transmission a hand with friction and a stiffening spring hangs.
+    """Simulate a motor with friction whose transmission drives a hand with friction and a stiffening spring.
 
-    Return both sides of the inequality of step 4 after every tick, from rest: what the held forces gave, and what the
-    integral and the speed at the end ask for. The motor weighs `mass`, the promised least mass if None.
+    Return both sides of the inequality of step 4 after every tick, from rest: the energy that the held forces supply,
+    and the integral plus the storage at the end. The motor weighs `mass`, the promised least mass if None.
     """
     m, k, b = promised.motor_mass_min, promised.transmission_stiffness_max, promised.transmission_damping_max
     motor = m if mass is None else mass
@@ -286,14 +287,14 @@ def rubbing_motor(rng, promised, delta, beta, ticks, T, mass=None):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_held_forces_pay_the_least_cost(seed):
-    """Step 4 along hands with friction, a clutch and a stiffening spring, from rest."""
+    """The inequality of step 4 holds from rest for hands with friction, a clutch and a stiffening spring."""
     rng = np.random.default_rng(seed)
     sides = rubbing_motor(rng, DEVICE, 1.3, 5e-5 * rng.uniform(0.2, 0.9), 60, 1e-3)
     assert (sides[:, 0] >= sides[:, 1] - 1e-7 * np.abs(sides[:, 0]).max()).all()  # the integrator's tolerance
 
 
 def test_a_lighter_motor_breaks_the_inequality():
-    """With a twentieth of the promised mass the inequality of step 4 fails along every one of these hands."""
+    """With a twentieth of the promised mass the inequality of step 4 fails for each of these hands."""
     for seed in range(4):
         sides = rubbing_motor(np.random.default_rng(seed), DEVICE, 1.3, 4.5e-5, 40, 1e-3, mass=0.003)
         assert (sides[:, 0] < sides[:, 1]).any()
@@ -324,7 +325,7 @@ def test_the_block_is_the_energy_of_periods(theta):
     steps, N = 40, 400
     dx, v = np.zeros(N), np.zeros(N)
     dx[:steps], v[1:steps] = rng.normal(size=steps) * 1e-3, rng.normal(size=steps - 1)
-    dx[steps - 1] -= dx.sum()  # it returns, so that F(1) stores nothing at the end
+    dx[steps - 1] -= dx.sum()  # the motion returns to 0, so that F(1) stores nothing at the end
     out, state = np.zeros((N, 2)), np.zeros(block.order)
     inputs = np.stack([dx, v], axis=1)
     for k in range(N):
@@ -351,7 +352,7 @@ def test_sums_over_aliases_have_a_closed_form():
 
 @pytest.mark.parametrize("coupling", ["none", "I"])
 def test_the_proof_is_tight_for_the_papers_loop(coupling):
-    """Theorem A, which no condition undercuts for equal devices, is a tenth of a percent below Theorem B."""
+    """No condition requires less than Theorem A for equal devices; it is at most 0.1 % below Theorem B."""
     F = KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"])
     exact = _necessary_share(F, KNOWN)
     assert exact.held
@@ -363,7 +364,7 @@ def test_the_proof_is_tight_for_the_papers_loop(coupling):
 
 
 def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
-    """Spectral radius of the sampled loop with each lossless ladder of (mass, stiffness), (n, links, 2)."""
+    """Return the spectral radii of the sampled loop; `ladders` (n, links, 2) holds (mass, stiffness), lossless."""
     (device,), T = loop.known_devices, loop.T
     m, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_min
     n, links, _ = ladders.shape
@@ -379,7 +380,7 @@ def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
             K[:, 2 + j, 2 + j] += ladders[:, j, 1]
             K[:, 1 + j, 2 + j] -= ladders[:, j, 1]
             K[:, 2 + j, 1 + j] -= ladders[:, j, 1]
-    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # velocities in these units
+    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # unit of velocities
     G = np.zeros((n, 2 * size + 1, 2 * size + 1))
     G[:, :size, size:-1] = fast * np.eye(size)
     G[:, size:-1, :size], G[:, size:-1, size:-1] = -K / mass[..., None] / fast, -D / mass[..., None]
@@ -393,14 +394,14 @@ def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
 
 
 def ladders(rng, n: int, links: int, T: float) -> np.ndarray:
-    """Random ladders; the frequency of each mass on its spring lies between 1 Hz and four times the sampling rate."""
+    """Draw ladders; the frequency of each mass on its spring is between 1 Hz and four times the sampling rate."""
     mass = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (n, links)))
     rate = 2 * np.pi * np.exp(rng.uniform(0, np.log(4 / T), (n, links)))
     return np.stack([mass, mass * rate**2], axis=2)
 
 
 def worst_hand(F, loop, delta, rng) -> float:
-    """The largest spectral radius that random ladders and a local search from the worst of them reach."""
+    """Return the largest spectral radius of random ladders and of a local search from the worst of them."""
     worst = 0.0
     for links in (1, 2):
         drawn = ladders(rng, 400, links, loop.T)
@@ -433,7 +434,7 @@ def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
 
 
 # ----------------------------------------------------------------------------------------------------
-# What may be changed, and limits.
+# Changes that the guarantee permits, and limit cases.
 
 
 def required(F, loop, high=30.0) -> float:
@@ -462,7 +463,7 @@ def test_directions_that_the_guarantee_allows(field, factor, helps):
 
 
 def test_a_small_beta_gives_the_present_condition():
-    """As beta -> 0 the cost becomes delta dx^2/T, and the requirement that of every hand at the shaft."""
+    """As beta -> 0 the cost becomes delta dx^2/T, and the requirement becomes that of this-environment."""
     cost = period_cost(one(1e-3, 1.3), 1.0, np.array([1e-12]))
     assert cost.move[0] == pytest.approx(1300.0, rel=1e-3)
     sweep = sweep_of(wall(1000.0, 0.2, 0, 1e-3), one(1e-3, 1.0))
@@ -480,7 +481,7 @@ def test_uneven_periods_need_more():
 
 
 def enclosed(loop, beta):
-    """The bounds of q as the exact proof takes them."""
+    """Return the bounds of q as fractions, as the exact proof uses them."""
     return [[Fraction(repr(v)) for v in part] for part in _q_bounds(loop, beta)]
 
 
@@ -489,7 +490,7 @@ def exactly(loop, block_of, beta):
 
 
 def test_the_paper_loop_is_proved_exactly():
-    """Published gains are certified at 1.37 N s/m, which the present condition refuses."""
+    """The published gains, which this-environment refuses, are proved at 1.37 N s/m."""
     beta = [Fraction(f"{b!r}") for b in best_for("I").beta]
     F = KNOWN.F(PUBLISHED["I"], exact=True)
     _, block = exactly(KNOWN, lambda cost: known_device_block(F, cost, beta), beta)
@@ -497,7 +498,7 @@ def test_the_paper_loop_is_proved_exactly():
     assert reason is None
     assert P is not None
     assert _prove_positive_real(block, P) is None
-    short = change(KNOWN, delta=(0.95, 0.95))  # less than the 0.963 that the sweep asks
+    short = change(KNOWN, delta=(0.95, 0.95))  # less than the 0.963 that the sweep requires
     _, block = exactly(short, lambda cost: known_device_block(F, cost, beta), beta)
     assert find_storage(block)[0] is None
 
@@ -565,7 +566,7 @@ def test_files_prove_it_and_forgeries_are_refused():
 
     known = certificate.multipliers
     for name, factor in (("beta", 3.0), ("q_below", 1.001), ("q_above", 0.999)):
-        first, *others = known[name]  # another beta, q below that is too large, q above that is too small
+        first, *others = known[name]  # wrong beta; lower bound of q too large; upper bound too small
         assert not forged(multipliers=known | {name: (first * factor, *others)}).proved
     first, last = known["beta"]
     for spoiled in ((first,), (first, last, last), (0.0, last), (-first, last), (1e30, last)):
@@ -578,7 +579,7 @@ def test_files_prove_it_and_forgeries_are_refused():
 
 
 def test_the_smaller_requirement_is_taken():
-    """Where nothing is gained the plain condition is proved, with beta = 0."""
+    """Where the known device gains nothing, the plain condition is proved, with beta = 0."""
     loop, coupling = one(1e-3, 1.0, environment=SPRING), NoCoupling()
     plain, known = (required_damping(loop, coupling, name) for name in ("this-environment", "known-device"))
     assert known.required == pytest.approx(plain.required, rel=1e-9)
@@ -622,7 +623,7 @@ def test_loops_that_are_not_covered_are_refused(changes, said):
 
 
 def test_a_loop_without_known_devices_keeps_its_digest():
-    """The digest of the default loop with the published gains, as it was before devices could be known."""
+    """The scenario omega-pair keeps the digest that it had before devices could be known."""
     content = msgspec.to_builtins(PAIR)
     assert not {"known_devices", "T_min"} & set(content)
     assert load("omega-pair").digest.startswith("5e87cc8624324c7d")
@@ -653,17 +654,17 @@ def test_impossible_bounds_are_refused_in_one_line(fields, said):
 
 
 def test_the_slope_of_the_sampled_condition():
-    """Against central differences, in gains and in beta."""
+    """The slope equals central differences, in gains and in beta."""
     sampled = KnownDeviceLoop(KNOWN)
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
     steps = 1e-6 * np.eye(x.size)
     slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
-    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # of one-sided differences in beta
+    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta: finite differences
 
 
 @pytest.mark.slow
 def test_a_spring_damper_on_known_devices_feels_stiffer():
-    """The default loop is certified without a coupling, so the design makes its coupling next to rigid."""
+    """The default loop is certified without a coupling, so the design makes its coupling almost rigid."""
     plain = design(KNOWN, "this-environment")
     assert required_damping(KNOWN, plain.coupling, "known-device").required[0] == pytest.approx(1.10, abs=0.02)
     known = design_coupling(KNOWN)
@@ -675,10 +676,10 @@ def test_a_spring_damper_on_known_devices_feels_stiffer():
 
 
 def test_the_stiffest_spring_damper_for_any_environment():
-    """5223.8 N/m with 7.352 N s/m without reserve; a coupling that is half a percent stiffer satisfies it nowhere."""
+    """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid satisfy it."""
     loop = one(1.2e-3, 1.37)
     found = design_coupling(loop, "spring-damper", "known-device-any")
-    assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # the design keeps a thousandth of the damping
+    assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # the design leaves 0.1 % of the damping unused
     assert found.coupling.B[0] == pytest.approx(7.352, rel=1e-2)
     assert prove(loop, found.coupling, "known-device-any").proof == "rational"
     z = np.exp(1j * np.linspace(1e-3, np.pi, 500))
@@ -691,7 +692,7 @@ def test_the_stiffest_spring_damper_for_any_environment():
 
 
 def test_rigid_wall_gets_the_stiffest_spring_damper():
-    """The wall's E(z) is unknown, but the condition holds for any environment, with 5223.8 N/m at most."""
+    """A rigid wall has no E(z), but known-device-any covers any environment, with 5223.8 N/m at most."""
     loop = change(one(1.2e-3, 1.37), environment=RIGID_WALL)
     found = design_coupling(loop, "spring-damper", "known-device-any")
     assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)
@@ -718,7 +719,7 @@ STIFFER = Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))
 @pytest.mark.slow
 @pytest.mark.parametrize("ranges", [None, pytest.param(STIFFER, marks=pytest.mark.validate)])
 def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
-    """The filter of one channel, its block by hand on a dense sweep, and the file; this-environment renders less."""
+    """The block is positive on a dense sweep and the file proves it; this-environment leaves more mismatch."""
     monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
     network = Network(("tip",), (Spring(("tip", GROUND), 1200.0, 2.0),), {"tip": 0.2})
     loop = change(one(1e-3, 1.0, 1, environment=network), lam=(1,), ranges=ranges)
@@ -765,18 +766,18 @@ def test_designs_refuse_what_known_devices_exclude():
 
 
 # ----------------------------------------------------------------------------------------------------
-# Maps and what is left.
+# Maps, and the gap between necessary and proved damping.
 
 
 @pytest.mark.parametrize("name", ["known-device", pytest.param("known-device-any", marks=pytest.mark.slow)])
 def test_a_map_agrees_with_single_sweeps(name):
-    """A stack of spring-dampers before a rigid wall: to three hundredths, and never above the plain condition."""
+    """The ratios of a stack before a rigid wall are those of single sweeps to 3 %, and at most 2 % below them."""
     loop = one(1e-3, 1.37, environment=RIGID_WALL)
     K, B = (part.ravel() for part in np.meshgrid([1500.0, 4000.0], [0.4, 3.0]))
     drawn = named(name).ratios(loop, SpringDamper(K[:, None], B[:, None]))
     for k, b, ratio in zip(K, B, drawn, strict=True):
         swept = required_damping(loop, SpringDamper([k], [b]), name).ratio
-        if ratio > 0.05:  # below, a map keeps what is surely enough
+        if ratio > 0.05:  # below 0.05 a map returns a sufficient share
             assert ratio == pytest.approx(swept, rel=0.03)
         assert ratio >= swept * 0.98
 
@@ -800,7 +801,7 @@ def test_sufficient_damping_is_not_called_necessary():
 
 
 def random_walls(rng, T):
-    """An environment that the contact pushes against: a rigid wall, a spring, or a mass between two springs."""
+    """Return a spring to ground or a mass between two springs, of random stiffness and mass."""
     k = np.exp(rng.uniform(np.log(300), np.log(3e6), 2))
     springs = [(Spring(("tip", GROUND), k[0]),), (Spring(("tip", "mass"), k[0]), Spring(("mass", GROUND), k[1]))]
     masses = {"mass": float(np.exp(rng.uniform(-5, 1)))}
@@ -810,7 +811,7 @@ def random_walls(rng, T):
 
 @pytest.mark.parametrize("theta", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_pair_grows_above_the_requirement(theta):
-    """Lossless hands before lossless environments behind a coupling at 1.01 of what it needs; some grow at 0.6."""
+    """With a lossless environment no lossless hand grows at 1.01 of the required damping; some grow at 0.6."""
     T, rng = 1e-3, np.random.default_rng(theta)
     loop = one(T, 1.0, theta)
     coupling = SpringDamper([(2500.0, 1200.0)[theta]], [(4.0, 1.5)[theta]])
@@ -828,7 +829,7 @@ def test_no_pair_grows_above_the_requirement(theta):
 
 
 def test_periods_that_vary_lose_no_lossless_hand():
-    """Products of steps with drawn periods: with T_min and T_max certified at 1.01 every one of 200 hands decays."""
+    """At 1.01 of the requirement for T_min to T_max no product of steps of random periods grows, for 200 hands."""
     K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
     loop, F = one(T, 1.0, theta, T_max=high, T_min=low), wall(K, B, theta, T)
     needed = required(F, loop, this_environment(F, loop.delta, T_max=high).ratio)
@@ -855,10 +856,10 @@ def test_periods_that_vary_lose_no_lossless_hand():
 
 
 def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=4000):
-    """Simulate lossless hands before a one-sided wall whose force is limited, from a speed of the hand, delay 0.
+    """Simulate moving lossless hands before a one-sided wall whose force is limited, without delay.
 
-    Return the energy of motor, transmission and hand at each tick, (ticks, hands). A limiter of rho = 0 before a spring
-    is a clip of the force that solves spring-damper and wall together.
+    Return the energy of motor, transmission and hand at each tick, (ticks, hands). Before a spring, a limiter of
+    rho = 0 clips the force of spring-damper and wall in series.
     """
     (device,), T, n = loop.known_devices, loop.T, len(drawn)
     m, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_max
@@ -906,7 +907,7 @@ def test_any_environment_gets_walls_and_limiter_free():
 
 
 def test_every_device_within_the_bounds_is_covered():
-    """Heavier motors, softer and more or less damped transmissions, more motor damping: no lossless hand grows."""
+    """No lossless hand grows with heavier motors, softer transmissions of any permitted damping, and more damping."""
     T, rng = 1e-3, np.random.default_rng(11)
     bounds = DeviceBounds(0.05, 12000.0, 0.4, 1.5)
     loop, F = one(T, 1.0, 1, bounds), wall(800.0, 0.6, 1, T)
@@ -938,15 +939,15 @@ WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5), (1000.0, 5.
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
 def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, plain):
-    """Separate code needs `known` with a coarse sweep and m = 0; the touched wall alone needs less."""
+    """Separate code with a coarse sweep and m = 0 gives `known`; permanent contact with the wall needs less."""
     touched = sweep_of(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
 
 
 def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
-    """How many lossless hands behind the transmission have more energy at the end than in the middle.
+    """Count the lossless hands behind the transmission that have more energy at the end than in the middle.
 
-    Where delays switch, the force acts at every tick whose age gives most energy.
+    Where delays switch, the force of the age that gives the most energy acts at every tick.
     """
     rng = np.random.default_rng(seed)
     M, k = 10 ** rng.uniform(-3.5, 0.5, hands), 10 ** rng.uniform(0, 5, hands)
@@ -981,7 +982,7 @@ def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, *
         window = 0 if 0.4 * ticks < j < 0.5 * ticks else 1 if j > 0.9 * ticks else None
         if window is not None or j % 100 == 0:
             now = energies(state) if now is None else now
-            if not now.max() <= 1e6:  # [J], or no number
+            if not now.max() <= 1e6:  # [J]; also true for NaN
                 return int((now > 1.0).sum())
         if window is not None:
             energy[window] = np.maximum(energy[window], now)
@@ -996,7 +997,7 @@ def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, p
 
 @pytest.mark.slow
 def test_the_audit_says_what_is_left_before_walls():
-    """A hand that presses the wall for ever holds a spring-damper: some lossless one grows below the figure."""
+    """A hand that never leaves the wall feels a spring-damper; some lossless hand grows below the figure."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
     left = audit(loop, NoCoupling()).left_over
     assert left.attained
@@ -1031,7 +1032,7 @@ LIMITED = LimitedKnownDevice(LimitedForces(held=(RHO,)))
 
 
 def limited(theta, *walls):
-    """50 g on 20 N/m and 0.3 N s/m behind a known device, with walls."""
+    """Return the loop of a known device with 50 g on 20 N/m and 0.3 N s/m, and `walls`."""
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
     return Loop(1e-3, (theta,), (0,), (0,), (1.37,), network, known_devices=(DEVICE,))
 
@@ -1049,7 +1050,7 @@ LINEAR_OR_WALL = pytest.mark.parametrize("name", ["linear", pytest.param("wall",
 
 @LINEAR_OR_WALL
 def test_limited_forces_cost_little_on_known_devices(name):
-    """More than unlimited ones, and less than on a device of which only the damping is known."""
+    """They need no less damping than unlimited forces, and less than on a device of known damping only."""
     loop = LIMITED_LOOPS[name]
     unlimited = required_damping(loop, COUPLING, "known-device").required[0]
     plain = required_damping(loop, COUPLING, LimitedForces(held=(RHO,))).required[0]
@@ -1059,7 +1060,7 @@ def test_limited_forces_cost_little_on_known_devices(name):
 
 @LINEAR_OR_WALL
 def test_no_hand_gains_energy_from_limited_forces(name):
-    """Of lossless hands behind the transmission, with limits that many ticks reach."""
+    """No lossless hand behind the transmission gains energy at 1.01 of the requirement; at 0.1 some do."""
     loop, bound = LIMITED_LOOPS[name], {"limit": [1.0], "rho": [RHO], "coupling": COUPLING}
     assert hands_on_a_wall(loop, 1.01 * limited_needs(name), **bound) == 0
     assert hands_on_a_wall(loop, 0.1 * limited_needs(name), **bound) > 0
@@ -1133,7 +1134,7 @@ def together_needs(name):
     ],
 )
 def test_facts_on_known_devices_are_proved_from_files(name):
-    """For less damping than devices of which less is known need; a file without a multiplier is refused."""
+    """The proof needs less damping than that of unknown devices; a file without a multiplier is refused."""
     loop, condition = TOGETHER[name]
     needs = together_needs(name)
     assert needs < 0.8 * condition.plain.required(loop, COUPLING).required[0]
@@ -1146,7 +1147,7 @@ def test_facts_on_known_devices_are_proved_from_files(name):
         fewer = {known: values for known, values in certificate.multipliers.items() if known != missing}
         assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=fewer)))).proved
     multiplier = tuple(v for part in condition.multiplier_sizes(loop) for v in certificate.multipliers[part])
-    # The proof has multipliers of its own, which may need a little less than those of the search for the least damping.
+    # The multipliers of the proof may need a little less damping than those of the search for the least damping.
     least = required_damping(enough, COUPLING, condition, multiplier).required[0]
     assert 0.99 * needs < least < enough.delta[0]
     short = change(loop, delta=(0.999 * least,))
@@ -1155,7 +1156,7 @@ def test_facts_on_known_devices_are_proved_from_files(name):
 
 @pytest.mark.parametrize("name", ["switching", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TOGETHER)[1:3])])
 def test_no_hand_gains_energy_from_ages_of_forces(name):
-    """Of lossless hands behind the transmission, each with the worst age of its force at every tick."""
+    """With the worst age of the force at every tick no hand gains energy at 1.01 of the need; at 0.1 some do."""
     loop, condition = TOGETHER[name]
     bound = {"limit": [1.0], "rho": [RHO]} if condition is LIMITED else {}
     assert hands_on_a_wall(loop, 1.01 * together_needs(name), coupling=COUPLING, **bound) == 0
@@ -1200,7 +1201,7 @@ def test_an_assessment_guarantees_switching_on_known_devices():
 
 
 def test_longest_period_alone_proves_no_known_device():
-    """A declared T_max means that periods vary, even where it equals T: between ticks of 1 ms and 10 us hands grow."""
+    """A declared T_max means that periods vary, even where it equals T; with ticks of 1 ms and 10 us hands grow."""
     loop = msgspec.structs.replace(KNOWN, T_max=KNOWN.T)
     refused = assess(loop, PUBLISHED["I"])
     assert "T_min" in refused.requirements["known-device"].shortfall
@@ -1218,7 +1219,7 @@ def test_shortest_periods_are_positive(T_min):
 
 
 def test_huge_indefinite_matrices_are_not_positive():
-    """Pivots of matrices that do not hold overflow without a warning; the others are judged as by eigvalsh."""
+    """Pivots of indefinite matrices may overflow without a warning; the verdicts are those of eigvalsh."""
     rng = np.random.default_rng(0)
     A = rng.normal(size=(20, 6, 6)) + 1j * rng.normal(size=(20, 6, 6))
     H = A @ np.conj(np.swapaxes(A, 1, 2)) - np.arange(20)[:, None, None] / 10 * np.eye(6)

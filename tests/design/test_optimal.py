@@ -1,4 +1,4 @@
-"""The optimal coupling: its laws, its proofs, closed forms, and other programs that solve the same problem."""
+"""Test the optimal coupling: its laws, proofs and closed forms, and other programs for the same problem."""
 
 import json
 from dataclasses import replace
@@ -68,13 +68,13 @@ def force(loop: Loop, coupling) -> Lti:
 
 
 def dense() -> np.ndarray:
-    """6000 frequencies [rad/sample], half even and half even in their logarithm."""
+    """Return about 6000 frequencies [rad/sample], half evenly spaced and half evenly spaced in logarithm."""
     return np.union1d(np.linspace(1e-3, np.pi, 3000), np.geomspace(1e-3, np.pi, 3000))
 
 
 # what is returned ----------------------------------------------------------------------------------------------------
 
-#: name, rms mismatch [dB] that is reached with the two smallest bases, share of the static stiffness
+#: loop, largest rms mismatch [dB] with the two smallest bases, least share of the static stiffness
 REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
 
 
@@ -101,7 +101,7 @@ def test_the_sweep_that_knows_no_solver_certifies_it(name):
 
 @pytest.mark.parametrize("name", ["n0", "n3"])
 def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
-    """The file's matrix proves the block built again from the decimals, and nothing of a filter that is scaled up."""
+    """The file's matrix proves the block rebuilt from the decimals; a doubled filter is refused."""
     loop, found = loop_of(name), best(name)
     stored = Stored.of(loop, found.coupling, found.certificate)
     save(stored, tmp_path / "best.json")
@@ -115,7 +115,7 @@ def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["n0", "n2", "n4"])
 def test_static_stiffness_is_an_exact_share(name):
-    """In fractions F(1) = g E(1), and so it stays symmetric where the springs are others."""
+    """F(1) = g E(1) in fractions, also with other springs, so F(1) stays symmetric."""
     loop, coupling = loop_of(name), best(name).coupling
     total = sum(np.vectorize(lambda v: Fraction(repr(float(v))), otypes=[object])(R) for R in coupling.R)
     g = total[0, 0]
@@ -143,7 +143,7 @@ def test_causal_parts_match_the_transform():
     heights[[0, -1]] = 0
     w = np.linspace(0, np.pi, 2**17 + 1)
     real = np.array([np.interp(w, grid, column, left=0, right=0) for column in heights.T])
-    H = np.fft.irfft(np.concatenate([real, 1j * real]))[:, : w.size - 1]  # of z^0, z^-1, ..
+    H = np.fft.irfft(np.concatenate([real, 1j * real]))[:, : w.size - 1]  # coefficients of z^0, z^-1, ..
     D = np.diff(H, axis=1, prepend=0)
     D[:, 0] = 0  # -H_0 + H_0
     at = [0, 3000, 9000, 20000, w.size - 1]
@@ -152,14 +152,14 @@ def test_causal_parts_match_the_transform():
 
 @pytest.mark.parametrize("channels", [3, pytest.param(4, marks=pytest.mark.validate)])
 def test_parallel_walls_have_one_walls_bound(channels):
-    """Each is a problem of its own."""
+    """Parallel walls are separate problems, so their bound is that of one wall."""
     one, several = (bound(wall(3000.0, 3, 1.0, channels=n), knots=4) for n in (1, channels))
     assert several.rms == pytest.approx(one.rms, rel=0.02)
     assert several.rms > 0.1
 
 
 def test_there_is_no_bound_where_nothing_is_lost():
-    """The environment of this loop is safe itself and its mismatch zero; so must the bound be."""
+    """The environment of this loop is safe without a coupling, so its mismatch and its bound are zero."""
     assert bound(loop_of("o02"), knots=30).rms == 0
 
 
@@ -186,8 +186,8 @@ def test_every_basis_is_reported_as_it_is_finished():
 @pytest.mark.parametrize(
     ("script", "taken"),
     [
-        ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),  # stiffness that nobody feels
-        ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # a quarter of what is felt: not taken
+        ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),  # negligible stiffness
+        ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # less than half of another's stiffness is rejected
         ([(0.8, 0.5), (0.7, 0.6), (0.699, 0.6), (0.6, 0.6), (0.58, 0.6), (0.578, 0.6)], 4),
     ],
 )
@@ -212,7 +212,7 @@ def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
 
 @pytest.mark.parametrize("refused", [1, 3])
 def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
-    """After one failed proof the best filter is scaled down; after three the filter of the basis before is proved."""
+    """After one failed proof the best filter is scaled down; after three the previous basis's filter is proved."""
     usual, left, asked = prove, iter(range(refused)), []
 
     def refusing(loop, coupling, *more, **options):
@@ -237,7 +237,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition of 1e15 there, so that it is stored whole; without a heavier weight g would be .017."""
+    """P has a condition number of 1e15 and is stored whole; without a heavier weight g would be 0.017."""
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
@@ -250,7 +250,7 @@ def test_sixteen_samples_beside_slow_poles_are_proved():
 
 
 def random_loop(seed: int) -> Loop:
-    """One to three devices around one or two masses; light and heavy, stiff and soft, any small delays."""
+    """Draw one to three devices around one or two masses, with random stiffnesses and small delays."""
     rng = np.random.default_rng(seed)
     m = int(rng.integers(1, 4))
     contacts = tuple("abc"[:m])
@@ -285,7 +285,7 @@ def test_there_is_always_an_answer(seed):
 
 
 def test_ties_prefer_less_error_at_small_forces():
-    """Hands of case I that move together get a hundredth of the force: it is right to a few percent at 0.6 Hz, too."""
+    """Hands of case I that move together get less than 2 % of the force at 0.6 Hz; its error is below 5 %."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -312,9 +312,9 @@ def test_a_scaled_wall_needs_what_is_known(theta):
 
 @pytest.mark.parametrize("theta", [1, 16])
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
-    """F(1) T/2 is the mass at z = 1 of a measure delta whose moments 1 .. theta are zero: at most delta/(theta + 1).
+    """F(1) T/2 is the mass at z = 1 of a measure of total delta with zero moments 1 .. theta: <= delta/(theta + 1).
 
-    A plain spring reaches delta/(2 theta + 1); a designed filter more, and never more than that.
+    A plain spring reaches delta/(2 theta + 1); a designed filter reaches more, but less than delta/(theta + 1).
     """
     loop = wall(5000.0, theta, 1.0)
     found = design(loop, Options(bases=((4, 3), (8, 6), (14, 10))))
@@ -368,7 +368,7 @@ def test_the_supremum_and_the_cap_are_kept():
     ],
 )
 def test_demands_are_kept_together(further, asked):
-    """The own unknowns of each demand have their own place in the program, however many there are."""
+    """Each demand has separate unknowns in the program, so several demands can be combined."""
     loop = msgspec.structs.replace(loop_of("n3"), **asked)
     found = design(loop, replace(SMALLEST, **further))
     assert found.proved
@@ -378,7 +378,7 @@ def test_demands_are_kept_together(further, asked):
 
 @pytest.mark.slow
 def test_ranges_fall_back_to_a_proved_basis():
-    """A ton on a soft spring: at a vertex the exact proof needs more room than the bases leave at first."""
+    """With a ton on a soft spring the exact proof of a vertex needs more margin than the bases leave at first."""
     contact = Spring(("a", "m"), 1000.0)
     network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
     loop = Loop(1e-3, (2,), (0,), (2,), (1.0,), network)
@@ -488,7 +488,7 @@ def test_requests_that_make_no_sense_are_refused():
 
 @pytest.mark.parametrize("n", [1, 5, 60])
 def test_matrix_routines_are_those_of_scipy(n):
-    """Bit for bit, for every storage order, because couplings are compared by their bytes."""
+    """Results equal scipy's bit for bit in every storage order, because couplings are compared by their bytes."""
     rng = np.random.default_rng(n)
     rows = rng.standard_normal((3 * n, n))
     U = scipy.linalg.qr(rows, mode="r")[0][:n]
@@ -523,7 +523,7 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
 
 
 def test_entrywise_inequalities_equal_dense_ones():
-    """He[left X right], each entry of X a sum of two functions, and a further unknown that makes it positive."""
+    """The form is He[left X right] with two functions in each entry of X, plus an unknown that makes it positive."""
     rng = np.random.default_rng(4)
     k, r = 5, 3
     functions, left, right = (rng.normal(size=(k, *s)) + 1j * rng.normal(size=(k, *s)) for s in ((2,), (r, r), (r, r)))
@@ -559,8 +559,8 @@ ORDINARY = {
 
 @pytest.mark.parametrize("name", [*list(ORDINARY)[:2], pytest.param(list(ORDINARY)[2], marks=pytest.mark.slow)])
 def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
-    """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
-    monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
+    """With four taps and three poles, cvxpy reaches the same objective to 0.1 dB, with many frequencies."""
+    monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # the cone program has neither
     monkeypatch.setattr("haptic_loop.design.program._EVEN", 0.0)
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
@@ -570,7 +570,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
     def map_of(z: np.ndarray) -> np.ndarray:
-        """Theta b R_ij Psi E of each unknown, (unknowns, k, m, m): g, then b by b and entry by entry."""
+        """Return Theta b R_ij Psi E of each unknown, (unknowns, k, m, m): g first, then b by b, entry by entry."""
         late = [z[:, None] ** -np.asarray(delays) for delays in (loop.theta, loop.psi)]
         inner = late[1][:, :, None] * E.at(z)
         shapes, units = basis(span.poles, z, span.pairs)[:, 1:] - 1, np.eye(m * m).reshape(m, m, m, m)
@@ -610,7 +610,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
 
 
 def filter_with_sum() -> ForceFilter:
-    """Three channels: own chains with two taps, two poles and a pair, and one of the sum with a further pair."""
+    """Return a filter of three channels: each has two taps, two poles and a pair, and their sum a further pair."""
     rng, m = np.random.default_rng(0), 3
     R = np.zeros((9, m, m + 1))
     R[1:7, np.arange(m), np.arange(m)] = rng.integers(-900, 900, (6, m)) / 1000
@@ -628,7 +628,7 @@ def test_filters_sum_their_functions_in_every_arithmetic():
     np.testing.assert_allclose(R.filter(T).at(z), expected, atol=1e-9)
     one = Sampled(z[None], np.tile(np.eye(3, dtype=complex), (1, 4, 1, 1)), T)
     np.testing.assert_allclose(R.around(one).G[0], expected, atol=1e-12)
-    assert R.filter(T).order == 3 * 6 + 2  # the sum's chain has states of its own only where it is longer
+    assert R.filter(T).order == 3 * 6 + 2  # the sum's chain adds states only where it is longer
     exact = R.filter(Fraction(1, 1000))
     for name in "ABCD":
         np.testing.assert_allclose(getattr(exact.floats(), name), getattr(R.filter(T), name), atol=1e-14)
@@ -680,7 +680,7 @@ def test_a_basis_is_larger_for_few_devices():
 
 @pytest.fixture
 def brief(monkeypatch):
-    """Two bases only, and a bound of few knots."""
+    """Use two bases and a bound of eight knots."""
     monkeypatch.setattr(Options, "__init__", partialmethod(Options.__init__, bases=SHORT.bases))
     monkeypatch.setattr("haptic_loop.design.bound.bound", partial(bound, knots=8))
 
@@ -716,7 +716,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys, br
 
 
 def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch, brief):
-    """The verdict is printed and the proof is stored before the bound and the robustness are worked out."""
+    """The verdict is printed and the proof is stored before the bound and the robustness are computed."""
     file, printed = tmp_path / "c.json", []
 
     def interrupted(*arguments):
@@ -735,7 +735,7 @@ def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch,
 
 
 def test_a_longer_period_is_a_smaller_damping():
-    """Periods up to T_max count as the damping times T/T_max: the same coupling, and the proof carries T_max."""
+    """Periods up to T_max act like the damping times T/T_max: a design reaches the same mismatch with either."""
     loop = msgspec.structs.replace(loop_of("n3"), T_max=0.0012)
     found = design(loop, SHORT)
     assert found.proved
@@ -745,7 +745,7 @@ def test_a_longer_period_is_a_smaller_damping():
 
 
 def test_late_walls_match_their_closed_form():
-    """K of (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2, theta = 0: a plain share is found, and filters beat it."""
+    """K of (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2 needs all of delta; a design reaches 0.98 of this K."""
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
@@ -759,7 +759,7 @@ def test_late_walls_match_their_closed_form():
     "name", ["n0", pytest.param("n2", marks=pytest.mark.slow), pytest.param("n4", marks=pytest.mark.validate)]
 )
 def test_limited_forces_are_part_of_designs(name):
-    """By matrices of our own: [[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] on a dense grid."""
+    """[[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] is positive real on a dense grid."""
     loop = loop_of(name)
     found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
     assert found.proved
@@ -790,7 +790,7 @@ def test_limited_forces_are_not_designed_for_ranges():
 
 @pytest.mark.parametrize("seed", [11, 12, 14])
 def test_every_loop_gets_an_answer_and_proof(seed):
-    """Drawn at the ends of what devices and objects are: 15 samples, 54 kg on .08 N/m, dampings of .04 N s/m."""
+    """The loops are extreme: 15 samples of delay, 54 kg on 0.08 N/m, dampings of 0.04 N s/m."""
     found = design(hostile(np.random.default_rng(seed)), SMALLEST)
     assert found.proved
     assert isinstance(found.coupling, ForceFilter)
