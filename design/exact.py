@@ -418,7 +418,7 @@ _CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the block'
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
-    """Return (P, None) with a P that proves G strictly positive real, or (None or an empty P, reason).
+    """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation is
@@ -437,8 +437,10 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
         kind = Violated if margin < -_CLEARLY else str
         return None, kind(f"the condition is violated at {w:.6g} rad/sample")
     if G.order == 0:
-        return Matrix.zeros(0, 0), _prove_positive_real(G, Matrix.zeros(0, 0))
-    reason: str | None = None
+        empty = Matrix.zeros(0, 0)
+        reason = _prove_positive_real(G, empty)
+        return None if reason else empty, reason
+    reason = None
     for share, white in ((0.5, True), (0.5, False), (0.9, True)):
         try:
             out, riccati = _solved(parts, margin, share, white)

@@ -241,6 +241,15 @@ def kyp(G: Lti, P: np.ndarray) -> np.ndarray:
     return np.block([[P - G.A.T @ P @ G.A, cross.T], [cross, G.D + G.D.T - G.B.T @ P @ G.B]])
 
 
+def test_a_static_block_is_refused_exactly(monkeypatch):
+    """D + D' has the determinant -1/2^60, which a sweep in floating point may take for positive."""
+    monkeypatch.setattr(exact, "_least_eigenvalue", lambda G: (1e-17, 0.0))
+    D = [[Fraction(1), Fraction(1)], [Fraction(1), 1 - Fraction(1, 2**60)]]
+    P, reason = find_storage(Lti.constant(D, Fraction(1, 1000)))
+    assert P is None
+    assert reason
+
+
 def test_the_kyp_matrix_is_the_storage_increase():
     """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u: the energy that goes in less what is stored."""
     rng = np.random.default_rng(6)
