@@ -100,9 +100,9 @@ def free_pair(mass=0.25):
     return nobody(load().replace(device=[device] * 2))
 
 
-def arming_test(cap=12.0, closing=False, q=1e-6):
+def arming_test(cap=12.0, closing=False, q=1e-6, still=1):
     units = Units((q, q), (STEP, STEP), (10**6, 10**6))
-    return EncoderTest(SafetyLimits((cap, cap)), T, units, (1, 1), Expected(free_pair(), False), closing=closing)
+    return EncoderTest(SafetyLimits((cap, cap)), T, units, (still,) * 2, Expected(free_pair(), False), closing=closing)
 
 
 def test_axes_are_tested_one_after_another():
@@ -353,6 +353,21 @@ def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
     assert "axis 1" in later.cause
 
 
+@pytest.mark.parametrize("strength", [1, 0])
+def test_noisy_coarse_counts_show_the_motor(strength):
+    """At 1 N the free mass swings by 3 counts of 0.3 mm. Noise of half a count has a range of 2 counts in 100 ms."""
+    q, draw = 3e-4, np.random.default_rng(5)
+    fine, test = masses(q=1e-3 * q), arming_test(q=q, still=4)
+    noisy = lambda k, applied: tuple(  # noqa: E731
+        round(strength * 1e-3 * n + draw.normal(0.0, 0.5)) for n in fine(k, applied)
+    )
+    if strength:
+        played(test, noisy)
+    else:
+        with pytest.raises(SafetyStop, match=r"encoder of axis 1 does not follow: it moved by \d counts"):
+            played(test, noisy)
+
+
 def test_noise_is_the_least_short_range():
     noise, draw = EncoderNoise(2, T), np.random.default_rng(2)
     for k in range(400):
@@ -420,6 +435,20 @@ def test_the_impulse_decides(axis, sign, newton, after):
     with pytest.raises(SafetyStop, match=f"axis {axis + 1} does not follow"):
         stand_still(round(0.2 * after / T) + 1)
     return None
+
+
+def test_motions_below_two_counts_test_nothing():
+    """At 0.05 N the free mass swings by 0.056 mm, which an encoder with counts of 0.1 mm hardly shows."""
+    with pytest.raises(SafetyStop, match=r"axis 1 by 0\.056 mm, less than 2 counts of 0\.1 mm"):
+        played(arming_test(cap=0.05, q=1e-4), masses(q=1e-4))
+
+
+def test_forces_that_return_stop_nothing():
+    """The allowed 8 sqrt(q M F) is 0.028 N s for 0.1 mm, 2.5 kg and 0.05 N; 0.3 s of this force are 0.015 N s."""
+    monitor = monitor_of(1e-4, 1e-5, cap=(0.05,))
+    for force in (0.05, 0.0):
+        for _ in range(round(0.3 / T)):
+            monitor.check((0,), (round(force / 1e-5),), 1)
 
 
 def test_coarse_encoders_get_more_time():
