@@ -1,4 +1,4 @@
-"""Facts that hold together: digits of a separate computation, exact proofs, and hands that try to take energy."""
+"""Tests of combined facts: figures of a separate computation, exact proofs, and hands that try to gain energy."""
 
 import itertools
 
@@ -27,7 +27,7 @@ def wall(stiffness, damping):
 
 
 def held(*walls):
-    """A mass of 50 g on 20 N/m and 0.3 N s/m at the tip, with walls."""
+    """Return a mass of 50 g, held by 20 N/m and 0.3 N s/m at the tip, with walls."""
     return Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
 
 
@@ -50,16 +50,16 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most):
-    """Separate code, with m = 0 and both parts of a period charged apart, needs more; the frozen contact needs less."""
+    """`most` is from code with m = 0 that bounds both parts of a period apart; a frozen contact needs less."""
     loop = loop_of(Network(("tip",), walls=(wall(k, damping),)), theta=theta, latency=(latency,))
     touched = loop_of(Network(("tip",), (Spring(("tip", GROUND), k, damping),)), theta=theta)
-    least = need(change(touched, latency=(latency[1:] * 2,)), BARE)  # at the latest latency alone
+    least = need(change(touched, latency=(latency[1:] * 2,)), BARE)  # with the constant latest latency
     assert least * (1 - 1e-6) < need(loop, BARE) < 0.96 * most
 
 
 @pytest.mark.parametrize(("theta", "known", "alone"), [(1, 1.2623, 1.2452), (0, 0.99051, 0.99051)])
 def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
-    """rho is 0.01 of the requirement without limiter over T; the figures are those of m = 0."""
+    """rho is 0.01/T times the requirement without limiter; `known` was computed with m = 0."""
     loop = loop_of(held(wall(3000.0, 2.0)), 1e-3, theta)
     linear = need(loop, COUPLING)
     assert alone * 0.999 < linear <= alone * (1 + 5e-5)
@@ -70,7 +70,7 @@ def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
     ("theta", "walls", "known"), [(1, (), 1.3905), (0, (), 0.8172), (1, (1,), 1.3910), (0, (1,), 0.8177)]
 )
 def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
-    """rho = 13 N/m, 0.3 ms, without and with the wall; the figures with the wall are those of m = 0."""
+    """rho is 13 N/m and the latency 0.3 ms; the known figures with the wall were computed with m = 0."""
     loop = loop_of(held(*(wall(3000.0, 2.0) for _ in walls)), 1e-3, theta, latency=((0.3e-3, 0.3e-3),))
     found = need(loop, COUPLING, 13.0)
     assert known * (1 - 5e-4) < found < known * (1 + 5e-5)
@@ -85,7 +85,7 @@ EVERY = {
 SETS = [names for count in (2, 3, 4) for names in itertools.combinations(EVERY, count)]
 
 
-#: the sets of three facts are left to `make validate`: they lie between those of two and that of all
+#: Only `make validate` tests the sets of three facts, which lie between the sets of two and the set of all.
 MOST_SETS = pytest.mark.parametrize(
     "names",
     [pytest.param(names, marks=[pytest.mark.validate] if len(names) == 3 else []) for names in SETS],
@@ -101,7 +101,7 @@ def combined(names, delta=10.0):
 
 @MOST_SETS
 def test_every_combination_is_proved_stored_and_verified(names):
-    """At 1.001 of the damping that the sweep finds, and not at 0.999; a file without a multiplier is refused."""
+    """The proof exists at 1.001 of the required damping, not at 0.999; a file that lacks a multiplier is refused."""
     loop, rho = combined(names)
     least = need(loop, COUPLING, rho)
     condition = LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
@@ -120,9 +120,9 @@ HANDS, TICKS = 60, 12000
 
 
 def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
-    """How many lossless hands have more energy at the end than in the middle, at worst ages and latencies.
+    """Return how many lossless hands have 2 % more energy at the end than in the middle.
 
-    At every tick the force of each age and each end of the latency is tried, and the one that gives most energy acts.
+    Each tick tries the force of every age at both ends of the latency, and applies the one that gives most energy.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)
@@ -131,7 +131,7 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
     late = sorted(set(loop.latency[0])) if loop.latency else [0.0]
     parts = [(expm(A * (loop.T - tau))[:, :2], expm(A * tau)[:, :2]) for tau in late]
-    # (latencies, 2, 4, hands): the plant after a period, of the plant, the force before and the force that follows
+    # (latencies, 2, 4, hands): map from the plant, the last force and the new force to the plant after a period
     step = np.stack([np.concatenate([second[..., :2] @ first, second[..., 2:]], axis=2) for second, first in parts])
     step = np.ascontiguousarray(np.moveaxis(step, 1, -1))
     bound = {} if rho is None else {"limit": [limit], "rho": [rho]}
@@ -148,12 +148,12 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
         before[:-1] = after[1:]
         forces = [after[0].copy(), *forces[:-1]]
         held = (step[:, :, :3] * [*plant, applied]).sum(axis=2)
-        acting = np.repeat(forces[lo:], len(late), axis=0)  # age by age, each at every latency
+        acting = np.repeat(forces[lo:], len(late), axis=0)  # one row per age and latency
         now = np.tile(held, (hi + 1 - lo, 1, 1)) + np.tile(step[:, :, 3], (hi + 1 - lo, 1, 1)) * acting[:, None]
         gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
         best = np.argmax(gained, axis=0), every
         most = gained[best]
-        if most.max() > 1e6:  # [J] of hands that began with less than 0.02
+        if most.max() > 1e6:  # [J]; hands begin with less than 0.02 J
             return int((most > 1.0).sum())
         plant, applied = np.stack([now[:, 0][best], now[:, 1][best]]), acting[best]
         at = 0 if 0.4 * ticks < k < 0.5 * ticks else 1 if k > 0.9 * ticks else None
@@ -179,7 +179,7 @@ def test_some_hands_gain_energy_far_below_the_requirement(names):
     "names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.slow)], ids="-".join
 )
 def test_facts_are_proved_at_every_vertex(names):
-    """One set of multipliers serves all environments, each of which asks for at most as much by its own."""
+    """All vertices share one set of multipliers; no vertex needs more when it is judged alone."""
     loop, rho = combined(names)
     loop = change(loop, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
     least, condition = need(loop, COUPLING, rho), LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
@@ -197,7 +197,7 @@ def test_facts_are_proved_at_every_vertex(names):
 
 @pytest.mark.slow
 def test_walls_with_ranges_are_guaranteed_as_ranges():
-    """Every vertex is proved, and the search between them takes the multipliers of the proof."""
+    """Every vertex is proved, and the search between the vertices uses the multipliers of the proof."""
     network = held(wall(3000.0, 2.0))
     loop = loop_of(network, 1e-3, 1, 1.3, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
     found = assess(loop, COUPLING, ranges_samples=2)
@@ -207,7 +207,7 @@ def test_walls_with_ranges_are_guaranteed_as_ranges():
     assert not assess(change(loop, delta=(1.2,)), COUPLING, ranges_samples=0).holds
 
 
-# Before any passive environment behind a coupling.
+# The any-environment condition.
 
 ANYWHERE = SpringDamper([1000.0], [0.1])
 LATE, SWITCHED = {"latency": ((0.13e-3, 0.4e-3),)}, {"varying_delay": DelayRange((0,), (1,))}
@@ -235,7 +235,7 @@ def test_springs_before_any_environment_need_the_closed_form(further, theta, nee
 
 
 def test_any_environment_requirements_follow_from_chi():
-    """He[V/(1-z)] against chi = (tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2)/(4 delta)."""
+    """He[V/(1-z)] >= chi, with chi = (tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2)/(4 delta)."""
     tau, theta, T = 0.3e-3, 2, 1.2e-3
     coupling = SpringDamper([900.0], [0.3])
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1.0),)), T, theta, latency=((tau, tau),))
@@ -264,7 +264,7 @@ def test_any_environment_is_proved_stored_and_verified(further):
 
 
 def lossless(rng):
-    """A random chain of springs and masses from the tip to the ground."""
+    """Return a random chain of springs and masses from the tip to the ground."""
     count = int(rng.integers(1, 4))
     nodes = ["tip", *(f"node {i}" for i in range(1, count)), GROUND]
     springs = tuple(Spring(pair, 10 ** rng.uniform(2, 6)) for pair in itertools.pairwise(nodes))
@@ -275,7 +275,7 @@ def lossless(rng):
 @pytest.mark.parametrize("limited", [False, True])
 @pytest.mark.parametrize("further", [LATE, SWITCHED, LATE | SWITCHED], ids=["latency", "switching", "both"])
 def test_no_hand_gains_energy_before_lossless_environments(further, limited, count):
-    """At worst ages and latencies, before walls with the limiter of no lag, too."""
+    """Ages and latencies are the worst ones; the limited loops have a wall and a limiter with rho = 0."""
     rng = np.random.default_rng(11)
     _, least = anywhere(further)
     for seed in range(count):
@@ -293,7 +293,7 @@ def test_below_the_requirement_some_hands_gain_energy(further):
 
 @pytest.mark.parametrize(("theta", "tau"), [(0, 0.13e-3), (2, 0.5e-3)])
 def test_the_stiffest_coupling_counts_the_exact_latency(theta, tau):
-    """V(1) = ((theta + 1) T + tau)/(2 delta), which no linear coupling undercuts."""
+    """V(1) = ((theta + 1) T + tau)/(2 delta) is the least compliance of a linear coupling."""
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1e3),)), theta=theta, latency=((tau, tau),))
     found = design_coupling(loop, "moving-average", "any-environment")
     limit = 2 / ((theta + 1) * 1.2e-3 + tau)

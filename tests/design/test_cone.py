@@ -1,4 +1,4 @@
-"""Linear matrix inequalities: known optima, another solver, and a solver that is never believed."""
+"""Linear matrix inequalities: known optima, another solver, and solvers whose answers are checked."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
 from haptic_loop.design.lmi import symmetric_from
 from haptic_loop.design.result import DesignFailed, Infeasible
 
-#: the least trace of X >= M is that of M
+#: The least trace of an X >= M is the trace of M.
 M = np.array([[2.0, 1.0], [1.0, 2.0]])
 LEAST_TRACE = ConeProgram(np.array([1.0, 0.0, 1.0]), [Inequality.of(lambda v: symmetric_from(v, 2) - M, range(3))])
 
@@ -26,9 +26,9 @@ def hermitian(rng, *shape):
 
 
 def with_known_optimum(rng, p, shapes):
-    """(problem, x): of every block a random space is in S(x), the rest in the multiplier Z; c_a = <slope_a, Z>.
+    """Return a problem and its optimum x: S(x) and the multiplier Z of each block have complementary ranges.
 
-    All slopes together are positive, and every x_a is bounded, so that both sets have an interior.
+    cost_a = <slope_a, Z>. Slopes add up to I and every x_a is bounded, so that both sets have an interior.
     """
     x, cost, blocks = rng.normal(size=p), np.zeros(p), []
     for count, n, complex_ in shapes:
@@ -66,7 +66,7 @@ def test_a_known_optimum_is_found(seed, settings):
 
 
 def test_a_large_block_is_not_for_clarabel(monkeypatch):
-    """60 complex rows, whose triangle has 7260 real entries, and the equations of Clarabel their square."""
+    """60 complex rows have 7260 real entries in their triangle; Clarabel's equations have the square of that."""
     calls = answering(monkeypatch)
     problem, x = with_known_optimum(np.random.default_rng(0), 5, [(1, 60, True)])
     assert problem.cost @ problem.solve("it") == pytest.approx(problem.cost @ x, rel=1e-6)
@@ -74,7 +74,7 @@ def test_a_large_block_is_not_for_clarabel(monkeypatch):
 
 
 def answering(monkeypatch, *answers):
-    """Let Clarabel's first answers be these: an error, or what becomes of (x, status)."""
+    """Replace Clarabel's first answers by errors or by functions of (x, status); return the list of calls."""
     original, calls = cone._clarabel, []
 
     def wrapped(problem, options):
@@ -91,7 +91,7 @@ def answering(monkeypatch, *answers):
 
 
 class PanicException(BaseException):
-    """What pyo3 raises when Rust panics."""
+    """A stand-in for the exception that pyo3 raises when Rust panics."""
 
 
 def test_an_easy_problem_takes_one_setting(monkeypatch):
@@ -133,7 +133,7 @@ def test_a_failure_carries_problem_and_attempts(monkeypatch):
 
 
 def bounds(*of):
-    """One unknown, between bounds."""
+    """Return the problem of the least x for which every f(x) >= 0."""
     return ConeProgram(np.array([1.0]), [Inequality.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
 
 
@@ -177,7 +177,7 @@ def test_clarabel_reads_the_same_matrix_from_scipy():
 
 
 def test_a_design_loads_no_modelling_language(tmp_path):
-    """With its exact proof; nor do runs, those who judge, and the other designs. Nor SciPy beyond compiled modules."""
+    """A proved design and the imports of runs and other designs load neither cvxpy nor these SciPy modules."""
     words = ["--condition", "any-environment", "--out", str(tmp_path / "coupling.json")]
     code = f"""if True:
         import sys, cli.design, sim.run, design.coverage, design.fixed_order

@@ -1,4 +1,4 @@
-"""design.compare: curves against formulas evaluated by hand, their maxima against the conditions' figures."""
+"""Tests of design.compare: curves match formulas by hand, and their maxima match the conditions' figures."""
 
 import json
 import re
@@ -19,12 +19,12 @@ T, DELTA = 1.2e-3, 1.37
 
 HZ = np.array([0.3, 6.17, 40.0, 133.0, 400.0])
 
-#: rounding of a state-space response against a formula, with poles 1e-3 from the circle
+#: Relative rounding error of a state-space response whose poles are 1e-3 from the unit circle.
 ROUNDING = 1e-9
 
 
 def by_hand(hz):
-    """E and F of the default scenario with the paper's gains, from Figure 4's formula and (6)."""
+    """Yield E, F and Theta of the default scenario with the paper's gains, from Figure 4's formula and (6)."""
     for f in hz:
         z = np.exp(2j * np.pi * f * T)
         s = (z - 1) / (T * z)
@@ -37,7 +37,7 @@ def by_hand(hz):
 
 
 def wall(K, B=0.0, theta=0):
-    """A grounded spring-damper as the environment of one device."""
+    """Return a loop of one device whose environment is a grounded spring-damper."""
     network = Network(("tip",), (Spring(("tip", GROUND), K, B),))
     return Loop(T, (theta,), (0,), (theta,), (DELTA,), network)
 
@@ -64,7 +64,7 @@ def test_an_undelayed_wall_feels_like_its_spring():
 
 
 def test_a_delayed_spring_feeds_and_a_damper_dissipates():
-    """z^-1 K is K cos(wT) and -K sin(wT)/w; backward Euler's B is B sin(wT)/(wT), and stiffens by B (1 - cos wT)/T."""
+    """z^-1 K feels like K cos(wT) and -K sin(wT)/w; backward Euler's B like B (1 - cos wT)/T and B sin(wT)/(wT)."""
     omega = 2 * np.pi * HZ
     late = wall(1000.0, theta=1)
     felt = curves(late, judge(late, NoCoupling()), HZ).perceived
@@ -77,7 +77,7 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
 
 
 def test_demand_by_hand():
-    """This environment: -T He[F/(z-1)] / delta; any, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
+    """this-environment: -T He[F/(z-1)]/delta; any-environment: max (1 - cos n w)/(2 delta Re[(z-1) V/(Tz)])."""
     demands = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
         z = np.exp(2j * np.pi * HZ[k] * T)
@@ -105,7 +105,7 @@ def test_the_curves_maximum_is_the_required_damping(coupling):
 
 
 def test_the_curve_with_delay_in_the_environment():
-    """psi >= 1: any-environment has a multiplier, and a floor under its curve."""
+    """With psi >= 1 any-environment has a multiplier, and the curve's maximum is still its ratio."""
     soft = Network(
         FIGURE_4.contacts,
         tuple(Spring(s.between, s.stiffness / 8, s.damping / 8) for s in FIGURE_4.springs),
@@ -118,7 +118,7 @@ def test_the_curve_with_delay_in_the_environment():
 
 
 def test_required_damping_is_perceived_with_the_hold():
-    """One channel: T Im[F e^-jw/2] / (2 sin(w/2)), the damping half a sample later, is lowest at -required."""
+    """For one channel, the minimum of T Im[F e^(-jw/2)]/(2 sin(w/2)) over frequency is -required."""
     loop = wall(900.0, 0.4, theta=2)
     judged = judge(loop, SpringDamper([2000.0], [0.3]))
     w = np.linspace(1e-4, np.pi, 200_001)
@@ -149,7 +149,7 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
 
 
 def test_other_devices_other_delays_and_no_pictures(tmp_path):
-    """Three unequal devices, one of them delayed by option."""
+    """Three unequal devices get delays of 0, 1 and 2 samples by option."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
     assert main([*args, "--json", str(tmp_path / "r.json")]) == 0
     assert not list(tmp_path.glob("*.png"))

@@ -1,4 +1,4 @@
-"""Coulomb friction pays for encoder steps: the bound on the impulse response, and the energy of quantised loops."""
+"""Coulomb friction that covers encoder steps: the bound on the impulse response, the energy of quantised loops."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_the_bound_is_above_and_close():
 def test_first_order_closed_form(pole):
     one = Lti([[pole]], [[1.0]], [[1 - pole]], [[0.5]], T)
     assert _l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
-    slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed: still a bound
+    slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed, but still bounded
     assert 1e9 <= _l1_gain(slow)[0, 0] < np.inf
 
 
@@ -59,12 +59,12 @@ def test_taps_delays_and_unstable_maps():
 
 @pytest.mark.parametrize("amplitude", [0.05, 3.0, 100.0])
 def test_quantised_loops_gain_no_energy(amplitude):
-    """sum f'dx + dx' D dx + W |dx| >= 0 from rest, on motions around an edge of a step; without W some take more."""
+    """sum f'dx + dx' D dx + W |dx| >= 0 from rest near the edge of a step; without W small motions violate it."""
     requirement = this_environment(F, LOOP.delta)
     delta, W = np.array(requirement.required) * (1 + 1e-9), encoder_friction(F, [STEP, STEP])
     hz, phase = np.geomspace(2, 400, 25), np.random.default_rng(1).uniform(0, 2 * np.pi, (25, 2)).T
     k = np.arange(4000)[:, None, None]
-    way = np.minimum(k / 200, 1)  # from rest to where the encoder's value changes
+    way = np.minimum(k / 200, 1)  # ramp from rest to the position where the encoder's value changes
     x = STEP * way * (0.5 + amplitude * np.sin(2 * np.pi * hz * T * k + phase))  # (ticks, channels, motions)
     seen, state, plain, paid, least = np.round(x / STEP) * STEP, np.zeros((F.order, 25)), 0.0, 0.0, np.inf
     for measured, dx in zip(seen, np.diff(x, axis=0), strict=False):

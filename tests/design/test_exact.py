@@ -1,4 +1,4 @@
-"""Laws of the exact arithmetic: against numpy, against the floating-point blocks, and symmetry at z = 1."""
+"""Exact arithmetic agrees with numpy and with the floating-point blocks, and is symmetric at z = 1."""
 
 import random
 from fractions import Fraction
@@ -121,7 +121,7 @@ def test_definiteness_below_rounding_is_not_proved():
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
 def test_what_rounding_makes_definite_is_not_proved(monkeypatch, bits):
-    """J + u M with |M| <= 1/2: rounded to multiples of u it is J + u I, which is definite; as it is, it is not."""
+    """J + u M with |M| <= 1/2: rounded to multiples of u it is J + u I, which is definite; the matrix itself is not."""
     monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
     M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
@@ -157,7 +157,7 @@ def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
 
 
 def test_definiteness_is_proved_beyond_double_precision():
-    """Hilbert's matrices, condition 5e5 to 2e28: against elimination, on both sides of the least eigenvalue."""
+    """Hilbert's matrices of condition 5e5 to 2e28, shifted to both sides of their least eigenvalue by elimination."""
     for n in (5, 12, 20):
         low, high = Fraction(0), Fraction(1, n)
         while high - low > high / 1000:
@@ -185,7 +185,7 @@ def test_the_exact_force_map_is_what_runs(coupling, theta, psi):
     running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
     rng = np.random.default_rng(4)
     for z in rng.uniform(0.7, 1.5, 5) * np.exp(1j * rng.uniform(0, np.pi, 5)):
-        # the frequency response of either block is good to 1e-9 near its resonance
+        # Near its resonance, each frequency response has an error of up to 1e-9.
         np.testing.assert_allclose(at(F, z), running.at(z), rtol=1e-8, atol=1e-8)
 
 
@@ -216,14 +216,14 @@ def test_a_wrong_storage_matrix_proves_nothing():
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
         told = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
         assert told is reason or told.startswith(reason)
-    zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # P = 1 makes all of its matrix exactly zero
+    zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # with P = 1 the KYP matrix is exactly zero
     assert _prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or too close to singular for a proof"
     )
-    # D + D' = 0 behind inputs that move nothing: no P can mend it
+    # D + D' = 0, and the input moves no state: no P can prove it
     still = Lti(*([[Fraction(v)]] for v in ("1/2", "0", "0", "0")), Fraction(1))
     assert _prove_positive_real(still, Matrix.of([[1]])).startswith("D + D' is not positive definite")
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
@@ -236,7 +236,7 @@ def random_exact(rng: np.random.Generator, n: int, m: int) -> Lti:
 
 
 def kyp(G: Lti, P: np.ndarray) -> np.ndarray:
-    """The matrix of Kalman, Yakubovich and Popov over the Fractions."""
+    """Return the Kalman-Yakubovich-Popov matrix in Fractions."""
     cross = G.C - G.B.T @ P @ G.A
     return np.block([[P - G.A.T @ P @ G.A, cross.T], [cross, G.D + G.D.T - G.B.T @ P @ G.B]])
 
@@ -251,7 +251,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
 
 
 def test_the_kyp_matrix_is_the_storage_increase():
-    """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u: the energy that goes in less what is stored."""
+    """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u, is supplied minus stored energy."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
     P = numbers(half + half.T, Fraction(1)) / 7
@@ -263,7 +263,7 @@ def test_the_kyp_matrix_is_the_storage_increase():
 
 @pytest.mark.parametrize(("bits", "finer"), [(16, 16), (32, 16), (48, 112), (192, 192)])
 def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
-    """Beside the exact matrix of the rounded P, in the same scaled states and channels, whatever their units are."""
+    """The integer matrix is within its bound of the exact matrix of the rounded P, whatever the units are."""
     rng, fullest = np.random.default_rng(16), 0.0
     for _ in range(30):
         n, m = 5, 2
@@ -286,7 +286,7 @@ def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
 
 
 def test_the_exact_test_refuses_alone(monkeypatch):
-    """Without the quick refusal in floating point: a P of another sign, or a little too large, is refused."""
+    """Without the quick refusal in floating point, a P just outside either end of the valid interval is refused."""
     monkeypatch.setattr(exact, "_refuted_in_floating_point", lambda G, P: False)
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))  # (3/4 P)(2 - P) > (1/2 - P/2)^2
     low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
@@ -297,7 +297,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
 
 
 def test_what_floating_point_refuses_exact_arithmetic_refuses_too():
-    """At M = e P, P ill-conditioned, e of the size of rounding: the matrix is definite and its computed one is not."""
+    """M = e P with ill-conditioned P and e as small as rounding: M is definite, though often not as computed."""
     rng, indefinite = np.random.default_rng(7), 0
     for _ in range(60):
         n = int(rng.integers(2, 6))
@@ -318,7 +318,7 @@ def test_unreachable_states_are_left_out():
     B, C = [[1], [1], [0], [0]], [[0.1, 0, 0.1, 0.1]]
     G = Lti(*(numbers(part, Fraction(1)) for part in (A, B, C, [[1]])), Fraction(1))
     assert reached(G) is G
-    P, reason = find_storage(G)  # the third and fourth are pushed by equal and opposite states
+    P, reason = find_storage(G)  # equal and opposite states drive the third and fourth
     assert reason is None
     assert P.shape == (4, 4)
     late = Lti(G.A.T, numbers([[0], [0], [1], [0]], Fraction(1)), G.C, G.D, Fraction(1))
@@ -350,7 +350,7 @@ def test_models_with_too_many_states_are_reported():
 
 @pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])
 def test_integer_products_are_exact(bits, others):
-    """Against Python's integers, for entries of the largest size and of either sign, and for empty matrices."""
+    """Products equal those of Python's integers, also for the largest entries of either sign and empty matrices."""
     draw = random.Random(bits)
     X, M = (
         np.array([[draw.randint(-(2**b), 2**b) for _ in range(columns)] for _ in range(30)], dtype=object)

@@ -1,4 +1,4 @@
-"""design.export: the C file against the loop's formulas; the C file compiled, run, and called from other code."""
+"""Tests of design.export: the C file matches the loop's formulas, compiles, runs, and is called from other code."""
 
 import json
 import re
@@ -40,7 +40,7 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contrac
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with the stored couplings; the first is certified."""
+    """Return a folder with the stored couplings, of which only `gains` is certified."""
     folder = tmp_path_factory.mktemp("export")
     for name, data in COUPLINGS.items():
         certificate = prove(PAIR, SOFT, "any-environment") if name == "gains" else None
@@ -65,7 +65,7 @@ def run(program):
 
 
 def test_the_order_of_the_sums_in_plain_python():
-    """Floats of Python, one rounding per operation: equal to the last bit."""
+    """Python's floats, with one rounding per operation, give the same outputs to the last bit."""
     block = process_block(Stored.of(PAIR, SOFT))
     test, G = trial(block), block.system
     z = [0.0] * G.order
@@ -82,7 +82,7 @@ def test_the_order_of_the_sums_in_plain_python():
 
 @pytest.fixture(scope="module")
 def limited_files(tmp_path_factory):
-    """The default pair, five channels in a star, and four contacts that nothing holds."""
+    """Return a folder and its stored couplings: the default pair, a star of five channels, a free chain of four."""
     folder, stored = tmp_path_factory.mktemp("limited"), {}
     names = ("a", "b", "c", "d", "e")
     star = tuple(Spring((name, "hub"), 300.0, 0.5) for name in names)
@@ -107,7 +107,7 @@ def limited_files(tmp_path_factory):
     ("name", "limit"), [("pair", (12.0, 5.0)), ("star", (2.0,) * 5), ("free", (3.0, 2.0, 1.0, 2.0))]
 )
 def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
-    """To rounding, with a third of the ticks limited; the tick of the simulator solves the same problem another way."""
+    """The simulator solves the same problem another way, with equal forces but for rounding; many ticks are limited."""
     stored = limited_files[1][name]
     block = process_block(stored, force_limit=limit)
     test, m = trial(block), len(limit)
@@ -135,7 +135,7 @@ def test_limited_c_code_repeats_its_test_vector(limited_files, name, limit):
 
 @pytest.fixture(scope="module")
 def space(tmp_path_factory):
-    """Two planar devices that hold a body, one of them with full damping."""
+    """Return the coupling of two planar devices that hold a body, and its file; one damping matrix is full."""
     tips = tuple(f"{tip}.{axis}" for tip in "ab" for axis in "xy")
     held = tuple(Spring((tip, f"body.{tip[2]}"), 700.0 if tip[0] == "a" else 400.0, 0.5) for tip in tips)
     ground = (Spring(("body.x", GROUND), 200.0, 0.1), Spring(("body.y", GROUND), 90.0, 0.1))
@@ -149,7 +149,7 @@ def space(tmp_path_factory):
 
 
 def vectors(stored, psi):
-    """The limited process, also where the object answers the first device a sample late: M is block triangular then."""
+    """Return the limited process for delays `psi` in the environment; unequal ones make M block triangular."""
     block, loop = process_block(stored, force_limit=(2.0, 2.0, 1.0, 1.0), balls=stored.loop.devices), stored.loop
     G = msgspec.structs.replace(loop, psi=psi).sent(stored.built())
     limiter = Limiter(G, loop.theta, limit=block.limiter.limit, rho=10 * block.limiter.rho, balls=loop.devices)
@@ -158,7 +158,7 @@ def vectors(stored, psi):
 
 @pytest.mark.parametrize("psi", [(0, 0, 0, 0), (1, 1, 0, 0)])
 def test_limited_vectors_are_those_of_the_simulator(space, psi):
-    """The simulator begins with full steps of Newton's method, and has a bisection behind it."""
+    """The exported code gives the forces of the simulator, which begins with full steps of Newton's method."""
     block = vectors(space[0], psi)
     test = trial(block)
     buffer = StepBuffer(Process(block.limiter, np.full(4, np.inf), np.zeros(4)), len(test.inputs), 4)
@@ -210,7 +210,7 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_export_and_simulator_differ_by_rounding(data):
-    """It sums by BLAS, in any order: each tick each side is wrong by at most gamma_N |row| |v|, carried on by A."""
+    """BLAS sums in any order: at each tick either side errs by at most gamma_N |row| |v|, which A propagates."""
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
@@ -261,7 +261,7 @@ def test_single_precision_repeats_its_own_test_vector(limited_files, name, limit
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_single_precision_stays_within_its_error_bound(data):
-    """Coefficients, inputs and sums are rounded to 2^-24: each row errs by gamma_(N+2) |row| |v|, carried on by A."""
+    """Coefficients, inputs and sums are rounded to 2^-24: a row errs by gamma_(N+2) |row| |v|; A propagates it."""
     block = process_block(Stored.of(PAIR, data))
     G, inputs = block.system, trial(block).inputs
     single, double = _sequential(G, inputs, dtype=np.float32), _sequential(G, inputs)
@@ -316,7 +316,7 @@ int main(void)
 
 @needs_cc
 def test_other_code_can_close_the_loop(place):
-    """u = x - d, f = 900 u with V from the C file, against F = (I + E V)^-1 E with E = 900 I."""
+    """Code with f = 900 (x - d) and V from the C file gives the forces of F = (I + E V)^-1 E with E = 900 I."""
     source = export(place, "gains")
     driver = place / "driver.c"
     driver.write_text(DRIVER.replace("SOURCE", source.name))
@@ -391,11 +391,11 @@ def test_bad_input_is_one_line(place, options, message):
 
 
 def test_one_channel(tmp_path):
-    """A single device before a wall, as the command would be used for a first device."""
+    """The process of a single device and a wall has the static stiffness of two springs in series."""
     wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
     save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
     static = process_block(load(tmp_path / "one.json")).system.at(1.0)
-    assert static == pytest.approx(2000 * 500 / 2500)  # two springs in series
+    assert static == pytest.approx(2000 * 500 / 2500)
 
 
 def test_the_export_needs_no_solver():
