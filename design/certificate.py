@@ -66,7 +66,7 @@ def _in_time() -> Iterator[None]:
 # The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that each block
 # at the available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
 # any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the environment is passive
-# (Environment.active). Other multipliers are stored.
+# (Environment.active is None). Other multipliers are stored.
 #
 # With ranges, a condition on the environment is proved for the nominal one (P) and for at most 128 vertices (P1, P2,
 # ..). There is no proof for an environment between the vertices, or for one that changes with time.
@@ -214,7 +214,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     except SingularLoop:
         return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
-    states += sum(loop.theta) if members else 0  # Blocks without members (any-environment) leave out E.
+    states += sum(loop.theta) if members else 0  # Blocks of any-environment, which have no members, omit Theta.
     budgets.require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
@@ -441,7 +441,7 @@ def named(condition: str | Condition) -> Condition:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """Return the damping that the condition requires, as one share of all devices' damping, from a refined sweep.
+    """Return the requirement of a condition: the least multiple of all devices' damping, by a refined sweep.
 
     With ranges, a condition on the environment returns the largest requirement of all members. The requirement of a
     singular loop is infinite.
@@ -485,7 +485,7 @@ def requirements_of(
 ) -> dict[str, Requirement]:
     """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
-    Conditions for known devices are left out without bounds of the devices. The environment is the nominal one and the
+    A loop without bounds of its devices gets no known-device conditions. The environment is the nominal one and the
     delays theta are constant; design.assessment adds ranges and switching. `known` is a certificate that holds; its
     proof is not repeated.
     """

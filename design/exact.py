@@ -76,11 +76,11 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and more for each of their bits
+_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of an integer product, and what each bit of both adds
 
 
-#: largest number of integer products that are computed without FLINT, which is no faster for them (21 states) and takes
-#: 0.05 s to import
+#: Matrix products of at most this many integer products (about 21 states) are computed without FLINT, because FLINT is
+#: no faster for them, and its import takes 0.05 s.
 _FEW = 20_000
 
 
@@ -175,7 +175,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 _BITS = 192  # binary places of the rounded matrix whose definiteness is tested
-_FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; the others have the same unit
+_FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; all entries have one unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
@@ -271,7 +271,9 @@ def _whitening(W: Array) -> _Integers | None:
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
-    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2  # powers of two that equalise the diagonal
+    half = (
+        np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]
+    ) // 2  # exponents of the powers of two that equalise the diagonal
     with np.errstate(over="ignore"):
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
     if not np.isfinite(W).all():  # An entry is far too large for the diagonal.
@@ -302,15 +304,15 @@ _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; 
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative to the largest, are raised to this
-_LEFT = 0.02  # residual of the Riccati equation, relative to its drive, below which Newton's steps end
+_LEFT = 0.02  # Newton's steps end if the residual of the Riccati equation is below this share of e (`find_storage`)
 _UNIT = 2.0**-53  # unit roundoff of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
-_MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of the KYP matrix is below this many u.
+_MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of `_kyp_matrix` is below this many of its units.
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
 
 def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
-    """Return the matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
+    """Return the matrix of (KYP) in units of u = 2^-finer, and a bound on the norm of its error in them.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
     multiples of 2^-bits; the rounded P is exactly known and may itself be a proof. The other matrices are rounded to
@@ -486,7 +488,7 @@ def _extended(M: Any) -> Array:
 
 
 def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
-    """Return G with states and channels of about size one, and the powers of two that scaled the states.
+    """Return G with states and channels of about size one, and the exponents of the powers of two for its states.
 
     The size of a state is the largest gain from the scaled inputs to it, over frequency.
     """
@@ -508,7 +510,8 @@ def _states(G: Lti) -> NDArray[np.complex128]:
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
-    value, w = supremum(  # 1 - lambda is used, because `supremum` refines only peaks within a fifth of the largest.
+    # `supremum` refines peaks within a fifth of the largest. With 1 - lambda they include all small lambda.
+    value, w = supremum(
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )
     return 1 - value, w
@@ -526,9 +529,9 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    At most RICCATI_STEPS of Newton's steps reduce the residual, left by rounding, to less than _LEFT times the drive.
-    They need extended precision, because lightly damped modes have a small margin. Raises LinAlgError without a
-    solution.
+    Newton's steps in extended precision reduce the residual that rounding leaves, until it is below _LEFT times e or
+    after RICCATI_STEPS steps. Double precision is not enough where lightly damped modes make the margin small. Raises
+    LinAlgError without a solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)
@@ -553,7 +556,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
 def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
     """Return the limit of X <- H + A'X (I + S X)^-1 A, or without S of X <- H + A X A', from X = 0, by doubling.
 
-    Raises LinAlgError if the iteration diverges.
+    Raises LinAlgError if the iteration diverges or does not converge within DOUBLINGS steps.
     """
     one = np.eye(len(A))
     for _ in range(budgets.DOUBLINGS):
@@ -611,7 +614,7 @@ def rows_of(M: Matrix) -> _Rows:
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Return the reason why the named matrix does not prove that the block is strictly positive real, or None."""
-    if len(rows) != block.order:  # Older files also have the states that no input reaches.
+    if len(rows) != block.order:  # Only older files have the states that no input reaches.
         block = reached(block)
     n = block.order
     if len(rows) != n:

@@ -43,7 +43,15 @@ from tests.sessions import rehearsal_of
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
 PACE = 0.2  # session seconds per real second: the session's time-out of 1 s of silence takes 5 s
-PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.02, 0.01)  # of attempts: at the last, 6 ms without a STATE take 0.6 s
+PACES = (
+    0.3,
+    0.2,
+    0.1,
+    0.1,
+    0.05,
+    0.02,
+    0.01,
+)  # paces of successive attempts; at the last, 6 ms without a STATE take 0.6 s
 AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
 
 
@@ -143,7 +151,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     assert report["session"]["cause"] == "SIGINT"
     gain = np.load("out/bridge-I/trace.npz")["link_gain"]
     falling = gain[int(np.flatnonzero(gain == 1.0)[-1]) :]
-    falling = falling[falling > 0]  # at gain 0 the motors are tested once more
+    falling = falling[falling > 0]  # ticks at gain 0, in which the motors are tested again, are not part of the ramp
     assert falling.size * 1.2e-3 == pytest.approx(0.1, abs=0.01)  # s
     assert (np.diff(falling) < 0).all()
     assert falling[-1] < 0.02
@@ -175,7 +183,7 @@ def test_a_signal_while_forces_act(scenario, name, stage):
         return
     assert stages[-3:] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
     at = {event.stage: event.t_us for event in session.log}
-    assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) > 0.09  # of the session's clock
+    assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) > 0.09  # [s] on the session's clock
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
@@ -222,7 +230,7 @@ class BridgeOnTerminal:
         return termios.tcgetattr(self.slave)
 
     def read_until(self, word, patience=120.0):
-        """Return the output until it contains `word` or the process ends."""
+        """Return the output until it contains `word`, the process ends, or `patience` [s] have passed."""
         shown, end = b"", time.monotonic() + patience
         while word not in shown and time.monotonic() < end:
             if select.select([self.master], [], [], 0.05)[0]:
@@ -240,7 +248,7 @@ class BridgeOnTerminal:
 
 @pytest.mark.slow
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
-    """The bridges draw the status line and read single keys. SIGQUIT comes by its key. All run at once to save time."""
+    """The bridges draw the status line and read single keys. SIGQUIT is sent by typing Ctrl-\\."""
     names = ("SIGQUIT", "SIGTERM", "SIGHUP")
     with ExitStack() as devices:
         ports = [devices.enter_context(emulated("--pace=0.05")) for _ in names]
@@ -266,7 +274,7 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     ids=["once", "all"],
 )
 def test_a_device_is_identified_over_the_line(tmp_path, paces):
-    """Sweeps of 0.5 s on free handles give a bound of at most the emulated device's 1.37 N s/m, or a reason."""
+    """Sweeps of 0.5 s bound the damping by at most the emulated device's 1.37 N s/m, or say why not."""
     for pace in paces:
         options = ["--arm", "--seconds", "0.5", "--travel", "10", "--measure", "60", "--sittings", "1"]
         with emulated("--nobody", f"--pace={pace}") as path:
@@ -274,7 +282,7 @@ def test_a_device_is_identified_over_the_line(tmp_path, paces):
         report = json.loads((tmp_path / "report.json").read_text())
         if report["session"]["log"][-1]["stage"] == "finished" and "without a STATE" not in report.get("reason", ""):
             break
-    else:  # the machine is too busy for a session with a clock
+    else:  # The machine is too busy: every session ended because a message was late.
         late = "no new STATE", "by the host's clock", "without a STATE", "cause watchdog", "never arrived"
         assert any(words in report["reason"] for words in late)
         assert len(paces) == 1
@@ -293,7 +301,7 @@ class Designing:
         return ()
 
     def arm(self, now):
-        raise AssertionError("armed by a key from before there was anything to arm")
+        raise AssertionError("a key that was typed during the design armed the device")
 
     def stop(self, cause, now):
         self.stage = Stage.FINISHED
@@ -302,7 +310,7 @@ class Designing:
 
 @pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
 def test_keys_typed_during_design_do_not_arm(typed, stage):
-    """A key waits in the terminal's buffer during design and is read before arming is possible; other keys count."""
+    """Keys typed during the design are read before arming is possible: `a` has no effect, `q` ends the session."""
     keyboard, person = os.pipe()
     session = Designing()
 
@@ -426,7 +434,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 
 @pytest.mark.parametrize("module", [bridge, identify])
 def test_varying_delays_of_scenarios_are_refused(module, scenario, tmp_path, monkeypatch):
-    """A real link has its own delays, so a table that nothing reads would be misleading."""
+    """The link has its own delays, so a scenario's [varying_delay] is refused instead of ignored."""
     monkeypatch.setattr(
         module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )
