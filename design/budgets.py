@@ -33,7 +33,8 @@ BASIS_PROOFS = 30 * 112**2.7
 #: Largest number of unknowns of a basis with filters between all channels, for this-environment alone. The largest
 #: program takes ten seconds.
 BASIS_UNKNOWNS = 1600
-#: Largest product of the numbers of unknowns and channels, in all other cases. The largest program takes ten seconds.
+#: In all other cases, the largest product of the number of unknowns and the number of channels. A program of this size
+#: takes ten seconds.
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried.
 UNPROVED_BASES = 2

@@ -271,9 +271,8 @@ def _whitening(W: Array) -> _Integers | None:
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
-    half = (
-        np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]
-    ) // 2  # exponents of the powers of two that equalise the diagonal
+    # Row and column i are multiplied by 2^half[i], so that all entries of the diagonal have about the same size.
+    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2
     with np.errstate(over="ignore"):
         W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
     if not np.isfinite(W).all():  # An entry is far too large for the diagonal.

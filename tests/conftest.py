@@ -38,8 +38,8 @@ LONGEST = (
 )
 
 
-#: time at which the minute of `make check`, which begins with lint, is over; at least 15 s remain for tests, and the
-#: tests that do not start by then are left to `make test`
+#: `make check` sets the time at which its minute ends. Lint comes first, so the tests get at least 15 s. Tests that
+#: have not started at this time are skipped; `make test` runs them.
 CHECK_UNTIL = max(float(os.environ.get("CHECK_UNTIL", "inf")), time.time() + 15)
 
 

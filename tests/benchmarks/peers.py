@@ -93,7 +93,7 @@ def python_control(simulation: Simulation, w: Array) -> States:
 
 
 def drake(step: str, substeps: int) -> Peer:
-    """Return pydrake's MultibodyPlant as a peer, continuous with fixed Runge-Kutta steps ("RK3") or "discrete"."""
+    """Return a peer that uses pydrake's MultibodyPlant, with fixed Runge-Kutta steps ("RK3") or in "discrete" time."""
 
     def peer(simulation: Simulation, w: Array) -> States:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator

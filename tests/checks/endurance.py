@@ -55,7 +55,7 @@ def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
 
 
 def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
-    """Judge random hands on the default loop by eigenvalues; return whether all are stable, and the numbers."""
+    """Judge random hands on the default loop by eigenvalues. Return whether all are stable, and how many are not."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
     found = validate(question, progress=lambda done, total: mark(done / total))

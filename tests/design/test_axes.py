@@ -734,7 +734,7 @@ def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
 
 
 def _chains(stiffness: float, c: float) -> Loop:
-    """Return two delayed chains of eight masses on one device of two axes; a storage matrix needs fewer states."""
+    """Return a delayed loop of one device with two axes and 16 masses, too many states for a storage matrix."""
     springs = [Spring(("a.x", "x0"), stiffness, 0.05), Spring(("a.y", "y0"), 0.7 * stiffness, 0.05)]
     for axis in "xy":
         nodes = [*(f"{axis}{i}" for i in range(8)), "ground"]

@@ -259,7 +259,7 @@ def test_fake_device_clocks_are_found(scenario, rungs):
 
 
 def run_clock(ticks):
-    """Note ticks of these lengths [us] on a clock that wraps around."""
+    """Give the monitor of the device's clock ticks of these lengths [us]; the clock wraps around on the way."""
     pace, t = _ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
     for lasts in ticks:
         pace.note(round(t) & 0xFFFFFFFF, 1)

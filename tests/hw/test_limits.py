@@ -48,7 +48,7 @@ def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
 
 @given(st.tuples(*[numbers] * 5), st.tuples(*[st.floats(-4, 4)] * 5), st.floats(0, 1))
 def test_vectors_keep_within_their_cap_and_slew(asked, previous, gain):
-    """Channel 1 is limited alone, channels 2 and 3 and channels 4 and 5 as vectors."""
+    """Channel 1 has a limit of its force; channels 2 and 3 form a vector with a limit of its length, as do 4 and 5."""
     limits = SafetyLimits((2.0, 6.0, 6.0, 3.0, 3.0), vectors=((1, 3), (3, 5)))
     if not all(map(math.isfinite, asked)):
         return

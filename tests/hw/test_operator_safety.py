@@ -293,7 +293,7 @@ def test_a_busy_machine_is_told_what_to_do(monkeypatch):
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory):
-    """Rehearse twice with an energy budget. Return reports, traces and folders."""
+    """Return report, trace and folder of two rehearsals with an energy budget, with and without a picture."""
     found = []
     for name, picture in (("one", []), ("two", ["--no-plot"])):
         out = tmp_path_factory.mktemp(name)

@@ -119,7 +119,7 @@ def test_packages_live_where_they_belong(path):
 
 
 def circle(arrows: dict[str, set[str]]) -> list[str] | None:
-    """Return a circle of arrows, or None."""
+    """Return the nodes of a closed path of arrows, or None if there is no closed path."""
     done, way = set(), []
 
     def visit(node: str) -> list[str] | None:

@@ -171,7 +171,7 @@ def test_own_hand_populations_agree_in_both_engines():
 
 
 def test_the_adversary_searches_what_the_population_draws():
-    """The search finds a worse set than a quarter as many draws; its hands were drawn, its growth is the loop's."""
+    """The search finds hands that grow faster than those of a quarter as many draws, and reports their true growth."""
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
     F = assemble(scenario, NoCoupling()).F

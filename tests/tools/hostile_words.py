@@ -1,4 +1,4 @@
-"""Bad command lines: odd words and paths, outputs over inputs, options that exclude each other."""
+"""Yield bad command lines: wrong values and paths, outputs that would replace inputs, contradicting options."""
 
 from __future__ import annotations
 
