@@ -210,9 +210,10 @@ HANDS, TICKS = 60, 20000
 
 
 def grown(damping, latencies, mean, seed=3):
-    """How many lossless hands grow a hundredfold between a tenth of the ticks and the end.
+    """Return how many lossless hands grow a hundredfold between a tenth of the ticks and the end.
 
-    tau is one of `latencies` [s], drawn anew after `mean` ticks, or where it is None the one that gives most energy.
+    tau is one of `latencies` [s]. It is drawn anew after `mean` ticks on average. If `mean` is None, each tick has the
+    tau that gives the hand most energy.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-4, 0, HANDS), 10 ** rng.uniform(0, 3, HANDS)

@@ -148,9 +148,10 @@ def tick(F, A, B, period):
 
 
 def grown(damping, mean, seed=7):
-    """How many hands grow a hundredfold between a tenth of the ticks and the end.
+    """Return how many hands grow a hundredfold between a tenth of the ticks and the end.
 
-    Periods are drawn anew after `mean` ticks, or, where it is None, each is the one that gives the hand most energy.
+    Periods are drawn anew after `mean` ticks on average. If `mean` is None, each tick has the period that gives the
+    hand most energy.
     """
     rng = np.random.default_rng(seed)
     A, B = plants(damping, rng)

@@ -88,7 +88,7 @@ def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
     ("damping", "needs"), [(0.0, (1.0, 1.6764, 2.4319)), (2.0, (1.6154, 1.8630, 2.3639))], ids=["spring", "damped"]
 )
 def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
-    """A wall of 3000 N/m behind 2000 N/m and 2 N s/m, one, two and three ticks late."""
+    """A wall of 3000 N/m is behind 2000 N/m and 2 N s/m; forces are delayed by 0, 1 and 2 samples."""
     for theta, need in enumerate(needs):
         found = required_damping(bare(3000.0, damping, theta), SpringDamper([2000.0], [2.0]), "this-environment")
         assert found.required[0] == pytest.approx(need, abs=6e-5)
