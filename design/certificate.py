@@ -102,6 +102,7 @@ def prove(
 
     Raises:
         NotProved: No proof was found; the message gives the reason.
+        ValueError: The condition or a multiplier is not allowed.
     """
     import scipy
 
@@ -229,7 +230,7 @@ def _coefficients(value: Any) -> Iterator[float]:
             yield from _coefficients(part)
 
 
-_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the largest force or Delta_D/T
+_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the largest response or Delta_D/T
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
@@ -258,7 +259,7 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     if lost <= _MOST_LOST * scale:
         return None
     return (
-        f"in floating point the forces may be off by {lost / scale:.1e} of themselves, allowed is {_MOST_LOST:g}: "
+        f"rounding may change the forces by {lost / scale:.1e} of the largest one, allowed is {_MOST_LOST:g}: "
         "the running loop would differ from the proved one"
     )
 
@@ -291,10 +292,12 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
     if not certificate.limiter:
         return base
     if not (base.extensible or base is KNOWN_DEVICE):
-        raise ValueError(f"facts: {certificate.condition} has no multipliers for limited forces, but the file has")
+        raise ValueError(f"facts: the file has the limiter, but {certificate.condition} does not cover limited forces")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
-        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected equally many per device")
+        raise ValueError(
+            f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected c to have equally many per rho"
+        )
     limiter = LimitedForces(lags=len(c) // len(rho), held=rho)
     return LimitedKnownDevice(limiter) if base is KNOWN_DEVICE else limiter
 
@@ -329,7 +332,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
 def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> None:
     """Raise NotProved unless the certificate proves all its claims."""
     if certificate.proof != "rational":
-        raise NotProved(f"the certificate is {certificate.proof}: it carries no exact proof")
+        raise NotProved(f"the certificate's proof is {certificate.proof}, expected rational")
     if certificate.guarantee != condition.guarantee(loop):
         raise NotProved(f"{certificate.condition} does not guarantee {certificate.guarantee!r}")
     if certificate.available != loop.delta:
@@ -485,9 +488,9 @@ def requirements_of(
 ) -> dict[str, Requirement]:
     """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
-    A loop without bounds of its devices gets no known-device conditions. The environment is the nominal one and the
-    delays theta are constant; design.assessment adds ranges and switching. `known` is a certificate that holds; its
-    proof is not repeated.
+    Each condition is proved exactly if possible. `known` is a certificate that holds; its proof is not repeated. A loop
+    without bounds of its devices gets no known-device conditions. The environment is the nominal one and the delays
+    theta are constant; design.assessment adds ranges and switching.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)

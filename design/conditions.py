@@ -12,10 +12,10 @@ design.environments and design.known_device search for multipliers. design.certi
 way, and design.coupling_file stores the proofs.
 
 To add a hands' side, derive a class from `HandsSide` and state
-  `inputs`   one `Input` per scalar input. Its `moved` are the weights w_0 + w_1 z + .. of the input in the displacement
-             that f[k] multiplies: (1,) for dx; (0, 1) for xa of a latency, which f[k-1] multiplies; (-beta, beta) for
-             the speed v of a known device in f'(dx + beta dv), with `follows=0`. `slips` says whether the limiter's
-             slip is subtracted from the input;
+  `inputs`   one `Input` per scalar input. Its `moved` lists w_0, w_1, ..: the input is multiplied by w_0 + w_1 z + ..
+             in the displacement that f[k] multiplies. `moved` is (1,) for dx, (0, 1) for xa of a latency, which f[k-1]
+             multiplies, and (-beta, beta) for the speed v of a known device in f'(dx + beta dv). `follows` is 0 for a
+             speed and 1 for a displacement. `slips` says whether the limiter's slip is subtracted from the input;
   `damping`  the matrix over its inputs that is proportional to Delta_D;
   `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
   `unknowns` its multipliers, by name; `room`, `allowed` and `excess` state which values are allowed.
@@ -147,7 +147,7 @@ def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array
 
 
 def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
-    """Return whether phi (m,) [N s/m] makes E-hat + Phi passive at all frequencies, within _ROUNDING of the damping."""
+    """Return whether E-hat + Phi for phi (m,) [N s/m] is passive, up to _ROUNDING times the largest damping."""
     demand = delayed_environment_demand(delay(loop.psi, loop.T) @ loop.E(), phi)
     slack = _ROUNDING * float(max(even_damping(loop)))
     return hermitian_floor(demand.free + demand.gain, -slack / 2, -slack)[0] >= -slack
@@ -299,7 +299,7 @@ class Condition(ABC):
         return None
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
-        """Return the blocks to prove over the rationals, by the names of their matrices. Raises NotProved."""
+        """Return the blocks to prove over the rationals, by the names of their matrices. Raises SingularLoop."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         loops = enumerate(self._loops(loop))
         return {f"P{i or ''}": self.is_demand(self.demand(each, coupling, exact=True, **more)) for i, each in loops}
@@ -373,7 +373,7 @@ class Condition(ABC):
         return "these ranges" if loop.ranges else "this environment"
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        """Return the member of the ranges that a matrix belongs to, as the beginning of a message, or ""."""
+        """Return the name of the member of the ranges that a matrix belongs to, to begin a message with, or ""."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 
@@ -383,7 +383,7 @@ class Condition(ABC):
         return f"only the block of {self.name} is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
-        """Return `claim`, or the shortfall."""
+        """Return `claim` if the condition holds, otherwise the shortfall."""
         return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:
@@ -612,7 +612,8 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
     a limiter or walls. Friction of a device with several `axes` opposes its velocity in space. It must be at least
-    |W|_2 of these axes, because the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
+    |W|_2 of these axes, because the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for
+    a wrong number of steps or a negative one.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

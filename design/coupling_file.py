@@ -91,7 +91,7 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
             continue
         name = f"coupling {type(coupling).__name__}: form(), which files store, is another system than {method}()"
         if other is None:
-            raise InputError(f"{name}: it is a {built.kind} and has no compliance")
+            raise InputError(f"{name}: the form is a {built.kind} without a compliance")
         z = on_circle(frequencies(own))
         response = own.at(z)
         scale, apart = np.abs(response).max(), np.abs(response - other.at(z)).max()
@@ -176,6 +176,6 @@ def save(stored: Stored, path: str | Path) -> None:
     except (TypeError, msgspec.ValidationError) as error:
         known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
         own = [type(part).__name__ for part in known if type(part).__module__ != Network.__module__]
-        reason = f"a class of your own ({own[0]})" if own else " ".join(str(error).split())
+        reason = f"it has a class of your own ({own[0]})" if own else " ".join(str(error).split())
         raise InputError(f"{path}: the loop cannot be stored: {reason}") from None
     write(Path(path), msgspec.json.format(content, indent=1) + b"\n")

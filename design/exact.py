@@ -28,14 +28,14 @@ _Integers = NDArray[np.object_]
 
 @dataclass(frozen=True, eq=False)
 class Matrix:
-    """`num / den` with integer entries and one positive denominator."""
+    """The rational matrix `num / den`, with integer entries and one positive denominator."""
 
     num: _Integers  # (p, m), Python integers
     den: int = 1
 
     @classmethod
     def of(cls, rows: Any, shape: Any = None) -> Matrix:
-        """Convert rows of floats (read as decimals), integers, fractions or strings "p/q"."""
+        """Convert rows of floats (read as decimals), integers, fractions or strings "p/q" to a Matrix of this shape."""
         entries = [[rational(v) for v in row] for row in rows]
         shape = shape or getattr(rows, "shape", None) or (len(entries), len(entries[0]) if entries else 0)
         den = math.lcm(*(v.denominator for row in entries for v in row))
@@ -76,7 +76,7 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of an integer product, and what each bit of both adds
+_LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and of each bit of the two integers
 
 
 #: Matrix products of at most this many integer products (about 21 states) are computed without FLINT, because FLINT is
@@ -85,9 +85,9 @@ _FEW = 20_000
 
 
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
-    """Return the exact product X' M X, (m, m), of Python integers X (n, m) and M (n, n), by FLINT's matrices if large.
+    """Return the exact product X' M X, (m, m), of Python integers X (n, m) and M (n, n). FLINT computes large products.
 
-    Raises TooLong if the budget of `within` is spent.
+    Raises TooLong if the budget of controller.arithmetic.within is spent.
     """
     (n, m) = X.shape
     products = n * m * (n + m)
@@ -175,7 +175,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 _BITS = 192  # binary places of the rounded matrix whose definiteness is tested
-_FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; all entries have one unit
+_FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; all entries are multiples of one unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
 
@@ -223,10 +223,11 @@ def _less(W: _Integers, units: int) -> _Integers:
 
 
 def _definite(W: _Integers, bits: int) -> bool:
-    """Return whether the symmetric integer matrix W (n, n) > 0 is proved.
+    """Return whether the symmetric integer matrix W (n, n) is proved to be positive definite.
 
-    Between passes the entries are shortened to about 32 bits more than `bits`. Each entry then changes by less than one
-    unit, and the norm of the matrix by less than n units, which are subtracted from the diagonal.
+    Between passes the largest entry is shortened to 32 bits more than `bits`, and all others by as many bits. Each
+    entry then changes by less than one unit, and the norm of the matrix by less than n units, which are subtracted from
+    the diagonal.
     """
     for _ in range(budgets.DEFINITE_PASSES):
         floats = _floats(W)
@@ -306,12 +307,12 @@ _LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative
 _LEFT = 0.02  # Newton's steps end if the residual of the Riccati equation is below this share of e (`find_storage`)
 _UNIT = 2.0**-53  # unit roundoff of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and those of A, B, C and D, for each attempt of a proof
-_MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of `_kyp_matrix` is below this many of its units.
+_MOST_UNITS = 2.0**50  # A proof is tried only if the error bound of `_kyp_matrix` is below this many units u.
 _SAMPLES = 400  # approximate number of frequencies for the sizes of states
 
 
 def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
-    """Return the matrix of (KYP) in units of u = 2^-finer, and a bound on the norm of its error in them.
+    """Return the matrix of (KYP) in units of u = 2^-finer, and a bound on the norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
     multiples of 2^-bits; the rounded P is exactly known and may itself be a proof. The other matrices are rounded to
@@ -422,8 +423,8 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
-    D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation is
-    driven by e I, where e |(zI - A)^-1 B|^2 stays below the rest of mu. The equation is first solved in coordinates in
+    D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation has an
+    added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. The equation is first solved in coordinates in
     which white noise at the inputs moves all states equally and independently, where P is much better conditioned. The
     original states are tried next, and then the first coordinates with a larger share of mu. The result is transformed
     back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
@@ -509,7 +510,7 @@ def _states(G: Lti) -> NDArray[np.complex128]:
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
-    # `supremum` refines peaks within a fifth of the largest. With 1 - lambda they include all small lambda.
+    # `supremum` refines peaks within a fifth of the largest. Every small lambda gives such a peak of 1 - lambda.
     value, w = supremum(
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )
@@ -528,9 +529,9 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
 
-    Newton's steps in extended precision reduce the residual that rounding leaves, until it is below _LEFT times e or
-    after RICCATI_STEPS steps. Double precision is not enough where lightly damped modes make the margin small. Raises
-    LinAlgError without a solution.
+    Newton's steps in extended precision reduce the residual that rounding leaves. They end when it is below _LEFT times
+    e, or after RICCATI_STEPS steps. Double precision is not enough where lightly damped modes make the margin small.
+    Raises LinAlgError without a solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)
@@ -607,13 +608,13 @@ _Rows = tuple[tuple[str, ...], ...]
 
 
 def rows_of(M: Matrix) -> _Rows:
-    """Return every entry as a text "p/q" in lowest terms."""
+    """Return every entry as a text "p/q" in lowest terms, or "p" for an integer."""
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Return the reason why the named matrix does not prove that the block is strictly positive real, or None."""
-    if len(rows) != block.order:  # Only older files have the states that no input reaches.
+    if len(rows) != block.order:  # Only matrices in older files cover the states that no input reaches.
         block = reached(block)
     n = block.order
     if len(rows) != n:

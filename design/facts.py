@@ -59,7 +59,7 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return delta T/T_max (m,) [N s/m], which counts at a constant period T like delta in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m]: at a constant period T it dissipates what delta does in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T_k: the force map is the same at every tick.
@@ -364,7 +364,8 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 class Unknowns:
     """The numbers of one multiplier.
 
-    A search keeps each number between `least` and `most` times its unit; for the hands' side, s times each number.
+    A search keeps each number between `least` and `most` times its unit. For a multiplier of the hands' side, this
+    bounds s times the number.
     """
 
     name: str  # name of the multiplier in files
@@ -568,11 +569,11 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
 
 
 class PeriodCost(NamedTuple):
-    """A lower bound L of the energy of a period of a known device; (m,) each.
+    """The coefficients of a lower bound L of the energy of a period, (m,) each, for known devices.
 
-    L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the ends of the
+    L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step with the speeds v, v+ at the two ends of the
     period and vb = (v + v+)/2. The entries are floats or Fractions, in N/m, N s/m, N s^2/m and N s^2/m. The formulas
-    are those of a constant period T, with c0, c2 and q of design.known_device.
+    beside them hold for a constant period T, with c0, c2 and q of design.known_device.
     """
 
     move: Any  # c0/(T - q)
@@ -730,7 +731,7 @@ class Limited(Fact):
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         units = (1.0,) * len(loop.devices) * self.lags
-        return (Unknowns("c", units, "numbers >= 0, as many for each device", 0.0, 10.0, start=(0.0,) * len(units)),)
+        return (Unknowns("c", units, "numbers >= 0, equally many per device", 0.0, 10.0, start=(0.0,) * len(units)),)
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
         for i, d in enumerate(loop.per_channel(range(len(loop.devices)))):

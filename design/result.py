@@ -27,7 +27,9 @@ PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDIT
 
 
 #: the environments for which this-environment holds in a loop with walls, in words
-MAKING = "this environment, whose walls may make and break contact, have any gap, and be softer in proportion"
+MAKING = (
+    "this environment; its walls may have any gap, make and break contact, and be softer in stiffness and damping alike"
+)
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 #: limits of every certificate
@@ -170,7 +172,10 @@ class NotProved(ValueError):
 
 
 class DesignFailed(ValueError):
-    """No design could be verified. `problem` is the convex problem or None; `results` are the attempts."""
+    """No design could be verified. `problem` is the convex problem or None; `advice` is the message.
+
+    `results` are the attempts.
+    """
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice
@@ -250,7 +255,7 @@ class Design(Chosen):
         wall_s: The duration of the design [s].
         c: The multiplier of the limiter, one row per device, for loops in which its search takes long; otherwise None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
-        hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
+        hurried: Whether the time limit ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.
         phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
         certificate: The Certificate, if it was proved in this process.

@@ -155,7 +155,7 @@ def test_unequal_weights_need_enough_lag():
 
 def test_bad_requests_are_named():
     G = PAIR.sent(BUILT)
-    with pytest.raises(ValueError, match="as many for each device"):
+    with pytest.raises(ValueError, match="equally many per device"):
         limiter(G, (1, 2), DELTA, LAG, ((0.1,),))
     with pytest.raises(ValueError, match=r"beta is -0\.01, expected a number >= 0"):
         LimitedForces(-0.01)
@@ -233,9 +233,9 @@ def tampered(stored, **fields):
     [
         ({"c": (0.5, 0.5)}, "limiter: required is"),
         ({"c": (1.0, 1.0)}, "limiter: no proof was found"),
-        ({"c": (0.3, 0.1, 0.6)}, "expected equally many per device"),
+        ({"c": (0.3, 0.1, 0.6)}, "expected c to have equally many per rho"),
         ({"c": (-0.1, 0.7)}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
-        ({"c": (0.3,)}, "expected equally many per device"),
+        ({"c": (0.3,)}, "expected c to have equally many per rho"),
         ({"rho": (20.0, 20.0)}, "required is"),
         ({"rho": (-1.0, 10.0)}, "rho is"),
         ({"facts": ()}, "multipliers are"),
