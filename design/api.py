@@ -71,7 +71,7 @@ def design_coupling(
         required damping, from a sweep. `figure` is the name of the optimised figure, and `objective` is its value.
 
     Raises:
-        TypeError: An argument has the wrong type, or the kind does not have an option.
+        TypeError: An argument has the wrong type, or the kind has no option of this name.
         ValueError: The kind or the condition does not exist, or does not suit the loop.
         DesignFailed: No such coupling was found.
     """
@@ -136,7 +136,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
     every vertex is proved and the search finds no violation, the requirement is the largest of these environments.
-    Otherwise the search counts, too, and the requirement is not proved.
+    Otherwise it is the largest of these and of the search's worst environment, and it is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -225,7 +225,9 @@ def store(
     path: Path,
     assessment: Assessment | None = None,
 ) -> Filed:
-    """Save the coupling with its proof; `assessment` may contain proofs for ranges and for limited forces.
+    """Save the coupling with its proof, and return a summary of the file.
+
+    `assessment` may contain proofs for ranges and for limited forces.
 
     If the ranges are not proved by the design's condition, the stored loop has the nominal environment only, unless the
     condition holds in any environment. If switching delays are not proved, the stored loop has constant delays. Raises
@@ -289,7 +291,10 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
 
 
 def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
-    """Return the coupling of a design, or the coupling itself. Raises ValueError for a wrong number of channels."""
+    """Return the coupling of a design, or the coupling itself.
+
+    Raises TypeError for anything else, and ValueError for a wrong number of channels.
+    """
     alone = bare(coupling)
     Stored.of(loop, alone)
     return alone

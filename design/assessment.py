@@ -124,7 +124,7 @@ class RangesResult:
         return places[i], requirements[i]
 
     def part(self) -> dict[str, Any]:
-        """Return the fields of its JSON."""
+        """Return the record as fields for JSON."""
         member, requirement = self.worst
         inside: dict[str, Any] = {"samples": len(self.samples), "certified": 0, "seed": self.seed}
         inside |= {"worst_ratio": None, "worst": None}
@@ -237,7 +237,7 @@ def _proved_ranges(
 
 
 def violated_between(where: str, place: Member, ratio: float) -> str:
-    """Return why ranges that are proved at the vertices `where` are not guaranteed: a violation between them."""
+    """Return the reason why ranges are not guaranteed although they are proved at the vertices `where`."""
     needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
@@ -278,7 +278,7 @@ class ForceLimits:
     proof: str = "sampled"
 
     def within(self, force_limit: Sequence[float]) -> ForceLimits:
-        """Return the record with other limits (m,) [N], which no proof depends on."""
+        """Return the record with other limits (m,) [N]; no proof depends on them."""
         return replace(self, force_limit=tuple(force_limit))
 
     @property
@@ -305,7 +305,7 @@ class ForceLimits:
         return self.rho is not None and self.proof == "rational"
 
     def part(self) -> dict[str, Any]:
-        """Return the fields of its JSON."""
+        """Return the record as fields for JSON."""
         shown = {"rho": self.rho, "force_limit": self.force_limit, "reason": self.reason, "words": self.words}
         return shown | {"certificate": self.requirement, "c": self.c, "energy_budget": self.energy_budget}
 
@@ -430,7 +430,7 @@ class Guarantee:
         return self.environments
 
     def part(self) -> dict[str, Any]:
-        """Return the fields of its JSON."""
+        """Return the record as fields for JSON."""
         delays = {"lo": self.delays.lo, "hi": self.delays.hi}
         part: dict[str, Any] = {"condition": self.condition, "proof": self.proof, "facts": self.facts}
         part |= {"hands": self.hands, "environments": self.environments, "forces": self.forces}
@@ -503,7 +503,7 @@ class Assessment:
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
-        """Return the fields of its JSON."""
+        """Return the record as fields for JSON."""
         loop, gains = self.loop, self.gains
         about = {"T_s": loop.T, "T_max_s": loop.T_max, "latency_s": loop.latency}
         about |= {name: getattr(loop, name) for name in ("theta", "psi", "lam", "delta")}
@@ -547,8 +547,8 @@ def assess(
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
-        energy_budget: W0 [J] of the shell (default: 0 for a function, 2 mJ for a MuJoCo world), or without a shell
-            that of an energy budget at the devices (controller.budget; default: no budget).
+        energy_budget: W0 [J] of the shell; the default is 0 for a function and 2 mJ for a MuJoCo world. Without a
+            shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
         certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or
@@ -714,7 +714,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 
 def _over_ranges(assessment: Assessment) -> Guarantee | None:
-    """Return the guarantee for the ranges, or None without a proof, or if no member of the ranges runs."""
+    """Return the guarantee for the ranges, or None if they are not proved or no member of them runs."""
     ranges = assessment.ranges
     if not (ranges and ranges.proved) or all(assessment.environment != each.network for each in ranges.members):
         return None

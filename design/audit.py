@@ -68,7 +68,7 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
-    """Return the requirement at T [s] with the same coefficients and delays in samples; T_max and T_min scale."""
+    """Return the requirement at T [s] with the same coefficients and delays in samples; T_max, T_min scale with T."""
     longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest, T_min=shortest)
 
@@ -152,8 +152,8 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Condition) -> _Stiffest
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
     """Return the largest certified K of each channel, at most 2 (delta - B)/T.
 
-    This is (e) of docs/theory.md at z^(theta + 1) = -1. Without a latency the set of certified gains is convex and
-    contains K -> 0, so there is only one edge.
+    This bound follows from (e) of docs/theory.md at z^(theta + 1) = -1. Without a latency the set of certified gains is
+    convex and contains K -> 0, so there is only one edge.
     """
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
@@ -241,10 +241,10 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """Return an argument at which the damping suffices, within _EDGE of the edge towards `outside`, relative to itself.
+    """Return an argument at which the damping suffices, within a relative _EDGE of the edge between the two arguments.
 
-    If the damping suffices at `outside`, that is the result. The distance to the edge is that between the two nearest
-    arguments on its sides, or an estimate by their secant. The steps are bisection, or inverse quadratic interpolation
+    The damping must suffice at `inside`. If it suffices at `outside`, that is the result. The distance to the edge is
+    at most the width of the bracket; a secant estimates it. The steps are bisection, or inverse quadratic interpolation
     where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997). They aim half of _EDGE inside the edge, so that
     the last one is usually the result. Five values of `ratio` take less time than importing scipy.optimize.brentq.
     """

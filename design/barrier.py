@@ -251,7 +251,7 @@ def _solve_positive(H: Array, b: Array) -> Array:
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
-    """Minimise t (|A x - b|^2 + c'x) - sum log det S from a strictly feasible x."""
+    """Return an approximate minimiser of t (|A x - b|^2 + c'x) - sum log det S; the start x is strictly feasible."""
     cost = program.step_cost
     for _ in range(budgets.CENTRING_STEPS):
         spend(cost)

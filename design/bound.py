@@ -17,9 +17,10 @@ this bound is
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
 D >= 0, which lowers the bound on J. The bound on J is then proved.
-The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: only the proved bound is
-zero, or the psi differ, so that the zero combinations are known up to rounding only. The integrals over the band are
-computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are subtracted.
+The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero
+and the estimate is not, or the psi differ, so that the zero combinations are known up to rounding only. The integrals
+over the band are computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are
+subtracted.
 """
 
 from __future__ import annotations
@@ -86,8 +87,8 @@ class _Bound:
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
     """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
-    The loop has up to MOST channels. Periods up to T_max are replaced by even periods with less damping, as in the
-    condition.
+    The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
+    T_max are replaced by even periods with less damping, as in the condition.
     """
     started = time.perf_counter()
     even = tuple(even_damping(loop).tolist())
@@ -175,7 +176,7 @@ class _Dual:
         return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
-        """Return D's slopes in the unknowns of C_0 and the C_k, (k, unknowns, m, m), before the Hermitian part."""
+        """Return D's slopes in the unknowns of C_0 and the C_k, (k, unknowns, m, m); D takes their Hermitian part."""
         m, z = self.loop.channels, on_circle(w)
         triangle = _triangle(m)
         slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
@@ -367,7 +368,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E with a causal R. Row i of
     s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels'
     psi differ, these products lie in a subspace; v is orthogonal to it and is computed as a null space, up to rounding.
-    Only the first steps of long delays are used, because any subset of the sums gives a bound.
+    Only the first steps of long delays are used; any subset of the sums gives a bound.
     """
     import scipy
 
