@@ -60,7 +60,7 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Evaluate F with all walls touching, and each condition's requirement and demand over frequency.
+    """Evaluate F with all walls touching, each condition's requirement, and the required damping over frequency.
 
     The conditions are the plain ones and a user's `own`; `known` are requirements from an assessment of this loop and
     coupling. Raises SingularLoop if the algebraic loop has no solution.

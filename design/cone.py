@@ -141,7 +141,7 @@ class ConeProgram:
         statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
         if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
             raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
-        advice = "try fewer delays, a larger damping or a lower order; the error carries the problem"
+        advice = "try shorter delays, a larger damping or a lower order; the error's `problem` is the convex problem"
         raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 
     def violation(self, x: Array) -> float:
@@ -293,7 +293,10 @@ class _Newton:
         self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
-        """Return (dx, dS, dZ, longest step in S, in Z), steps at most 1, towards S Z = mu I with dZ dS = `left`."""
+        """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I; no step is longer than 1.
+
+        `left` is the second-order term dZ dS.
+        """
         import scipy
 
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
@@ -304,7 +307,7 @@ class _Newton:
         return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
 
     def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
-        """Return dZ for dS from the linearised equation S Z = mu I, with dZ dS = `left`."""
+        """Return dZ for dS from the linearised equation S Z = mu I, with the second-order term `left`."""
         parts = zip(self._Z, dS, left, self._inverse, strict=True)
         return [hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 

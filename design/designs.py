@@ -149,7 +149,7 @@ def design_by_kind(
         raise ValueError(f"{reason}{_before_walls(loop)}")
     if chosen.model and options.get("limiter") and (reason := LIMITER.not_designed(loop)):
         with_less = {**options, "limiter": False, "bases": ((4, 3),)}
-        raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
+        raise ValueError(f"{reason}{_instead(loop, 'leaving out --limiter', kind, **with_less)}")
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
     make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
@@ -263,7 +263,7 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
     with suppress(ValueError, DesignFailed):
         design = design_by_kind(loop, kind, **options)
         if design.requirement.certified:
-            return f"; {words} gives one that needs {design.requirement.ratio:.4g} of the damping"
+            return f"; {words} gives a coupling that needs {design.requirement.ratio:.4g} of the damping"
     return ""
 
 

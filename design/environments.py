@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block`, affine in s and `multiplier`, in which the values of `hands` are multiplied by s."""
+        """Return `block`, affine in s and `multiplier`, which holds s times the multipliers of the hands' side."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -597,9 +597,9 @@ _MOST_STATES = 30  # most states of E-hat for which a storage matrix is searched
 def least_multiplier(loop: Loop) -> Array:
     """Return a diagonal Phi (m,) [N s/m] with E-hat + Phi passive and Phi < Delta_D, within the solver's tolerance.
 
-    Delta_D and delta are multiplied by T/T_max. Up to _MOST_STATES states the sum of Phi_i/delta_i is least among the
-    Phi below `most`. Raises Infeasible, with the damping that would be needed, if no Phi, diagonal or not, is below
-    Delta_D, and DesignFailed if no diagonal Phi is found.
+    Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Up to
+    _MOST_STATES states the sum of Phi_i/delta_i is least among such Phi. Raises Infeasible, with the damping that would
+    be needed, if no Phi, diagonal or not, is below Delta_D, and DesignFailed if no diagonal Phi is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)

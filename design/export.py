@@ -93,7 +93,7 @@ class _Trial:
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """Return V(z), which maps forces to displacements. Raises ValueError for a coupling that has no V around Psi E."""
+    """Return the block V(z) from forces to displacements. Raises ValueError for a coupling without a V around Psi E."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         reason = "this coupling is not a V in feedback around the environment; export its process with --process"
@@ -108,7 +108,7 @@ def process_block(
     force_limit: Sequence[float] | None = None,
     balls: Sequence[slice] = (),
 ) -> ExportedBlock:
-    """Return F(z) of (6), which maps displacements to forces.
+    """Return the block F(z) of (6) from displacements to forces.
 
     Args:
         stored: The coupling with its loop.
