@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
@@ -28,11 +28,9 @@ from threadpoolctl import threadpool_limits
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import Timing
-from haptic_loop.controller.law import Law
-from haptic_loop.controller.lti import Array
+from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.ranges import Member
-from haptic_loop.controller.tick import Process
-from haptic_loop.models.hold import hold
+from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
 from haptic_loop.sim.accuracy import simulated_growth
@@ -44,11 +42,11 @@ from haptic_loop.sim.stability import (
     ClosedLoop,
     ImpulseTest,
     Mode,
+    close,
     disagree,
     dominant_mode,
-    exact_loops,
     impulse_test,
-    mujoco_loops,
+    mujoco_plants,
 )
 from haptic_loop.sim.switching import Switched, switched_crowd
 
@@ -245,9 +243,9 @@ def _group(
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
     late = scenario.usual_latency
-    loops = exact_loops(held_by, simulation.F, late=late)
-    frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
-    mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
+    plants = hold(held_by.plants(), scenario.T, late)
+    loops, frozen = close(plants, simulation.F), simulation.process.law.frozen().values()
+    mode = _dominant(plants, frozen) if simulation.process.walls else dominant_mode(loops)
     damping = np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)
     lossless = np.stack([port.damping.max(axis=1) for port in crowd.ports], axis=1).min(axis=1) == 0
     other, growth = _other_engine(validation, simulation, held_by, crowd, frozen)
@@ -257,7 +255,7 @@ def _group(
     if validation.ticks:
         if other:
             witnesses = _witnessed(validation, index, mode.growth, lossless)
-        exact = _traced(validation, simulation, held_by, loops, other, witnesses, ticked)
+        exact = _traced(validation, simulation, held_by, loops, plants, other, witnesses, ticked)
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
         also = other if validation.ticks else None
@@ -293,11 +291,11 @@ def _other_engine(
     simulation: Simulation,
     held_by: Variants,
     crowd: Crowd | HumanSets,
-    frozen: Sequence[Process],
+    frozen: Collection[Lti],
 ) -> tuple[_Other | None, Array | None]:
     """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
 
-    `frozen` are the processes of the contact states. The map of a user's own engine is measured with every basis state.
+    `frozen` are the force maps of the contact states. The map of a user's own engine is measured by every basis state.
     """
     if not isinstance(validation.engine, str):
         drawn = crowd.mechanics or ((),) * len(crowd)
@@ -312,9 +310,14 @@ def _other_engine(
     if validation.engine == "exact":
         return None, None
     late = validation.scenario.usual_latency
-    maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
-    growth = Mode.worst([dominant_mode(loop) for loop in maps]).growth
+    plants = mujoco_plants(held_by, simulation.process, nthread=validation.threads, late=late)
+    growth = _dominant(plants, frozen).growth
     return partial(_batch, held_by, validation.scenario.T, validation.threads), growth
+
+
+def _dominant(plants: HeldPlant, frozen: Iterable[Lti]) -> Mode:
+    """Return the dominant mode of each plant with the force map for which it grows fastest."""
+    return Mode.worst([dominant_mode(close(plants, F)) for F in frozen])
 
 
 def _batch(
@@ -352,6 +355,7 @@ def _traced(
     simulation: Simulation,
     held_by: Variants,
     loops: ClosedLoop,
+    plants: HeldPlant,
     other: _Other | None,
     witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
@@ -362,13 +366,14 @@ def _traced(
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks
-    balance, engine = Balance.of(held_by, simulation.loop, late), ExactEngine(hold(held_by.plants(), T, late))
-    exact = impulse_test(process, engine, held_by.scene, loops, balance, ticks)
+    balance = Balance.of(held_by, simulation.loop, late)
+    exact = impulse_test(process, ExactEngine(plants), held_by.scene, loops, balance, ticks)
     if not other:
         return exact
     timing = Timing(np.array([T]), np.array([late])) if late else None
     few = held_by.taken(witnesses)
-    settings = few.scene, exact_loops(few, simulation.F, late=late), Balance.of(few, simulation.loop, late), ticks
+    own = ClosedLoop(loops.A[witnesses], loops.B[witnesses], T)
+    settings = few.scene, own, Balance.of(few, simulation.loop, late), ticks
     last = impulse_test(process, other(witnesses, EXPONENTIAL, timing), *settings, ticked)
     growth, error, clipped = (getattr(exact, name).copy() for name in ("growth", "error", "clipped"))
     growth[witnesses], error[witnesses], clipped[witnesses] = last.growth, last.error, last.clipped

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from haptic_loop.sim.trace import Trace
 MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s] below this growth rate the errors of engines may change its sign
 _JUDGED = 4.0, 20.0, 100.0  # [s] durations, tried in turn until the sign of a varying loop's growth is certain
+_SHIFT, _INVERSE_STEPS = 1e-11, 4  # distance from the eigenvalue and number of steps of inverse iteration
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
 _SHORTEST_TRACE = 200  # ticks that a growth rate needs
 SETTLED = 10.0  # time constants before which fast decaying modes may still hide a slow growing one
@@ -61,9 +62,13 @@ class ClosedLoop:
     B: Array  # (..., n, outside)
     T: float  # [s]
 
+    @cached_property
+    def eigenvalues(self) -> NDArray[np.complex128]:  # (..., n)
+        return np.linalg.eigvals(self.A).astype(complex)
+
     def growths(self, *min_frequency_hz: float) -> list[Array]:
         """Return the growth [1/s] of the dominant mode at or above each of these frequencies [Hz]."""
-        values = np.linalg.eigvals(self.A)
+        values = self.eigenvalues
         size, hz = np.abs(values), np.abs(np.angle(values)) / (2 * np.pi * self.T)
         return [np.log(np.where(hz >= least, size, _NO_MODE).max(axis=-1)) / self.T for least in min_frequency_hz]
 
@@ -116,16 +121,23 @@ def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
 
 def dominant_mode(loop: ClosedLoop) -> Mode:
     """Return the mode of largest modulus of one loop, or of each loop of a stack."""
-    values = np.linalg.eigvals(loop.A)
-    largest = np.argmax(np.abs(values), axis=-1)[..., None]
-    return Mode(np.take_along_axis(values, largest, axis=-1)[..., 0].astype(complex), loop.T)
+    largest = np.argmax(np.abs(loop.eigenvalues), axis=-1)[..., None]
+    return Mode(np.take_along_axis(loop.eigenvalues, largest, axis=-1)[..., 0], loop.T)
 
 
 def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
-    """Return the dominant mode's unit left eigenvector (..., n); left* xi contains that mode alone."""
-    values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
-    largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
-    return np.take_along_axis(vectors, largest, axis=-1)[..., 0].conj()
+    """Return the dominant mode's unit left eigenvector (..., n); left* xi contains that mode alone.
+
+    A step of inverse iteration multiplies the share of another mode by _SHIFT over its distance from the dominant one.
+    """
+    n, mode = loop.A.shape[-1], dominant_mode(loop)
+    shift = (mode.eigenvalue + _SHIFT)[..., None, None] * np.eye(n)
+    inverse = np.linalg.inv(np.swapaxes(loop.A, -1, -2) - shift)
+    left = np.sin(1.0 + np.arange(n))[:, None].astype(complex)  # irregular, so not orthogonal to an eigenvector
+    for _ in range(_INVERSE_STEPS):
+        left = inverse @ left
+        left = left / np.linalg.norm(left, axis=-2, keepdims=True)
+    return left[..., 0].conj()
 
 
 def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
@@ -133,36 +145,39 @@ def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequen
     return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
-def mujoco_loops(
+def mujoco_plants(
     variants: Variants,
     process: Process,
     integrator: str = "RK4",
     substeps: int = 4,
     nthread: int = 0,
     late: Sequence[float] | None = None,
-) -> ClosedLoop:
-    """Return the closed loops that MuJoCo simulates: its map over one period, joined with the process.
+) -> HeldPlant:
+    """Return MuJoCo's map of the plants over one period; with `late` (m,) [s], held forces are states.
 
-    The plant is linear, so one period from each basis state and with each force alone gives its map. One batch holds
-    one simulation for each state and each force of every set of humans; with `late` (m,) [s] held forces are states.
+    The plants are linear, so a step from each basis state and with each force alone gives the map of a step. The map of
+    a period is a power of the map of a substep, unless forces latch between substeps.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     n = variants.states + (m if late else 0)
     timing = Timing(np.array([T]), np.array([late])) if late else None
+    once, powers = (substeps, 1) if late else (1, substeps)
     # unit forces stay within the actuators' limits
     unit = np.concatenate([np.ones(n), np.minimum(1.0, process.force_limit / 2)])
     unit[n - m : n] = unit[n:] if late else 1.0
-    buffer = StepBuffer(process, 1, n, variants.scene.outside, nsim * (n + m))
-    basis = np.tile(np.diag(unit), (1, nsim))
-    buffer.s[0], buffer.f[0] = basis[:n], basis[n:]
+    buffer = StepBuffer(process, 1, n, variants.scene.outside, nsim)
+    step = np.zeros((nsim, n + m, n + m))
+    step[:, n:, n:] = np.eye(m)
     with profiler_off(), quiet_warnings():
-        each = variants.repeated(n + m)
-        engine = MujocoBatchEngine(each, T, integrator, substeps, nthread, timing)
-        engine.start(buffer)
-        engine.advance(0)
-    columns = buffer.s[1].reshape(n, nsim, n + m).transpose(1, 0, 2) / unit
-    held = HeldPlant(columns[:, :, :n], columns[:, :, n:], np.eye(m, n), process.F.T)
-    return close(held, process.F)
+        engine = MujocoBatchEngine(variants, T / powers, integrator, once, nthread, timing)
+        for j, size in enumerate(unit):
+            buffer.s[0], buffer.f[0] = 0.0, 0.0
+            (buffer.s[0, j] if j < n else buffer.f[0, j - n])[:] = size
+            engine.start(buffer)
+            engine.advance(0)
+            step[:, :n, j] = buffer.s[1].T / size
+    period = np.linalg.matrix_power(step, powers)
+    return HeldPlant(period[:, :n, :n], period[:, :n, n:], np.eye(m, n), T)
 
 
 # ---- one simulation: verdicts of its eigenvalues and of its trace
@@ -539,6 +554,17 @@ def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[floa
     return rate, window
 
 
+def _parts(weights: NDArray[np.complex128]) -> Array:
+    """Return the real and the imaginary parts of weights (nsim, entries), (2, entries, nsim), for `_projected`."""
+    return np.ascontiguousarray([weights.real.T, weights.imag.T])
+
+
+def _projected(parts: Array, rows: Array) -> NDArray[np.complex128]:
+    """Return the weighted sum (ticks, nsim) of the entries of each row, (ticks, entries, nsim)."""
+    real, imaginary = np.einsum("cen,ken->ckn", parts, rows)
+    return real + 1j * imaginary
+
+
 class _Speeds:
     """Sums of the handles' squared speeds over two windows of ticks, (nsim,) each."""
 
@@ -560,8 +586,10 @@ class _Audit:
         nsim, self._balance = loops.A.shape[0], balance
         self._process, self._law = process, process.ticked
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
-        self._B, self._T = loops.B, loops.T
-        self._left = _left_eigenvector(loops)  # (nsim, n)
+        self._T = loops.T
+        if not process.walls:  # with walls the loop switches between linear loops, so it has no single mode
+            left = _left_eigenvector(loops).conj()
+            self._left, self._pushed = _parts(left), _parts(np.einsum("ns,nsw->nw", left, loops.B))
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
         self._linear = np.ones(nsim, dtype=bool)
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)
@@ -586,27 +614,31 @@ class _Audit:
         self._usable += linear.sum(axis=0)
         self._linear = linear[-1]
 
-        audited = np.ones_like(linear) if law.bounds else linear
-        work, spent = (np.where(audited[:, None], part, 0.0).sum(axis=1) for part in self._balance.terms(buffer, count))
+        work, spent = self._balance.terms(buffer, count)
+        whole = linear.all()
+        if not (whole or law.bounds):
+            work, spent = (np.where(linear[:, None], part, 0.0) for part in (work, spent))
+        work, spent = work.sum(axis=1), spent.sum(axis=1)
         energy = self._energy + np.cumsum(work + spent, axis=0)
         self._least = np.minimum(self._least, energy.min(axis=0))
         self._energy = energy[-1]
         self._size += (np.abs(work) + spent).sum(axis=0)
 
         self._speeds.see(buffer, first, count)
-        if law.walls:  # the loop switches between linear loops, so it has no single mode
+        if law.walls:
             return
         xi = np.concatenate([s, z], axis=1)
-        y = np.einsum("ns,ksn->kn", self._left.conj(), xi)
-        pushed = np.einsum("ns,nsw,kwn->kn", self._left.conj(), self._B, w[:count], optimize=True)
-        y, after = np.where(linear, y[:-1], 0), y[1:] - pushed
+        y = _projected(self._left, xi)
+        y, after, xi = y[:-1], y[1:] - _projected(self._pushed, w[:count]), xi[:-1]
+        if not whole:
+            y, xi = np.where(linear, y, 0), np.where(linear[:, None], xi, 0.0)
         across, weight = y.conj() * after, np.abs(y) ** 2
         if first < self._half <= first + count:
             until = self._half - first
             self._first = self._across + across[:until].sum(axis=0), self._weight + weight[:until].sum(axis=0)
         self._across = self._across + across.sum(axis=0)
         self._weight = self._weight + weight.sum(axis=0)
-        self._squares += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
+        self._squares += np.einsum("ksn,ksn->n", xi, xi)
 
     def result(self, simulated: float) -> ImpulseTest:
         above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._squares)

@@ -16,7 +16,7 @@ from haptic_loop.models.scene import Variants, crowds, variants
 from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
 from haptic_loop.sim.run import assemble, run_block
 from haptic_loop.sim.scenario import load
-from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
+from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_loops, mujoco_plants, unstable
 from tests.checks.tightness import attempts
 
 pytestmark = pytest.mark.benchmark(group="validation")
@@ -40,7 +40,7 @@ def test_verdicts(benchmark, held_by, coupling, request):
 
     exact = benchmark.pedantic(once, rounds=7, iterations=1, warmup_rounds=1)
     begin = time.perf_counter()
-    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process)).growth
+    mujoco = dominant_mode(close(mujoco_plants(held_by, simulation.process), simulation.F)).growth
     wall = time.perf_counter() - begin
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     wrong = int(disagree(exact, mujoco).sum())
@@ -105,7 +105,8 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     with profiler_off():
         benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
-    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, substeps=substeps)).growth
+    plants = mujoco_plants(held_by, simulation.process, substeps=substeps)
+    mujoco = dominant_mode(close(plants, simulation.F)).growth
     error, wrong = np.abs(mujoco - exact).max(), int(disagree(exact, mujoco).sum())
     print(
         f"\nMuJoCo batch RK4 x {substeps}: loop / raw steps {np.median(ratios):.2f} (median of {len(ratios)}), growth "

@@ -27,7 +27,7 @@ from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario, held_by, parse, save_humans
-from haptic_loop.sim.stability import dominant_mode, exact_loops, mujoco_loops
+from haptic_loop.sim.stability import close, dominant_mode, exact_loops, mujoco_plants
 
 TEXT = """
 name = "space"
@@ -298,7 +298,7 @@ def test_engines_agree_on_hands_in_space() -> None:
     for _, crowd in Validation(space, COUPLING, 3, 6, 0, "both", 0.0).crowds(range(6)):
         each = variants(space.device, crowd)
         growths = [dominant_mode(loops).growth for loops in (
-            exact_loops(each, simulation.F), mujoco_loops(each, simulation.process, substeps=8)
+            exact_loops(each, simulation.F), close(mujoco_plants(each, simulation.process, substeps=8), simulation.F)
         )]  # fmt: skip
         assert np.abs(growths[0] - growths[1]).max() < 1e-6
         assert (growths[0] != 0).all()

@@ -12,7 +12,7 @@ from haptic_loop.sim.adversary import _DESTABILISED, search
 from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import load
-from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
+from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_loops, mujoco_plants, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
 HUMANS = 100
@@ -81,7 +81,8 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's one-period map give the exact verdict for every hand."""
     simulation = assemble(load(scenario), optimal())
-    mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), simulation.process)).growth
+    loops = close(mujoco_plants(held(scenario, lossless), simulation.process), simulation.F)
+    mujoco = dominant_mode(loops).growth
     assert mujoco.max() < _DESTABILISED
     assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 

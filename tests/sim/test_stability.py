@@ -21,7 +21,7 @@ from haptic_loop.sim.stability import (
     _measured_growth,
     close,
     dominant_mode,
-    mujoco_loops,
+    mujoco_plants,
     ringing,
     verdict,
 )
@@ -113,7 +113,8 @@ def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys, monke
     scenario = load()
     simulation = assemble(scenario, read_coupling(path).built())
     crowd = HumanSets((scenario.human,), scenario.person)
-    loops = mujoco_loops(variants(scenario.device, crowd), simulation.process, "exponential", 1)
+    plants = mujoco_plants(variants(scenario.device, crowd), simulation.process, "exponential", 1)
+    loops = close(plants, simulation.F)
     values = np.linalg.eigvals(loops.A[0]).astype(complex)
     poles = np.log(values[np.abs(values) > 1e-6]) / scenario.T
     ratio = (-poles.real / np.abs(poles)).min()

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from dataclasses import fields, replace
+from math import factorial
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from haptic_loop.sim.stability import (
     dominant_mode,
     exact_loops,
     impulse_forces,
-    mujoco_loops,
+    mujoco_plants,
     unstable,
 )
 from haptic_loop.sim.verdicts import Traces, disagreement_words
@@ -125,7 +126,8 @@ def test_stacked_people_equal_single_ones(devices):
         np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
     simulation = assemble(scenario, PUBLISHED["I"])
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
-    np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, simulation.process)).growth, exact, atol=1e-3)
+    plants = mujoco_plants(held_by, simulation.process)
+    np.testing.assert_allclose(dominant_mode(close(plants, simulation.F)).growth, exact, atol=1e-3)
     # The arms equal those of people who hold one device each.
     np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
 
@@ -179,8 +181,27 @@ def test_mujoco_maps_are_the_exact_maps(devices):
     simulation = assemble(scenario, PUBLISHED["I"])
     held_by = variants(devices, crowd(40, 2))
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
-    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process)).growth
+    mujoco = dominant_mode(close(mujoco_plants(held_by, simulation.process), simulation.F)).growth
     np.testing.assert_allclose(mujoco, exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
+def test_mujoco_maps_are_runge_kutta_polynomials(devices):
+    """MuJoCo's map of a period is four times Runge-Kutta's polynomial of order 4 in the plant's matrix."""
+    held_by, process = (
+        variants(devices, crowd(5, 2)),
+        assemble(SCENARIO.replace(device=devices), PUBLISHED["I"]).process,
+    )
+    held, plants = mujoco_plants(held_by, process), held_by.plants()
+    h, m = process.F.T / 4, process.channels
+    for A, B, own_A, own_B in zip(plants.A, plants.B[:, :, -m:], held.A, held.B, strict=True):
+        powers = [np.linalg.matrix_power(h * A, i) / factorial(i + 1) for i in range(5)]
+        step, by = sum((i + 1) * power for i, power in enumerate(powers)), h * sum(powers[:4]) @ B
+        period = np.linalg.matrix_power(step, 4)
+        forced = sum(np.linalg.matrix_power(step, i) for i in range(4)) @ by
+        # the sixteen accelerations of a period are sums of a few terms, rounded to 1e-16 of the largest
+        np.testing.assert_allclose(own_A, period, rtol=0, atol=1e-13 * np.abs(period).max())
+        np.testing.assert_allclose(own_B, forced, rtol=0, atol=1e-13 * np.abs(forced).max())
 
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
@@ -322,8 +343,8 @@ def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
     """MuJoCo's Euler calls unstable loops stable; the command must fail and store the humans."""
     monkeypatch.setattr(
         examine_module,
-        "mujoco_loops",
-        lambda held_by, process, nthread, late: mujoco_loops(held_by, process, "Euler", 1),
+        "mujoco_plants",
+        lambda held_by, process, nthread, late: mujoco_plants(held_by, process, "Euler", 1),
     )
     file = tmp_path / "r.json"
     options = ["--case", "none", "--humans", "20", "--duration", "0", "--no-plot"]
