@@ -31,7 +31,7 @@ _SPARE_POLE = 0.5  # The initial poles of the states after the first are powers 
 
 
 class _Units:
-    """A loop in units T = 1 and usable damping = I, where matrix inequalities are well scaled."""
+    """A loop in units T = 1 and usable damping (lmi.usable) = I, where matrix inequalities are well scaled."""
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None) -> None:
         loop, self.usable, self.T = shaping.loop, shaping.usable, shaping.loop.T

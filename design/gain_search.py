@@ -275,7 +275,8 @@ def _slsqp(
     """Return x (n,) after at most `most` steps of SLSQP: least objective where constraint(x) (m,) >= 0.
 
     With SciPy 1.17 the compiled routine is called in a loop like that of `minimize`, because the import of
-    scipy.optimize takes 0.2 s. Its state and workspace differ between releases, so others use `minimize` itself.
+    scipy.optimize takes 0.2 s. The routine's state and workspace differ between releases, so with any other release
+    `minimize` itself is called.
     """
     import scipy  # slow to load
 

@@ -158,7 +158,7 @@ def _principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
 
     Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
     Jacobi's rotations, whose additions, products and roots round alike on every machine. So every machine can check a
-    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii.
+    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii. Raises NotProved if this is not positive.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)
@@ -656,7 +656,7 @@ class KnownDevice(Condition):
 
     The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number each per channel, and of
     the facts' multipliers. The first three are 0 if the condition `plain`, which ignores the device bounds, requires
-    less damping. The bounds of q are also 0 where the damping does not suffice, and no proof needs them.
+    less damping. The bounds of q are also 0 where the damping does not suffice, because then no proof needs them.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
@@ -698,7 +698,7 @@ class KnownDevice(Condition):
         )
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block at the loop's damping, with gain 0 for beta > 0, as L is not proportional to the damping."""
+        """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m, straight = loop.channels, _straightened(loop)

@@ -31,8 +31,8 @@ def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: fl
 
     sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n) and S2 = sum g_n conj(a_n)/(w_n^2 c_n). Here
     a_n = delta + j m w_n, g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. The terms are rational in w_n.
-    Their denominator is d = b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2 with W = w_n^2, and W d in S0. The sums
-    of their partial fractions are cotangents.
+    With W = w_n^2 their denominator is d = b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2 in S2, and W d in S0. The
+    sums of their partial fractions are cotangents.
     """
     high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
     root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))

@@ -229,7 +229,7 @@ def design(
 
     any-environment reduces ||W1 L W2||_inf (23) over the exact set of gains (for psi >= 1, that of one Phi) until the
     norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is reached
-    from the starts, above FEW channels the first one. known-device-any maximises the sum of K.
+    from the starts, or with more than FEW channels the first one. known-device-any maximises the sum of K.
 
     Args:
         loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
@@ -625,7 +625,7 @@ def _rounded_inverse(level: Array) -> Array:
 
 
 def _late_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of l (Q d)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q.
+    """Return the coefficients chi_k of l (Q d)^-1 l*/4, l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], for the best Q.
 
     d is (1 - RESERVE) delta.
     """
@@ -640,9 +640,10 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
-    """Return chi_k of |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha), where v is the mean window and h = (hi - lo)/2.
+    """Return the coefficients chi_k of |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha) for switching delays.
 
-    d is (1 - RESERVE) delta/T_max. A constant delay has no alpha.
+    v is the mean of the windows of lo and hi, h = (hi - lo)/2, and d = (1 - RESERVE) delta/T_max. A constant delay has
+    no alpha.
     """
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2

@@ -26,8 +26,8 @@ class Transparency:
         tau: Ratio (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1].
         relative_mismatch: Ratio: sup over the band of sigma_max(M) / sigma_max(E).
         rms_mismatch: Ratio: rms over log frequency in the band of ||M||_F / ||E||_F.
-        dc_ratio: sigma_max F(1) / sigma_max E(1), the share of the static stiffness that is felt.
-        high_frequency_gain: Ratio: sup above 100 Hz of sigma_max(F) / sigma_max(E).
+        dc_ratio: sigma_max F(1) / sigma_max E(1), the share of the static stiffness that is felt; nan if E(1) = 0.
+        high_frequency_gain: Ratio: sup above 100 Hz of sigma_max(F) / sigma_max(E); nan if 1/(2 T) <= 100 Hz.
         band_hz: The band [Hz], lowest and highest frequency.
     """
 
