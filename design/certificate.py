@@ -332,7 +332,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
 def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> None:
     """Raise NotProved unless the certificate proves all its claims."""
     if certificate.proof != "rational":
-        raise NotProved(f"the certificate's proof is {certificate.proof}, expected rational")
+        raise NotProved(f"the certificate's proof is {certificate.proof}: it carries no exact proof")
     if certificate.guarantee != condition.guarantee(loop):
         raise NotProved(f"{certificate.condition} does not guarantee {certificate.guarantee!r}")
     if certificate.available != loop.delta:
@@ -461,7 +461,7 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: An
         demands = condition.exact_demands(loop, coupling, multiplier)
         return {name: _block(demand) for name, demand in demands.items()}
     except SingularLoop as error:
-        reason = f"a pole at z = 1 or an algebraic loop without solution: {error}"
+        reason = f"the block has a pole at z = 1 or an algebraic loop without solution: {error}"
     except ValueError as error:
         reason = str(error)
     raise NotProved(_placed(condition.place(loop), reason))

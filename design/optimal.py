@@ -387,7 +387,9 @@ class _Search:
     def over_basis(
         self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
     ) -> tuple[Optimal, _BasisResult]:
-        """Return the optimum over a basis, scaled so that every sweep passes. With a limiter its proof is tried, too.
+        """Return the optimum over a basis, scaled so that every sweep passes, and its result.
+
+        With a limiter the proof of the optimum is tried, too.
 
         If the optimum renders less than the share `floor` of the static stiffness, the program is solved again with a
         larger weight of the stiffness.

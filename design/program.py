@@ -48,9 +48,9 @@ _FASTER = 0.25  # With many channels, real modes of smaller radius are only in t
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
 _RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
-_EDGED = {1: 20, 2: 20}  # number of channels: least number of taps for these sections
-_EDGED_OF_MANY = 6  # least number of taps for these sections with more than two channels
-_EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; small, because the error may jump at the band's end
+_EDGED = {1: 20, 2: 20}  # number of channels: least number of taps of a basis with sections at the band's end
+_EDGED_OF_MANY = 6  # the same least number for more than two channels
+_EDGES = (0.2, 0.07, 0.02)  # damping ratios of the sections; small, because the error may jump at the band's end
 # Up to FULL channels every force has a filter to every device. With further constraints,
 # a latency or ranges, the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
@@ -61,8 +61,8 @@ _EVEN = 0.002  # weight of the error relative to each motion's own force (`_even
 _LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10
-# Duality gaps before the first and before each later sweep, relative to the objective or, if less, its gain over zero
-# force.
+# Duality gaps before the first and before each later sweep, relative to the objective or to its gain over zero force,
+# whichever is less.
 _GAPS = (0.05, 0.01)
 _FORGIVEN = 5e-4  # allowed violation of an inequality between the frequencies of its grid; scaling removes it
 _STEEPER = 3.0  # factor between successive weights of the barrier method
@@ -323,7 +323,7 @@ def _zeros(E: Lti) -> Complex:
 
 
 def _separate(modes: Complex) -> list[complex]:
-    """Drop the modes that are nearer to an earlier mode than 5 % of its distance to the unit circle."""
+    """Drop each mode nearer to an earlier mode than 5 % of the earlier mode's distance to the unit circle."""
     distinct: list[complex] = []
     for mode in modes:
         if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):

@@ -307,7 +307,7 @@ def test_realisations_changed_by_rounding_are_refused(condition):
     scenario = digest(loop, cancelling(1000.0).form())
     claims = change(good, scenario=scenario, required=asked.required, margin=1 / asked.ratio)
     reason = verify(Stored.of(loop, cancelling(1000.0), sealed(claims))).reason
-    assert reason.startswith("in floating point the forces may be off by ")
+    assert reason.startswith("rounding may change the forces by ")
 
 
 def test_the_bound_on_rounding_holds_for_a_tick():
