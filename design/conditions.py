@@ -154,7 +154,7 @@ def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
 
 
 #: A 2 x 2 gain is singular if its determinant is below _SINGULAR times the product of its diagonal. Diagonal entries
-#: below _NOTHING times the largest one are rounding.
+#: below _NOTHING times the largest one count as rounding errors.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are processed together
 
@@ -356,7 +356,7 @@ class Condition(ABC):
         return named_values
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the multiplier that serves every coupling or None, the reason why the loop is not covered)."""
+        """Return (the multiplier that serves every coupling or None, the reason why there is none or None)."""
         return None, self.beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
@@ -519,7 +519,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 
 _ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; a lossless E has 2e-13 by rounding
 _VANISHES = 1e-5  # size of V, relative to V(1), up to which V counts as vanishing in a direction
-#: passivity, relative to V(1), that is added in these directions; ratio above which V counts as not passive there
+#: passivity, relative to V(1), that is added where V vanishes; ratio above which V counts as not passive there
 _SOFTENED, _NEVER = 1e-12, 1e6
 
 

@@ -79,8 +79,8 @@ class Matrix:
 _LIMBS, _BIT = 5e-9, 3e-11  # work [units of `spend`] of a product of two integers, and of each bit of the two integers
 
 
-#: Matrix products of at most this many integer products (about 21 states) are computed without FLINT, because FLINT is
-#: no faster for them, and its import takes 0.05 s.
+#: Matrix products with at most this many multiplications of integers (about 21 states) are computed without FLINT,
+#: because FLINT is no faster for them, and its import takes 0.05 s.
 _FEW = 20_000
 
 
@@ -223,7 +223,7 @@ def _less(W: _Integers, units: int) -> _Integers:
 
 
 def _definite(W: _Integers, bits: int) -> bool:
-    """Return whether the symmetric integer matrix W (n, n) is proved to be positive definite.
+    """Return whether the symmetric integer matrix W (n, n), in units of 2^-bits, is proved to be positive definite.
 
     Between passes the largest entry is shortened to 32 bits more than `bits`, and all others by as many bits. Each
     entry then changes by less than one unit, and the norm of the matrix by less than n units, which are subtracted from
@@ -249,8 +249,8 @@ def _longest(W: _Integers) -> int:
 def _dominates(W: Array) -> bool:
     """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
 
-    The answer holds for the integers from which `_floats` made W. Their rounding is 2^-53 of each entry and 2^-900 of
-    the largest one, and that of a sum of n < 2^11 terms is n 2^-53. Both are below 2^-40, the factor's excess over one.
+    The answer holds for the integers from which `_floats` made W. Rounding changed each by 2^-53 of itself and 2^-900
+    of the largest, and changes a sum of n < 2^11 terms by n 2^-53. Both are below 2^-40, the factor's excess over one.
     """
     diagonal = np.diag(W)
     others = np.abs(W).sum(axis=1) - np.abs(diagonal)
@@ -401,7 +401,7 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
 def reached(G: Lti) -> Lti:
     """Return the same map without the states that no input reaches, by the pattern of A and B.
 
-    Such states stay zero from rest, for example those of a filter behind a lost contact.
+    If the map starts at rest, such states stay zero, for example those of a filter behind a lost contact.
     """
     reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
@@ -520,7 +520,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 def _independent(covariance: Array) -> tuple[Array, Array]:
     """Return the change to coordinates with the covariance I, and its inverse."""
     variance = np.diag(covariance)
-    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Small variances may be rounding only.
+    deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # Small variances may be rounding errors.
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     root = np.sqrt(np.maximum(size, size[-1] * _LEAST_MOVED))
     return (V / root).T / deviation, deviation[:, None] * V * root

@@ -35,7 +35,7 @@ from haptic_loop.design.arguments import shown
 
 @dataclass(frozen=True, eq=False)
 class Demand(Generic[Block]):
-    """free + s gain must be strictly positive real, with s = 1 for the available damping.
+    """The demand that free + s gain is strictly positive real; s is 1 for the available damping.
 
     `static` holds named matrices that must be symmetric. Those named in `semidefinite` must also be positive
     semidefinite.
@@ -59,7 +59,7 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return delta T/T_max (m,) [N s/m]: at a constant period T it dissipates what delta does in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m], which stands at the constant period T for delta in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T_k: the force map is the same at every tick.
@@ -124,7 +124,7 @@ class Collected(Generic[Block]):
         """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
-        self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> input
+        self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
         self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
         self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
@@ -273,8 +273,8 @@ class Collected(Generic[Block]):
         """Return (residue at z = 1 (n, n), block without this pole and without the damping, damping matrix).
 
         For a Sampled G the residue is 0 and the block keeps its pole; its Hermitian part on the circle is the same. G
-        maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. With None
-        the steps of the forces are inputs instead (`force`).
+        maps [x; p], displacements and wall forces, to [f_e; y], sent forces and displacements across walls. If G is
+        None, the steps of the forces are inputs instead (`force`).
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
@@ -680,8 +680,8 @@ class Switching(Fact):
 
     A force that is late by n in [lo, hi] differs by an error w from the mean of the forces late by lo and by hi. Summed
     over all ticks, w^2 is at most ((hi - lo)/2)^2 times the squared steps of the force. The multiplier weighs w against
-    the displacement that the force multiplies. The axes of a device share its delay, so that the weight may be the
-    matrix alpha_i Delta_i / mean(diag(Delta_i)).
+    the displacement that the force multiplies. The axes of a device share its delay, so the weight is the matrix
+    alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:

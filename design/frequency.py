@@ -50,7 +50,7 @@ def integral(response: Callable[[Array], Array], grid: Array) -> float:
 
 
 def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Array:
-    """Apply Gauss's rule in each interval, (k,)."""
+    """Return the integral over each interval, (k,), by Gauss's rule."""
     half = (right - left) / 2
     points = (left + right) / 2 + half * _NODES[:, None]
     return half * (_WEIGHTS @ response(points.ravel()).reshape(points.shape))
