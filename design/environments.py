@@ -199,7 +199,7 @@ _MOST_PEAKS = 3  # largest number of local maxima (`peaks`) whose frequencies ar
 _NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
 # A search ends when a refined sweep exceeds the bound by less than twice _SETTLED, relative to max(bound, 1).
 _SETTLED = 5e-7
-_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; below 1e-6 units it is 0 if `least` is 0
+_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; a number below 1e-6 units becomes 0 if `least` is 0
 
 
 class _Search:
@@ -476,7 +476,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 
 
 class SwitchingDelays(ThisEnvironment):
-    """this-environment of a loop whose delays switch, reported as a separate requirement "switching"."""
+    """The condition this-environment for delays that switch, reported as a separate requirement "switching"."""
 
     name, covers = "switching", BEYOND
 
@@ -507,7 +507,7 @@ BETA = 0.01  # default lag of a limiter under this-environment, relative to Delt
 
 @dataclass(frozen=True)
 class LimitedForces(ThisEnvironment):
-    """this-environment also while forces are limited, by a limiter of lag rho_i = beta lambda_min(Delta_i)/T."""
+    """The condition this-environment for forces behind a limiter of lag rho_i = beta lambda_min(Delta_i)/T."""
 
     beta: float = BETA
     lags: int = 1  # number of weights c_ij per device
@@ -521,7 +521,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Return rho [N/m] per device: `held`, or the rho of beta and the available damping, rounded to six digits."""
+        """Return rho [N/m] per device: `held`, or the rho that follows from beta, rounded to six digits."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property

@@ -414,7 +414,10 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,) and blocks (.., k, n, n): for zero beta and multipliers, then slopes in each of these."""
+        """Return z (k,) and blocks (.., k, n, n): for zero beta and multipliers, then slopes in each of these.
+
+        The margin `spare` of the demand is subtracted from the first block.
+        """
         m, z = self.m, on_circle(w)
         none, no_beta = 0 * self.units, np.zeros(self.device.size)
         each = [(no_beta, none), *((beta, none) for beta in np.eye(m)[:, self.device])]

@@ -32,7 +32,7 @@ MAKING = (
 )
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
-#: limits of every certificate
+#: what every certificate assumes and does not cover, in words
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
     "or pass the limiter that a report names. "
@@ -207,7 +207,7 @@ class Chosen:
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
         condition: The name of the condition.
         kind: The kind of the coupling in reports.
-        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
+        phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
         certificate: The Certificate of the file, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
         own: The user's own condition (design.conditions.Condition), or None.
@@ -257,7 +257,7 @@ class Design(Chosen):
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether the time limit ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.
-        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
+        phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
         certificate: The Certificate, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
         own: The user's own condition (design.conditions.Condition), or None.
