@@ -180,7 +180,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: Coupling and loop have different numbers of channels.
+        ValueError: Coupling and loop have different numbers of channels, or the environment never exerts a force.
     """
     of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
@@ -227,11 +227,10 @@ def store(
 ) -> Filed:
     """Save the coupling with its proof, and return a summary of the file.
 
-    `assessment` may contain proofs for ranges and for limited forces.
-
-    If the ranges are not proved by the design's condition, the stored loop has the nominal environment only, unless the
-    condition holds in any environment. If switching delays are not proved, the stored loop has constant delays. Raises
-    InputError if the file cannot be written.
+    `assessment` may contain proofs for ranges and for limited forces. If the ranges are not proved by the design's
+    condition, the stored loop has the nominal environment only, unless the condition holds in any environment. If
+    switching delays are not proved, the stored loop has constant delays. Raises InputError if the file cannot be
+    written.
     """
     ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate

@@ -64,7 +64,7 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-PluggedEnvironment = Callable[[Array], Array]  # port positions (m,) [m] for zero force -> force (m,) [N]
+PluggedEnvironment = Callable[[Array], Array]  # positions of its port at zero force (m,) [m] -> force (m,) [N]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -389,7 +389,7 @@ class Guarantee:
         proof: "rational": exact arithmetic, also for limited forces if `forces` names them; "sampled": a refined sweep;
             "account": an energy account at every tick.
         facts: Properties of the loop that the condition covers (Assessment.facts).
-        hands: The hands that the guarantee covers. For an energy account, `words` starts with "no passive hand".
+        hands: The hands that the guarantee covers. For an energy account it is "no passive hand", which begins `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", the restriction, or the account that scales them.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.

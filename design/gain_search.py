@@ -228,7 +228,10 @@ class SampledLoop:
         return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """Return the Hermitian part of the block: upper left (k, m, m), lower left, diagonal of the lower right."""
+        """Return the Hermitian part of the block: upper left (k, m, m), lower left, diagonal of the lower right.
+
+        The shapes of the last two are (k, active, m) and (k, active).
+        """
         G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu

@@ -289,7 +289,7 @@ def _exact_cost(
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
 _LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of the plain condition to five digits
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
-_TOGETHER = 100  # matrices in a stack, which take hardly longer than one: a step tries several shares at once
+_TOGETHER = 100  # A stack of this many matrices takes hardly longer than one, so a step tries several shares at once.
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
 _VIOLATED = 3  # largest number of local minima at which `_Search.cut` adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
@@ -299,7 +299,7 @@ _DIGITS = 7  # digits of beta and multipliers; the exact proof uses these rounde
 
 
 class _Best(NamedTuple):
-    """The least share of the damping that a form of Theorem B needs."""
+    """The least share of the damping that a search found, with its beta and multipliers."""
 
     share: float  # inf if no beta needs less than the allowed share
     w: float  # binding frequency [rad/sample]
@@ -685,7 +685,7 @@ class KnownDevice(Condition):
         return None
 
     def form(self, G: Any, loop: Loop, values: Values, hands: KnownMotor) -> Demand[Any]:
-        """Return the demand of a `map`, in any arithmetic."""
+        """Return the demand for the map G (`map`), in any arithmetic."""
         return compose(G, _straightened(loop), self.facts(loop), values, hands=hands)
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
