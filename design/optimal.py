@@ -389,10 +389,8 @@ class _Search:
     ) -> tuple[Optimal, _BasisResult]:
         """Return the optimum over a basis, scaled so that every sweep passes, and its result.
 
-        With a limiter the proof of the optimum is tried, too.
-
-        If the optimum renders less than the share `floor` of the static stiffness, the program is solved again with a
-        larger weight of the stiffness.
+        With a limiter the proof of the optimum is tried, too. If the optimum renders less than the share `floor` of the
+        static stiffness, the program is solved again with a larger weight of the stiffness.
         """
         for heavier in (1.0, 2.5, 6.0):
             tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
@@ -448,10 +446,10 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
     ) -> tuple[ForceFilter, list[float]]:
-        """Find the optimum for the nominal environment, and again with each environment that needs too much damping.
+        """Return (the coupling that serves all environments, share of the damping that each environment needs).
 
+        The optimum for the nominal environment is found first, and again with environments that need too much damping.
         `need` returns required over available damping in an environment.
-        Returns (coupling, share of the damping that each environment needs).
         """
         active = [0]
         while True:

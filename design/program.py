@@ -380,7 +380,7 @@ class Problem:
         return x
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness.
+        """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness, size of R.
 
         The forces of a device depend on g and on the device's own row of R only. So each row is a separate
         least-squares problem, which is reduced to its triangular factor.

@@ -413,9 +413,9 @@ _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains
 
 
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
-    """Return the lower bound (k, m) [m/N] of He[V/(1-z)] for each frequency and channel.
+    """Return the bound (k, m) [m/N] that He[V/(1-z)] must exceed, for each frequency and channel.
 
-    It is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    The bound is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
     """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
