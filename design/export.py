@@ -161,7 +161,7 @@ def _with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: ExportedBlock) -> _Trial:
-    """Return normal random inputs and their outputs.
+    """Return normally distributed random inputs and their outputs.
 
     For a limiter, inputs are scaled so that forces without it would exceed a limit on a third of the ticks.
     """
@@ -295,7 +295,7 @@ def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any
 class _Balls(NamedTuple):
     """The problem f = q - M e for limited force vectors, with the channels in the order in which blocks are solved."""
 
-    at: list[int]  # (m,) channels
+    at: list[int]  # (m,) channel of each entry
     first: list[int]  # (m,) first entry of the vector to which each entry belongs
     last: list[int]  # (m,) end of the vector to which each entry belongs
     end: list[int]  # end of each block

@@ -180,7 +180,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
     """Return the content of TOML text. Raises InputError."""
     if match := _DEEP_KEY.search(text):
         line = text.count("\n", 0, match.start()) + 1
-        raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
+        raise InputError(f"{named}: line {line}: a key has more than {_DEEPEST_KEY} names joined by dots")
     try:
         return tomllib.loads(text)
     except RecursionError:

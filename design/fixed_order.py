@@ -210,9 +210,9 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 #
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
 # positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
-# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. Each SDP therefore
-# improves on the last one, mu^2 enters linearly, and there is no bisection. In state coordinates with Q0 = I the
-# tangent is 2I - Q.
+# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. Each semidefinite
+# program (SDP) therefore improves on the last one, mu^2 enters linearly, and there is no bisection. In state
+# coordinates with Q0 = I the tangent is 2I - Q.
 
 
 _Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu

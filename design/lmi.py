@@ -1,4 +1,4 @@
-"""The matrices of the paper's lemmas, one function per lemma, its loop-shaping objective, and scalings for solvers.
+"""The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
 `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
 arrays or cvxpy expressions.

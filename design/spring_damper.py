@@ -415,7 +415,7 @@ _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains
 def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
     """Return the bound (k, m) [m/N] that He[V/(1-z)] must exceed, for each frequency and channel.
 
-    The bound is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
+    It is l Lam^-1 l*/4 with the matrix Lam of L (`PeriodCost`), l = [(z^n - 1)/(z - 1), beta z^n] and n = theta + 1.
     """
     own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
