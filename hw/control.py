@@ -330,7 +330,8 @@ class Drive:
         self._check_motion(x, ticks)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
-        self.encoders.check(state.counts, state.applied, ticks)
+        if self.gain.value > 0:  # otherwise only test forces act
+            self.encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
         if ticks > 1 and self.x is not None:

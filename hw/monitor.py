@@ -51,6 +51,7 @@ _STRONG = 2  # first block of the test at the end of a session
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
+_TREMOR = 3e-5  # [m] least range of a calm hand in that time; with coarser counts it looks like a dead encoder
 _FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops if wrong ticks stay more frequent
 
 
@@ -744,7 +745,8 @@ class EncoderMonitor:
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
     of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
-    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor.
+    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. It
+    shows where noise and counts hide less than 30 um.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
@@ -753,7 +755,9 @@ class EncoderMonitor:
         #: (m,) [N] unit of force changes: 1 N, or half of the cap of a weak motor
         self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]
         self._band: list[list[int]] | None = None
-        self._quiet = [0.0] * m  # [s] time under a force without a motion
+        tremor = _TREMOR / limits.lever
+        self._shown = [(n + 1) * q <= tremor for n, q in zip(still, units.encoder_step, strict=True)]
+        self._quiet = [0.0] * m  # [s] time under a force without a motion that shows a tremor
         self._reference = [0.0] * m  # [N] force at the last motion
         self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion
 
@@ -779,7 +783,8 @@ class EncoderMonitor:
                 if self._impulse[i] > max(_IMPULSE * newton, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                     doing = f"it stands still while the force changes by {change:.3g} N"
                     raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
-            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING * newton else 0.0
+            pressed = self._shown[i] and abs(force) > _PRESSING * newton
+            self._quiet[i] = self._quiet[i] + ticks * self._T if pressed else 0.0
 
     @property
     def dead(self) -> str | None:

@@ -397,6 +397,25 @@ def test_still_encoders_under_force_are_dead(newton, found):
     assert (monitor.dead == "encoder or motor of axis 1 is dead: nothing moves for 0.5 s under a force") == found
 
 
+@pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
+def test_coarse_counts_hide_a_calm_tremor(count, dead):
+    """A tremor of 30 um always leaves two counts of 15 um, but it fits into two counts of 16 um or more."""
+    monitor = monitor_of(count)
+    for _ in range(round(0.6 / T)):
+        monitor.check((0,), (1250,), 1)  # 0.5 N
+    assert (monitor.dead is not None) == dead
+
+
+@pytest.mark.parametrize("cap", [0.2, 0.3])
+def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
+    """After its test an axis rests within counts of 0.1 mm, although the force has changed by the cap."""
+    free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
+    session = Session(free, SafetyLimits((cap, cap)), LinkSettings(measure=60, held=False))
+    stop = (2.0, lambda session, now: session.stop("asked to", now))
+    Rehearsal(session, Emulator(free), lambda ages: rungs, actions=[stop]).run_until_armed(4.0)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "asked to")
+
+
 @pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
 def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
     """Whichever way people begin, the axis with the dead encoder is named within 0.5 s."""
