@@ -69,7 +69,7 @@ class _Board:
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
-        """Receive a STATE. Raises SafetyStop if the board keeps applying forces that the host did not send."""
+        """Receive a STATE. Raises SafetyStop if the board keeps applying wrong forces, or holds one for too long."""
         ticks = wire.distance(state.tick, self.last.tick) if self.last else 1
         if ticks <= 0:
             return
@@ -144,7 +144,10 @@ class _Board:
         return None if tick == self.tick_of((later + 1) & 0xFFFF) else tick
 
     def send(self, force: wire.Force, now: int) -> None:
-        """Send this board's part of the force that answers step `force.source`, computed at `now` [us]."""
+        """Send this board's part of the force that answers step `force.source`, computed at `now` [us].
+
+        Nothing is sent where the tick of that force has no length.
+        """
         if self.offset is None or (apply_at := self.due(force.source)) is None:
             return
         source, steps = (apply_at - self.config.theta) & 0xFFFF, force.force[self.axes]
@@ -224,7 +227,7 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send each board its part of `config` and its extra delay. Return the worst answer, or None until all came."""
+        """Send each board its part of `config` with its extra delay. Return the highest result; None until all came."""
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:
@@ -269,7 +272,7 @@ class Boards:
                 board.device.stop(reason)
 
     def _next(self) -> wire.State | None:
-        """Return the STATE of a step that is complete and new."""
+        """Return the STATE of the newest step if it is complete and was not returned before, else None."""
         if (last := self._lead.last) is None or last.tick == self._step:
             return None
         step, (_, at) = last.tick, self._lead.states[last.tick]
@@ -285,9 +288,10 @@ class Boards:
         return state
 
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
-        """Return one STATE: worst phase and margin, sum of errors, most misses of a board, axes of all boards in order.
+        """Return one STATE with the worst phase and margin, the sum of errors, and the axes of all boards in order.
 
-        The phases come from the last STATE of every board, not from the samples of the step, so a fault shows at once.
+        In each step the misses grow by the largest number of a board. The phases come from the last STATE of every
+        board, not from the samples of the step, so a fault shows at once.
         """
         last = [board.last for board in self._boards if board.last]
         worst = min(last, key=lambda state: _FAULTS.index(state.phase) if state.phase in _FAULTS else len(_FAULTS))

@@ -40,8 +40,8 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # most ticks in a row with a speed change above jump/5; ten of 0.6 mm/tick add 5 m/s at T = 1.2 ms
-_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of a reserve of the last resort
+_SHAKING = 10  # most ticks in a row with a speed change above jump/5; ten changes of 0.6 mm in 1.2 ms add up to 5 m/s
+_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of the last reserve that is tried
 
 
 class Controller(Protocol):
@@ -118,8 +118,8 @@ class BudgetPlan:
         """Return the plan for a device of this configuration.
 
         The device holds a force for `hold` missed ticks, then ramps it to zero. Because of its slew rate, an older
-        force still acts in up to ceil(cap / slew) later ticks with an answer, each after up to `hold` missed ticks.
-        Then the applied force lies between forces that were sent later.
+        force still acts in up to n = ceil(config.cap / config.slew) later ticks with an answer, each after up to
+        `hold` missed ticks. Afterwards, the applied force lies between forces that were sent later.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -173,7 +173,7 @@ class WorldController:
     gain, caps and rounding as a part of the environment. For a tick without an answer, the shell books the force that
     the device holds.
 
-    A force that tests a motor does not pass the coupling, so an energy budget measures its energy at the device. That
+    A force that tests a motor bypasses the coupling, so an energy budget measures its energy at the device. That
     budget starts with the energy of the shell, and its spent energy is charged to the shell afterwards. So shell and
     budget together give at most W0 beyond what the scene released.
     """
@@ -236,7 +236,7 @@ class WorldController:
             self._tested, self._test = self._tested + self._test.spent, None
 
     def later(self, steps: Sequence[int], ticks: int) -> tuple[int, ...]:
-        """Put `steps`, computed `ticks` after the previous ones, into the delay lines and return the steps to send."""
+        """Put `steps`, computed `ticks` ticks after the last ones, into the delay lines. Return the steps to send."""
         sent = []
         for line, step in zip(self._lines, steps, strict=True):
             line.extend([line[-1] if line else step] * (ticks - 1) + [step])
@@ -305,7 +305,7 @@ class Drive:
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # several boards have one each
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # boards each have one
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property
@@ -375,7 +375,7 @@ class Drive:
         ticks: int,
         test: tuple[float, ...] | None,
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return force (m,) [N] and steps within a world's energy accounts. A test force suppresses scene forces."""
+        """Return force (m,) [N] and steps within a world's energy accounts. A test force replaces the scene's force."""
         nothing, plan = (0,) * len(steps), self._test_plan
         pushes = plan is not None and test is not None and any(test)
         allowed = world.limit(nothing if pushes else steps, self.units.force_step)
@@ -391,7 +391,7 @@ class Drive:
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
-        """Raise SafetyStop where the handles came to x (m,) [m] by a jump or a jolt, or faster than the speed limit."""
+        """Raise SafetyStop where the handles jumped to x (m,) [m], shake, or moved faster than the speed limit."""
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
             if ticks == 1 and self._before is not None:
@@ -501,7 +501,7 @@ class CertifiedCoupling:
         return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
 
     def remarks(self) -> list[str]:
-        """Return remarks on the coupling's file, own conditions, torques, walls, and forces that latch on arrival."""
+        """Return remarks on the file, the user's conditions, held torques, walls, latency and missed answers."""
         said = [*self.chosen.remarks(self.assessment.requirements)]
         if torques := self.assessment.held_torques:
             said.append(f"held torques: {torques}")

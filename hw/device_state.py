@@ -131,7 +131,10 @@ class Device:
                 self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
-        """Store the first force for tick source + theta if it is in time; apply it at once if theta = 0."""
+        """Store the first force for tick source + theta if it is in time; apply it at once if theta = 0.
+
+        A force that is too late still sets `echo` and `margin`.
+        """
         known = frame.command == wire.Command.RUN or (
             frame.command in (wire.Command.IDLE, wire.Command.ARM) and not any(frame.force)
         )

@@ -34,7 +34,7 @@ class Operator:
     _free_at: int = 0  # [us] earliest time of arming without a key
 
     def decide(self, session: Session, now: int) -> Said:
-        """Return the messages that are due at `now` [us] in this stage."""
+        """Arm or stop the session if that is due at `now` [us], and return its messages."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
             if self.auto_arm and session.hindrance:

@@ -155,7 +155,7 @@ class Line:
         self._held: bytes | None = None  # a frame that the next one overtakes
 
     def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
-        """Return the times of arrival [us] and the bytes of a frame, with its faults."""
+        """Return the frames that arrive where `frame` was sent, each after its time of arrival [us]."""
         frames, due = [frame], now_us + self._latency
         for fault in self._faults:
             if fault.active(since_armed):
@@ -265,7 +265,7 @@ def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scena
 
 
 def info_of(scenario: Scenario) -> Info:
-    """Return the INFO of an emulated device: limits and steps of the scenario's devices, in the units of the wire."""
+    """Return the INFO of an emulated device: the scenario's damping, limits and steps, in the units of the wire."""
     r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
     encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
     step = _FORCE_STEP if scenario.unit == "m" else max(1, round(1e6 * max(limits) / 30000))

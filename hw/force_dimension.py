@@ -23,7 +23,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 FORCE_DIMENSION = "force-dimension"  # value of --port for these devices
 _PACKAGE = "forcedimension_core"
 _SATURATED = 2  # setForce returns this code when the motors cannot give the force
-_WATCHDOG = 160  # times 125 us: the device drops a force after 20 ms without a new one, if it has a watchdog
+_WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new one comes within this time
 _SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
 _SHORTEST = 0.75  # a period that follows a late one lasts at least this share of T
 
@@ -53,7 +53,7 @@ class ForceDimension:
     """Drive axes of one or several Force Dimension devices. This host is their clock.
 
     The state machine is the firmware's (hw/device_state.py): it arms on ARM, limits forces and their slew rate, and
-    ramps out.
+    ramps them to zero.
     """
 
     errors = 0  # number of unreadable frames: there are no frames
@@ -68,7 +68,7 @@ class ForceDimension:
     ) -> None:
         """Open the devices that `axes` names, such as "0x,1x" (default: the scenario's axes, on the first devices).
 
-        Raises InputError.
+        Raises InputError where `axes` is wrong, the library is missing, or a device cannot be opened.
         """
         self._where = _axes(axes, scenario)
         #: channels whose force limit is that of another channel: all but the first of each limited force vector
@@ -107,7 +107,7 @@ class ForceDimension:
         ]
 
     def info(self) -> wire.Info:
-        """Return INFO; the library does not report damping and encoder step, so these are the scenario's."""
+        """Return INFO. Only name and serial number are the library's, which reports no damping and no encoder step."""
         return self._info
 
     def configure(self, config: wire.Config) -> int:
@@ -156,20 +156,20 @@ class ForceDimension:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Set zero force and switch the motors off, whatever came before."""
+        """Set zero force, switch the motors off and close the devices."""
         self._zero()
         for ID in self._ids.values():
             self._sdk.enableForce(False, ID=ID)
             self._sdk.close(ID=ID)
 
     def _zero(self) -> None:
-        """Set zero force at every device, also after one that does not accept it."""
+        """Set zero force at every device, even if one of them reports an error."""
         for ID in self._ids.values():
             self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
 
     @contextmanager
     def _off_after_an_error(self) -> Iterator[None]:
-        """Remove the force from every device as soon as one of them has an error, and apply none again."""
+        """Set zero force at every device and enter ESTOP if an exception is raised, then raise it again."""
         try:
             yield
         except Exception:
@@ -194,7 +194,10 @@ class ForceDimension:
         return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
-        """Raise SafetyStop if a device has no power, no link, an error or, while armed, no calibration or no force."""
+        """Raise SafetyStop if a device has no power, no link or an error.
+
+        An armed device must also not be in reset mode, and its forces must be on. Raises PortLost without a status.
+        """
         armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():
             status = self._status[index]
@@ -224,8 +227,9 @@ class ForceDimension:
                 self._device.fault()
 
     def _heeded(self, code: int) -> int:
+        """Return the code of one of the library's calls. Raises PortLost if the code reports an error."""
         if code < 0:
-            raise PortLost(f"the device is gone: {self._sdk.errorGetLastStr()}")
+            raise PortLost(f"a call to the device failed: {self._sdk.errorGetLastStr()}")
         return code
 
 
@@ -237,8 +241,8 @@ def _axes(text: str | None, scenario: Scenario) -> list[tuple[str, int]]:
     if len(parts) != channels or not all(re.fullmatch(r"(sn)?\d+[xyz]", part) for part in parts):
         example = ",".join(usual)
         raise InputError(
-            f"--port {FORCE_DIMENSION}:{text}: expected a device's index and an axis for each of {channels} channels, "
-            f"as in {FORCE_DIMENSION}:{example}"
+            f"--port {FORCE_DIMENSION}:{text}: expected a device (its index, or sn and its serial number) and an axis "
+            f"for each of {channels} channels, as in {FORCE_DIMENSION}:{example}"
         )
     chosen = [(part[:-1], "xyz".index(part[-1])) for part in parts]
     if len(set(chosen)) != channels:

@@ -135,7 +135,10 @@ def _bristle(x: Array, reach: float) -> Array:
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
-    """Return the ticks at which h passes enough of the force. Elsewhere, motion that h removes changes friction."""
+    """Return the ticks at which the force is weak, or h passes enough of it.
+
+    Elsewhere, motion that h removes changes friction.
+    """
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
@@ -214,6 +217,8 @@ class _Pair:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
+    """Parameters (p,), columns (rows, p) and residual (rows,) [N] of a fit."""
+
     p: Array
     columns: Array
     residual: Array
@@ -310,7 +315,7 @@ def dry_friction(x: Array, T: float, found: Friction) -> Array:
 
 
 def nonviscous(x: Array, T: float, step: float, found: Friction) -> Array:
-    """Return dry friction, drag, spring and drift [N] during each tick after x (N,) [m], by the law that fits best."""
+    """Return the sum (N,) [N] of dry friction, drag, spring and drift in each tick from x (N,) [m], by the best law."""
     x, edge = x - x[0], round(_REACH * _speed_window(step, T) / T)
     speed = _filtered(np.pad(x, edge, mode="edge"), 1, _speed_window(step, T), T)[edge : edge + len(x)]
     speed = (speed + np.append(speed[1:], speed[-1])) / 2
@@ -348,7 +353,10 @@ def at_radius(figures: _Figures, r: float) -> _Figures:
 
 
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:
-    """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
+    """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's.
+
+    Raises ValueError where the axis moves in too few samples.
+    """
     balance = _Balance(x, force, T, step)
     laws = [(slip, reach, balance.matrix(dry)) for slip, reach, dry in balance.laws(step)]
     fits = [(slip, reach, _fitted(balance, matrix, [])) for slip, reach, matrix in laws]

@@ -120,7 +120,7 @@ def chirp(
     seconds: float,
     swing: Swing | None = None,
 ) -> Excitation:
-    """Return the force to play to a device: cosines of exponentially rising frequency, a swing, then silence.
+    """Return the force to play: zero for 0.3 s, cosines of exponentially rising frequency, a swing, then silence.
 
     The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each of
     these three takes `seconds`, and the silence takes half of that. Two slow motions at two levels of force show
@@ -216,7 +216,7 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
     spectrum = Spectra(x, force - dry_friction(x, T, found), T, band=_BAND_HZ, points=len(x))
 
     def error(p: Array) -> Array:
-        return spectrum.error(np.append(p, 0.0), 1.0)  # without memory
+        return spectrum.error(np.append(p, 0.0), 1.0)  # c = 0: friction without memory
 
     how: dict[str, Any] = {"bounds": (_LEAST, np.inf), "x_scale": "jac", "max_nfev": _STEPS}
     fits = [scipy.optimize.least_squares(error, start[:7], **how) for start in starts([spectrum], found)]
@@ -247,7 +247,7 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
 
 
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
-    """Return one estimate per axis from two or more recordings, and warnings if a hand damped only some of them.
+    """Return one estimate per axis from two or more recordings (sittings), and warnings if a hand damped some of them.
 
     Each axis gets the estimate of its least damped recording, and the least bound of all recordings. A passive hand
     only adds damping (docs/hardware.md), so no hand damped the least damped recording, unless a hand damped them all.
@@ -282,7 +282,7 @@ def unbounded(estimates: Sequence[Estimate]) -> str:
 
 
 def _more_damped(one: Estimate, least: Estimate) -> bool:
-    """Return whether a recording has more damping than two recordings of one free device can differ by."""
+    """Return whether the damping of `one` exceeds that of `least` by more than recordings of a free device differ."""
     scatter = 2 * np.hypot(one.friction.errors["viscous"], least.friction.errors["viscous"])
     return one.viscous - least.viscous > _SUSPICIOUS * least.viscous + scatter
 

@@ -83,7 +83,7 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    #: [m/s] fastest motion while forces act; one drifting encoder under 2 N then leaves a handle below 1 m/s
+    #: [m/s] fastest motion while forces act; even with one drifting encoder and 2 N, a handle then stays below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
@@ -165,7 +165,7 @@ class SafetyLimits:
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
     def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> int | None:
-        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass allows.
+        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which a mass rules out.
 
         `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
         whose speed changed by more than a fifth of `jump` per tick, or None. A fifth is two counts of the coarsest

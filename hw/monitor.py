@@ -35,7 +35,7 @@ _CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of th
 _REMEMBERED = 64  # most forces or latches that are stored; at most the last theta still matter
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
 _PATIENCE = 5  # wrong ticks in a row at which a session stops
-_CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle that is not at a stop
+_CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle not at an end stop
 _IMPULSE = 0.1  # [s] times the unit of _CHANGE: largest integral of such changes without a motion; 1 N for 100 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
@@ -155,8 +155,8 @@ class Measurement:
     A limit on the number of STATEs ends the measurement in any case. Where too many ages are inferred, answers may
     have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
     round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
-    same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are farther
-    apart than the longest age, at random distances, so that bursts meet each with the same probability.
+    same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are at random
+    distances, so that bursts meet each with the same probability. The least distance is the longest age, or theta.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
@@ -504,9 +504,9 @@ class EncoderNoise:
 
     @property
     def still(self) -> tuple[int, ...]:
-        """Return the range (m,) [counts] in which an encoder rests: 1 without noise, as broken channels toggle by 1.
+        """Return the range (m,) [counts] in which an encoder rests: twice its noise, at least 1.
 
-        Over a longer time, noise exceeds twice its range in 100 ms with a probability below 1e-6.
+        Broken channels toggle by 1. Over a longer time, noise exceeds this range with a probability below 1e-6.
         """
         return tuple(2 * least if least and least > 1 else 1 for least in self.range)
 
@@ -629,12 +629,13 @@ class EncoderTest:
     def _compare(self) -> tuple[Array, Array, float, float, float, bool]:
         """Compare all motions with the expected one.
 
-        Returns size and fit (m,) of all motions, and for the tested axis the size at any phase, the delay and its
-        error [ticks], and whether its motion has the shape of the expected handle but not that of one in a heavy hand.
+        Returns the relative size and the fit (m,) of all motions. For the tested axis, also returns the size at any
+        phase of the force, the delay and its error [ticks], and whether the shape is that of the expected handle but
+        not that of a handle in a heavy hand.
 
         The delay is -a/s in the fit s x + a x' of the expected motion x. The row p of the pseudoinverse that yields a
-        turns rounding errors of q/sqrt(12) into a standard error |p| q/sqrt(12)/|s|. The stated error |p| q/|s| is 3.5
-        of them; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
+        turns rounding errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error
+        |p| q/|s| is 3.5 standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
         """
         t, expected, loaded, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
@@ -644,7 +645,7 @@ class EncoderTest:
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
-        # standard deviations [m] of noise and rounding: `still` is twice the range, a range of 100 ms has about four
+        # [m] of noise and rounding: `still` is twice the range in 100 ms, which is about four standard deviations
         scatter = np.array(self._units.encoder_step) * np.maximum(12**-0.5, np.array(self._still) / 8)
         own = np.maximum((moved**2).sum(axis=0) - len(t) * scatter**2, len(t) * scatter**2)
         fit = size**2 * power / own

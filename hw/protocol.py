@@ -158,7 +158,7 @@ class State(NamedTuple):
     status: int  # phase, cause and deadman
     tick: int
     echo: int  # the source of the last usable FORCE
-    margin_us: int  # last usable FORCE to its latch (theta = 0: to its tick's end), negative: late; or NO_MARGIN
+    margin_us: int  # from the last usable FORCE to its latch (theta = 0: end of its tick); negative: late; or NO_MARGIN
     crc_errors: int  # frames that the device rejected, modulo 256
     misses: int  # ticks without a FORCE in time, modulo 256
     t_us: int  # the device's clock at this tick, modulo 2^32
@@ -388,7 +388,7 @@ class Decoder:
         return messages
 
     def read(self, frame: bytes) -> Message | None:
-        """Return the message of one frame without its delimiter."""
+        """Return the message of one frame without its delimiter, or None for an unreadable frame, which is counted."""
         if len(frame) >= _MAX_WIRE:
             self.oversize += not self.skipping
             return None

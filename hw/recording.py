@@ -158,7 +158,9 @@ class _Comparison:
 
 
 def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
-    """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest.
+    """Replay recorded displacements through controller, gain, limits and rounding, and compare the forces.
+
+    Every arming starts at rest.
 
     Raises InputError where the trace cannot be replayed, for example without a recipe.
     """

@@ -65,7 +65,7 @@ class _Cable:
     gone: bool = False
 
     def wait(self, seconds: float) -> bool:
-        """Advance time until bytes have come, by at most `seconds`."""
+        """Advance time by at most `seconds`, and return whether bytes have come or the cable was pulled."""
         return self.rehearsal.wait(seconds, (self,))
 
     def read(self) -> bytes:
@@ -201,7 +201,10 @@ class Rehearsal:
             self._ended = self.now
 
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
-        """Advance time until bytes have come, by at most `seconds`, and then until the host is no longer frozen."""
+        """Advance time until bytes have come, by at most `seconds`, and then until the host is no longer frozen.
+
+        Returns whether bytes have come, or a cable was pulled.
+        """
         until, cables = self.now + 1e6 * seconds, cables or self._cables
         one = cables[0]  # usually the only cable; the loop checks it first to save time
         while not (ready := bool(one.data or one.gone or (cables[1:] and _come(cables)))):

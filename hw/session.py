@@ -156,9 +156,9 @@ class Session:
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
         """End the session as planned: by a ramp if the gain is above 0, otherwise at once.
 
-        After the ramp the motors are tested once more, if the settings request encoder tests. A session that was armed
-        ends as stopped if this test is impossible: the user `let_go` of the deadman, or no force acts at the moment. A
-        session that was never armed ends as stopped, too.
+        After the ramp the motors are tested once more, if the settings request encoder tests. The session ends as
+        stopped if the user `let_go` of the deadman, if it was never armed, or if this test is impossible because no
+        force acts at the moment.
         """
         self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
@@ -381,7 +381,7 @@ class Session:
 
 
 def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: float) -> None:
-    """Raise SafetyStop where the device is in a wrong phase, or applies a force that no host can have sent."""
+    """Raise SafetyStop where the device is in a wrong phase, or applies a force above its cap or while disarmed."""
     for force, cap in zip(state.applied, config.cap, strict=True):
         if not -cap <= force <= cap:
             raise wire.SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")

@@ -254,7 +254,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 
 def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
-    """Write the trace (if forces acted), its picture and the report."""
+    """Write the trace (if forces acted), its picture and the report, and return their paths."""
     files, acted = [], len(recorder) > 0
     for name, written in (("trace.npz", acted), ("trace.csv", acted), ("figure.png", acted and plot)):
         if not written:

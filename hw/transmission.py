@@ -1,4 +1,4 @@
-"""Bounds of a motor's mass and of its transmission from records with the handle free and with the handle clamped.
+"""Bound a motor's mass and its transmission from records with the handle free and with the handle clamped.
 
 The known-device conditions need these bounds: the least mass at the motor, the largest stiffness k of the transmission,
 and the least and the largest of its damping b. With a clamped handle, motor and transmission are a mass on a spring and
@@ -27,10 +27,10 @@ _TOLD = 0.01  # allowed error of the model, as a share of the motion; the encode
 #: largest rms error over the allowed one; with play or presliding friction it is 3 to 6, with dry friction up to 2.1
 _UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
-_SIGMAS, _SCALE = 2.0, 0.005  # bounds are moved by so many standard errors, and by this relative error of the encoder
+_SIGMAS, _SCALE = 2.0, 0.005  # standard errors, and relative error of the encoder, by which bounds are moved
 _WITHIN = (2.0, 0.85)  # the clamped mode must lie between these multiples of the lowest and the highest frequency
 _STEPS = 60  # most evaluations in a fit
-_LATE = 0.05  # [T] largest lag with delay of a force, as of a current loop; no proof covers a slower one
+_LATE = 0.05  # [T] largest sum of lag and delay of a force, such as a current loop's; no proof covers a larger one
 _FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # lower bounds of log m1, log m2, log k, log b, delta and lag
 
 

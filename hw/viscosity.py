@@ -192,7 +192,7 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
 
 
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
-    """Return the smallest lower bound of b [N s/m] over all tau, the tau [s] that gives it, and whether memory shows.
+    """Return the least lower bound of b [N s/m] over all tau, its tau [s], and whether the record shows a memory.
 
     `force` is that of the motor less `nonviscous`. The model without memory is fitted to all frequencies. A small
     Maxwell element changes the motion little beside the mass, so its effect is linear in c, and each tau takes one

@@ -24,7 +24,7 @@ static inline void watchdogFeed() { WDOG3_CNT = 0xB480A602u; }
 #include <avr/wdt.h>
 static inline void watchdogStart(uint32_t ms) { wdt_enable(ms > 15 ? WDTO_30MS : WDTO_15MS); }
 static inline void watchdogFeed() { wdt_reset(); }
-#elif defined(BOARD_WATCHDOG) /* yours: void BOARD_WATCHDOG(uint32_t ms) starts the watchdog if ms > 0, feeds it if 0 */
+#elif defined(BOARD_WATCHDOG) /* your macro: BOARD_WATCHDOG(ms) starts the watchdog if ms > 0 and feeds it if ms is 0 */
 static inline void watchdogStart(uint32_t ms) { BOARD_WATCHDOG(ms); }
 static inline void watchdogFeed() { BOARD_WATCHDOG(0); }
 #else

@@ -5,8 +5,8 @@
  * a force acts from the tick after its sample on, so the file must be certified for theta = 1.
  *
  *   ha_home   call while the handles stand at their reference; no force acts before
- *   ha_arm    tests each axis by a small force while nobody holds its handle; then raises the gain. Limits that are NaN or
- *             not positive end it (HA_LIMITS)
+ *   ha_arm    tests each axis by a small force while nobody holds its handle; then raises the gain. A range, speed or cap
+ *             that is NaN or not positive ends the test (HA_LIMITS)
  *   ha_stop   ramps out (HA_ASKED, HA_DEADMAN, HA_DEAD), or drops the force at once (every other cause, and during a test)
  *   ha_tick   call once per period; it computes the forces for the next period
  */

@@ -208,7 +208,8 @@ static inline void hl_configure(hl_device *d, const uint8_t *p, size_t n)
     d->cause = HL_NONE;
 }
 
-/* Stores the first force for a tick that is ahead and theta after the source; applies it at once if theta = 0. */
+/* Stores the first force for tick source + theta if it is in time; applies it at once if theta = 0. A force that is too late
+ * still sets echo and margin. */
 static inline void hl_accept(hl_device *d, const uint8_t *p, size_t n, uint32_t now)
 {
     uint16_t apply_at = hl_get16(p + 2), source = hl_get16(p + 4);

@@ -260,7 +260,7 @@ def test_a_device_that_is_unplugged_is_lost(scenario):
         sdk.broken |= session.stage == Stage.ARMED
 
     session, *_ = held_session(scenario, sdk, watch=watch)
-    assert (session.stage, session.cause) == (Stage.LOST, "the device is gone: no device found")
+    assert (session.stage, session.cause) == (Stage.LOST, "a call to the device failed: no device found")
     assert sdk.force.tolist() == [0.0, 0.0]
 
 
