@@ -61,14 +61,48 @@ STYLES: tuple[dict[str, Any], ...] = (
 _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
 
 
-def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
+def _panels(
+    title: str, rows: int, columns: int, size: tuple[float, float], layout: Any = "constrained", **shared: Any
+) -> tuple[Figure, Any]:
     """Make a figure of `size` [inch] with a title, and its axes (rows, columns), each with a grid."""
-    figure = Figure(size, layout="constrained")
+    figure = Figure(size, layout=layout)
     axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     figure.suptitle(title)
     return figure, axes
+
+
+def _arrange(figure: Figure, axes: Any) -> None:
+    """Make room for the labels of the axes (rows, columns) and the legend, in half of the constrained layout's time.
+
+    That layout measures every label twice, also those of the right and upper sides.
+    """
+    renderer, (width, height) = FigureCanvasAgg(figure).get_renderer(), figure.get_size_inches()
+
+    def room(axis: Any, side: int) -> float:
+        """Return the room [inch] that labels need on the left (side 0) or below (side 1) of their axes."""
+        box = axis.get_tightbbox(renderer)
+        return 0.0 if box is None else (axis.axes.bbox.min[side] - box.min[side]) / figure.dpi + _MARGIN
+
+    (columns, rows), dpi = axes.T.shape, figure.dpi
+    left = [max(room(panel.yaxis, 0) for panel in column) for column in axes.T]
+    below = [max(room(panel.xaxis, 1) for panel in row) for row in axes]
+    titled = [_MARGIN + _TITLE * any(panel.get_title() for panel in row) for row in axes]
+    below[-1] += sum(legend.get_window_extent(renderer).height for legend in figure.legends) / dpi + _MARGIN
+    titled[0] += _TITLE * (1 + figure.get_suptitle().count("\n"))
+    across, down = sum(left[1:]), sum(below[:-1]) + sum(titled[1:])
+    figure.subplots_adjust(
+        left=left[0] / width,
+        right=1 - _MARGIN / width,
+        bottom=below[-1] / height,
+        top=1 - titled[0] / height,
+        wspace=columns * across / max(columns - 1, 1) / (width - left[0] - _MARGIN - across),
+        hspace=rows * down / max(rows - 1, 1) / (height - below[-1] - titled[0] - down),
+    )
+
+
+_MARGIN, _TITLE = 0.12, 0.22  # [inch] around panels, labels and legends; height of a line of a title
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
@@ -116,6 +150,7 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     _literal(figure)
     relabel(figure)
     if kind != ".png":
+        figure.set_layout_engine("constrained")
         _fit_paper(figure)
     if kind == ".png":
         figure.set_dpi(dpi)
@@ -215,7 +250,8 @@ def draw_run(
     parts = _shown_parts(result, frequency_hz, onset)
     zoomed = len(parts) > 1
     shape: dict[str, Any] = {"width_ratios": (2, 1)} if zoomed else {}
-    figure, axes = _panels(title, 2, len(parts), (11, 6.4), sharex=False if growth is not None else "col", **shape)
+    shared = False if growth is not None else "col"
+    figure, axes = _panels(title, 2, len(parts), (11, 6.4), layout=None, sharex=shared, **shape)
     if growth is not None:
         axes[0, 0].sharex(axes[1, 0])
     _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts, around)
@@ -235,6 +271,7 @@ def draw_run(
     for axis in axes[1]:
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
+    _arrange(figure, axes)
     return figure
 
 
