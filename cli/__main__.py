@@ -1,4 +1,4 @@
-"""python -m cli: the same as haptic-loop."""
+"""python -m cli: the command haptic-loop."""
 
 from haptic_loop.cli.main import main
 

@@ -16,15 +16,15 @@ from haptic_loop.sim.scenario import InputError, require_even_ticks, require_lin
 
 _MOST_STEPS = 3_000_000  # largest number of steps of RK4 at its default substeps; they take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: the larger error [1/s] of those with and without the coupling",
+    "position: relative rms error; growth: the larger error of the growth rates with and without the coupling [1/s]",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
-    "real: simulated seconds per second; *: right verdict, and no setting of this engine is faster and more accurate",
+    "real: simulated seconds per second; *: right verdict, on the Pareto front of this engine's speed and errors",
 )
 
 
 @dataclass(frozen=True)
 class _Report:
-    """Rows of every engine and step on one loop."""
+    """Speed and errors of every engine with each of its settings, on one loop."""
 
     case: str
     scenario: str
@@ -36,7 +36,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Measure every engine and step. Return 0 if the defaults judge stability right, 1 if not, 130 if interrupted."""
+    """Measure every engine. Return 0 if the defaults judge stability correctly, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.accuracy")

@@ -122,12 +122,12 @@ def _parser() -> options.Parser:
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|FILE.py:NAME", help=stored)
     parser.add_condition(
-        "the report judges this-environment and any-environment; the condition that must hold (default "
+        "the condition that must hold, beside the judged this-environment and any-environment (default "
         "this-environment, or known-device for known devices)",
         to=coupling,
     )
-    device = "use its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
-    coupling.add_argument("--device", metavar="NAME", help=f"from the catalogue: {device}; other options override it")
+    device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"
+    coupling.add_argument("--device", metavar="NAME", help=f"use a listed device: {device}; other options override it")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     parser.add_loop()
     parser.add_rigid()

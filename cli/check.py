@@ -49,7 +49,7 @@ class _Switching:
 
 @dataclass(frozen=True)
 class _Checked:
-    """The report; figures of the certificate are null if the file has none."""
+    """The report; figures of the certificate are null if the file has no certificate."""
 
     proved: bool
     reason: str | None = render.figure("reason")
@@ -57,7 +57,7 @@ class _Checked:
     guarantee: str | None = render.figure("guarantee")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
-    between: SearchFigures | None = render.figure("between")
+    between: SearchFigures | None = render.figure("between vertices")
     required_damping: Sequence[float] | None = render.figure("required damping [N s/m]", listed)
     available_damping: Sequence[float] = render.figure("available damping [N s/m]", listed)
     margin: float | None = render.figure("margin", "{:.6g}")
@@ -177,7 +177,7 @@ def _table(checked: _Checked) -> render.Table:
     title = "not proved"
     if checked.proved:
         ranges = checked.assessment and checked.assessment.ranges
-        between = f", at {ranges.where}; between them searched, not proved" if ranges and checked.between else ""
+        between = f", at {ranges.where}; only searched between vertices" if ranges and checked.between else ""
         anew = "proved anew, not from the file" if checked.anew else "proved"
         title = f"{anew}, in exact arithmetic{between}"
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]

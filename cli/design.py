@@ -76,7 +76,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--coupling", metavar="NAME", help=kinds)
     around = "vary stiffnesses and masses by PERCENT like a scenario's [ranges]: certify vertices, search between them"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
-    parser.add_condition("what to certify (default: the coupling's)")
+    parser.add_condition("condition to certify (default: that of the coupling)")
     ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
     varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
@@ -84,7 +84,7 @@ def _parser() -> options.Parser:
     parser.add_varying_delay(varying)
     limiter = (
         "fail unless this-environment (optimal: or known-device) is proved for limited forces, too "
-        "(default: only a spring-damper tries it)"
+        "(default: only a spring-damper tries this proof)"
     )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
@@ -185,9 +185,9 @@ _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 def _that_decays(
     scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
-    """Design for less and less damping, which gives softer couplings, until every mode has this damping ratio.
+    """Design for less and less damping, which gives softer couplings, until every mode has at least this damping ratio.
 
-    A coupling certified for less damping is also certified for the available damping.
+    A coupling certified for less damping is also certified for the available damping. Raises DesignFailed.
     """
     from haptic_loop.sim.run import assemble
     from haptic_loop.sim.stability import ringing

@@ -118,7 +118,7 @@ def _parser() -> options.Parser:
         "python -m design.export coupling.json --process",
         "python -m design.export coupling.json --process --force-limit 12",
     )
-    parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
+    parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling and its loop")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block")
     link = "leave out the transmission delay theta, if the link to the devices causes it"
     parser.add_argument("--without-theta", action="store_true", help=link)

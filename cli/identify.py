@@ -1,9 +1,9 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
-By default two sittings are recorded, with --port at different places of the handles. Nobody may hold them; if a hand
-damps a handle in one sitting, the other sitting reveals it. The excitation is played in a bridge session with limits of
-force and speed; the force cap is the excitation's largest force. With --transmission two sittings with clamped handles
-follow. They bound the mass of the motor and the transmission (hw/transmission.py), for the known-device conditions.
+By default two sittings (sessions) are recorded; with --port, the handles are at another place in the second. Nobody may
+hold them; if a hand damps a handle in one sitting, the other reveals it. The excitation is played in a bridge session
+with limits of force and speed; the force cap is the excitation's largest force. With --transmission two sittings with
+clamped handles follow, for bounds of motor mass and transmission (hw/transmission.py; known-device conditions).
 """
 
 from __future__ import annotations

@@ -172,7 +172,9 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
 
-    def add_condition(self, what: str = "what to certify (default: the coupling's)", to: _Group | None = None) -> None:
+    def add_condition(
+        self, what: str = "condition to certify (default: that of the coupling)", to: _Group | None = None
+    ) -> None:
         """Add --condition."""
         help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)

@@ -277,7 +277,7 @@ def _speed(run: Ran) -> str:
 
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
-    """Return a table of every engine and step on this scene; the one that ran is marked."""
+    """Return a table of the integrators and substeps tried on this scene; those of this run are marked."""
     cells: dict[str, Any] = {
         "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),

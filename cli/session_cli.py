@@ -46,8 +46,8 @@ def add_link_options(parser: options.Parser) -> None:
     """Add options for the device, its link, and the measurement of its delay."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
-    port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
-    port += f"{FORCE_DIMENSION}[:0x,1x]: number of a device and letter of its axis, for each channel"
+    port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
+    port += f"{FORCE_DIMENSION}[:0x,1x]: index of a device and letter of its axis, for each channel"
     add("--port", metavar="PATH", help=port)
     virtual = "the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
@@ -69,7 +69,7 @@ def add_link_options(parser: options.Parser) -> None:
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to the measured age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
-    parser.only("with --rehearse: a device has faults of its own", lambda args: args.rehearse, "fault")
+    parser.only("with --rehearse: faults act on an emulated device", lambda args: args.rehearse, "fault")
     parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
     parser.only(f"with --port {FORCE_DIMENSION}", host_clocked, "clamped")
     uart = f"with a serial port or --rehearse: {FORCE_DIMENSION} has no UART"

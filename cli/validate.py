@@ -291,7 +291,7 @@ class _Report:
 def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
-    """Return the numbers of hands that grow under varying delays and varying periods; None for constant ones."""
+    """Return how many hands make the loop grow with varying delays and with varying periods; None for constant ones."""
     from haptic_loop.sim.switching import DelaysCovered
 
     scenario, switching, timing = question.scenario, None, None

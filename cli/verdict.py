@@ -120,7 +120,7 @@ def _who(guarantee: Guarantee) -> str:
     """Return the hands and objects of a guarantee: 'every passive hand with this object'."""
     place = _OBJECTS.get(guarantee.environments, guarantee.environments)
     if guarantee.environments == RANGES:
-        place = f"{guarantee.vertices} of the ranges (between them searched, not proved)"
+        place = f"{guarantee.vertices} of the ranges (only searched between vertices)"
     delays, facts = guarantee.delays, guarantee.facts
     late = f", with delays that switch within {delays}" if "switching" in facts else ""
     return f"{guarantee.hands} with {place}{late}"

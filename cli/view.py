@@ -160,7 +160,7 @@ def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(with_file=True))
     parser = options.Parser(
         "sim.view",
-        f"Feel the loop in a window, or film it.\n\nKeys: {keys}; given is --coupling FILE.json.",
+        f"Feel the loop in a window, or film it.\n\nKeys: {keys}; `given` means --coupling FILE.json.",
         *_EXAMPLES,
         first="scenario coupling condition reference video script",
     )
@@ -168,7 +168,7 @@ def _parser() -> options.Parser:
     parser.add_loop()
     what = f"the first coupling: {', '.join(_names())} or FILE.json; designed is spring-damper"
     add("--coupling", metavar="NAME|FILE", help=what)
-    parser.add_condition("the condition of designs (default: the coupling's)")
+    parser.add_condition("condition to design for (default: that of the coupling)")
     parser.add_limiter()
     add(
         "--script",

@@ -28,7 +28,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least amplitude of an oscillation, the resolution of a desk device's encoders
+_FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
 _PRESS = 3.0  # [N] steady force of a hand; maps of environments have none, because soft ones would yield to it
 
 
@@ -87,7 +87,9 @@ def _parser() -> options.Parser:
     fixed = "keep this coupling and vary K and B of the environment's contact springs"
     names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
-    parser.add_condition("your own is drawn in every map; others need --coupling (default: the coupling's)", to=of_map)
+    parser.add_condition(
+        "condition to draw: your own, or with --coupling any (default: that of the coupling)", to=of_map
+    )
     rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T, or from the contact springs", "[N s/m]; default from delta"
@@ -211,7 +213,7 @@ def _effects(effects: Shown) -> str:
 
 
 def _marked(report: MapReport) -> Iterator[str]:
-    """Yield a line for every coupling of --mark."""
+    """Yield a line for every point of --mark."""
     for mark in report.marks or ():
         stiffest = mark.stiffest_K_at_this_B
         ends = ", ".join(f"{name} {_limit(K)}" for name, K in stiffest.items())
