@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(right: bool, rows: Sequence[Row]) -> str:
-    """Return whether the default settings judge stability right, and the errors of the exponential integrator."""
+    """Return whether the default settings judge stability correctly, and the errors of the exponential integrator."""
     words = "The defaults judge stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
     for row in rows:
         if (row.integrator, row.substeps) == (EXPONENTIAL, 1):

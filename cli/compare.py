@@ -1,7 +1,7 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
 Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. In a loop without
-walls and friction, the couplings drive the scenario's own hands, and couplings.png shows the forces side by side. With
+walls and friction, the scenario's own hands feel every coupling, and couplings.png shows the forces side by side. With
 --coupling, the named couplings are drawn over frequency: singular values, required damping, perceived stiffness and
 damping.
 """
@@ -33,7 +33,7 @@ _MOST = 6  # curves that can be told apart in one panel
 def main(argv: list[str]) -> int:
     """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed.
 
-    Ctrl-C ends the command without a report, because a table without all couplings would name a wrong best one.
+    Ctrl-C ends the command without a report, because a table that lacks couplings may name a wrong best one.
     """
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
@@ -245,7 +245,7 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep cannot tell frequencies below 0.5 mHz from 0.
+    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep does not resolve frequencies below 0.5 mHz.
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:

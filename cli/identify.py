@@ -182,7 +182,7 @@ def _sitting(
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r = scenario.lever  # the options state figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # This stops a device that is lighter than declared.
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # This limit stops a device that is lighter than declared.
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
@@ -244,7 +244,7 @@ def _with_transmissions(
         return replace(report, no_transmissions=reason)
     bounds = list[TransmissionBounds]()
     for i in range(scenario.channels):
-        free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # A hand would add damping.
+        free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # Hands only add damping.
         try:
             first, *others = (records_of(s.recorder, s.session)[i] for s in (free, *clamped))
             step = free.session.units.encoder_step[i]

@@ -41,7 +41,7 @@ from haptic_loop.sim.world import START_J, scene_of
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
 _SHAKING = 10  # most ticks in a row with a speed change above jump/5; ten changes of 0.6 mm in 1.2 ms add up to 5 m/s
-_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of the last reserve that is tried
+_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves where the requested kind gives none
 
 
 class Controller(Protocol):
@@ -118,7 +118,7 @@ class BudgetPlan:
         """Return the plan for a device of this configuration.
 
         The device holds a force for `hold` missed ticks, then ramps it to zero. Because of its slew rate, an older
-        force still acts in up to n = ceil(config.cap / config.slew) later ticks with an answer, each after up to
+        force still acts in up to ceil(config.cap / config.slew) later ticks with an answer, each after up to
         `hold` missed ticks. Afterwards, the applied force lies between forces that were sent later.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
@@ -128,7 +128,7 @@ class BudgetPlan:
 
 
 class SentBudget:
-    """The energy budget that limits shaped forces before they are sent. It truncates limited forces to whole steps."""
+    """The energy budget that limits forces after gain, caps and slew rate. It truncates them to whole steps."""
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
@@ -282,7 +282,7 @@ class Drive:
         expected: monitor.Expected,
         still: Sequence[int],
     ) -> None:
-        """Take `still` (m,) [counts], the encoders' noise, and `expected`, which predicts motions in encoder tests."""
+        """Take `still` (m,) [counts], the range of encoders at rest, and `expected`, which predicts tested motions."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
@@ -305,7 +305,7 @@ class Drive:
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # boards each have one
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # of several boards, each has one
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property

@@ -165,7 +165,7 @@ class SafetyLimits:
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
     def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> int | None:
-        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which a mass rules out.
+        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no hand can cause.
 
         `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
         whose speed changed by more than a fifth of `jump` per tick, or None. A fifth is two counts of the coarsest

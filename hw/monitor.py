@@ -51,7 +51,7 @@ _STRONG = 2  # first block of the test at the end of a session
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
-_TREMOR = 3e-5  # [m] least range of a calm hand in that time; with coarser counts it looks like a dead encoder
+_TREMOR = 3e-5  # [m] least range of a calm hand in _PRESSED; on coarser counts, such a hand looks like a dead encoder
 _FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops if wrong ticks stay more frequent
 
 
@@ -67,8 +67,8 @@ class LinkSettings:
     test_encoders: bool = True  # whether a small force tests the encoders at every arming
     held: bool = True  # whether the scenario's hands hold the handles in that test (rehearsals), or nobody does
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
-    rereference: bool = True  # positions count from where the handles are at arming
-    deadman: bool = False  # forces act only while the deadman at the device is held
+    rereference: bool = True  # whether positions count from the handles' place at arming
+    deadman: bool = False  # whether forces act only while the deadman at the device is held
     behind: tuple[int, ...] = ()  # (m,) with several boards, ticks added to the link's delay (hw/boards.py)
     elsewhere: tuple[int, ...] | None = None  # [counts] places that every handle must have left before arming
 
@@ -156,7 +156,7 @@ class Measurement:
     have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
     round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
     same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are at random
-    distances, so that bursts meet each with the same probability. The least distance is the longest age, or theta.
+    distances of the longest age (at most theta) or more, so that bursts meet each with the same probability.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
@@ -645,7 +645,7 @@ class EncoderTest:
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
-        # [m] of noise and rounding: `still` is twice the range in 100 ms, which is about four standard deviations
+        # standard deviation [m] of rounding, or of noise if that is larger: `still` / 2, a range in 100 ms, spans four
         scatter = np.array(self._units.encoder_step) * np.maximum(12**-0.5, np.array(self._still) / 8)
         own = np.maximum((moved**2).sum(axis=0) - len(t) * scatter**2, len(t) * scatter**2)
         fit = size**2 * power / own
@@ -746,8 +746,8 @@ class EncoderMonitor:
     toggles between two counts. The force that the device reports is compared with the force at the last motion. Changes
     of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
-    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. It
-    shows where noise and counts hide less than 30 um.
+    of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. The
+    tremor shows where noise and counts hide less than 30 um.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:

@@ -88,7 +88,7 @@ class _Ended:
 
 @dataclass(frozen=True)
 class _Link:
-    """Figures of the link during its measurement and while forces acted (None if none did); counters of the session."""
+    """Counters of the session, and figures of the link while it was measured and while forces acted, if any did."""
 
     measured_age_us: dict[str, float] | None
     measured_missing: int

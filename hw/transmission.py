@@ -23,7 +23,7 @@ from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N moves less than a count of 5 um
-_TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed besides
+_TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
 #: largest rms error over the allowed one; with play or presliding friction it is 3 to 6, with dry friction up to 2.1
 _UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn

@@ -211,7 +211,7 @@ class Live(Driver):
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
         """Return the designed couplings, and act on keys typed meanwhile. Raises SafetyStop if SIGINT came."""
-        self._watch(self.session)  # call it now, because the design takes a while
+        self._watch(self.session)  # show the stage now, because the design takes a while
         try:
             with _interruptible():
                 programs = self._design(ages)
