@@ -122,7 +122,7 @@ def _parser() -> options.Parser:
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|FILE.py:NAME", help=stored)
     parser.add_condition(
-        "the condition that must hold, beside the judged this-environment and any-environment (default "
+        "the report judges this-environment and any-environment; for exit code 0 this condition must hold (default "
         "this-environment, or known-device for known devices)",
         to=coupling,
     )

@@ -422,7 +422,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
     """
     scenario = axis_by_axis(scenario)
     if scenario.unit == "rad" and scenario.radius is None:
-        raise InputError("radius is missing: give the distance in metres from the axis to the hand, for its limits")
+        raise InputError("radius is missing: give the distance in metres from axis to hand, which scales the limits")
     limits, balls = scenario.limiter_limits
     r, vectors = scenario.lever, tuple((ball.start, ball.stop) for ball in balls)
     scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": SafetyLimits.speed / r, "lever": r} | more

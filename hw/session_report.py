@@ -214,13 +214,13 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
     """Return why a session that ended as planned does not count as finished, or None if forces acted as requested."""
     ticks, link = len(recorder), recorder.link()
     if 2 * session.counters.slowed > ticks > 0:
-        return f"{100 * session.counters.slowed / ticks:.0f} % of its forces were cut by the slew rate"
+        return f"{100 * session.counters.slowed / ticks:.0f} % of the forces were cut by the slew rate"
     second = min(ticks, round(1 / session.scenario.T))
     capped = session.limits.capped(link["gain"][:, None] * link["asked"], _AT_CAP)
     cut = np.convolve(capped.any(axis=1), np.ones(second) / second, "valid").max() if ticks else 0.0
     if cut > 0.5:
         advice = "raise --force-cap, request smaller forces, or look for a reversed sign"
-        return f"{100 * cut:.0f} % of its forces were cut in a second: {advice}"
+        return f"{100 * cut:.0f} % of the forces were cut in a second: {advice}"
     for i, growth in enumerate(growths, start=1):
         if growth.trend == "grows":
             return f"an oscillation grew in arming {i}"

@@ -32,7 +32,7 @@ static uint16_t longest, ticks; /* longest: [cycles / 8] of the longest tick sin
 #define MARK(what) /* the tests count cycles between marks */
 #endif
 
-/* Returns the counts of the motor without wraps. The motor must turn by less than a quarter between two ticks. */
+/* Returns the counts of the motor without wraps. The motor must turn by less than a quarter turn between two ticks. */
 static int32_t readSensor()
 {
   int16_t raw = (int16_t)analogRead(SENSOR);

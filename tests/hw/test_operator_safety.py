@@ -176,7 +176,7 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     assert session.stage == Stage.FINISHED
     report = outcome("I", session, recorder, 0)
     assert report.session.stage == session.stage == "stopped"
-    assert "% of its forces were cut" in report.session.cause
+    assert "% of the forces were cut" in report.session.cause
 
 
 @pytest.mark.parametrize(("cut", "stage"), [(400, "finished"), (450, "stopped")])
@@ -264,7 +264,7 @@ def test_doubts_reach_log_and_picture(tmp_path, capsys):
     report = json.loads((tmp_path / "report.json").read_text())["session"]
     last = json.loads((tmp_path / "incidents.jsonl").read_text().splitlines()[-1])
     assert (last["stage"], last["cause"]) == (report["stage"], report["cause"])
-    assert re.search(r"^the time is over, but \d+ % of its forces were cut in a second", last["cause"])
+    assert re.search(r"^the time is over, but \d+ % of the forces were cut in a second", last["cause"])
 
 
 # the machine
