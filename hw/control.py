@@ -40,7 +40,7 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # most ticks in a row with a speed change above jump/5; ten changes of 0.6 mm in 1.2 ms add up to 5 m/s
+_SHAKING = 10  # most ticks in a row with a speed change above jump/5; at T = 1.2 ms ten such changes add up to 5 m/s
 _FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves where the requested kind gives none
 
 

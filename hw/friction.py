@@ -7,9 +7,9 @@ Both sides of the balance are filtered by a Gaussian window h (modulating functi
 with the displacement x, the motor's force f and D = d/dt. The fit estimates the mass m and the viscous damping b. The
 term k x stands for a cable, a spring or gravity that changes with position, f0 + f1 t for a constant force and its
 drift. A motor (m1) that drives the handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12,
-p = a b + l m, r = a m1. The balance has no fractions, since both sides were multiplied by 1 + l D + a D^2. A lag tau of
-the amplifier changes l to l - tau and a to about a + tau^2/2, so the fit does not mistake it for negative damping. The
-fit differentiates h, never the encoder, and integrates a force held for a tick exactly. The balance is linear in all
+p = a b + l m, r = a m1. Both sides were multiplied by 1 + l D + a D^2, so there are no fractions. An amplifier's
+lag tau changes l to l - tau and a to about a + tau^2 - l tau, so the fit does not mistake it for negative damping.
+The fit differentiates h, never the counts, and integrates a force held for a tick exactly. The balance is linear in all
 parameters except the a before g, so a fit takes milliseconds. A fit needs no initial state.
 
 Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
