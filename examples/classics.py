@@ -1,8 +1,8 @@
 """Compare classic passivity layers (PO/PC, energy bounding) with our couplings, in half a minute.
 
 Columns: the rms error of the applied force; the force's rms above 40 Hz and its peak; the share of ticks in which the
-layer changed a force. The last two are about 100 pairs of lossless hands that start at 0.1 m/s: how many are faster in
-the tenth second, and the largest speed in that second.
+layer changed a force. The last two are about 100 pairs of lossless hands that start at 0.1 m/s: how many exceed this
+speed in the tenth second, and the largest speed in that second.
 """
 
 from dataclasses import dataclass
@@ -115,7 +115,7 @@ ROWS: dict[str, Any] = {
 
 
 def row(layer: Any) -> tuple[float | None, float, float, float, int, float]:
-    """Return the figures of one row of ROWS."""
+    """Return the figures of one row of ROWS, in the order of the columns."""
     scenario = load("omega-pair")
     design = design_coupling(scenario.loop("I"), *layer) if isinstance(layer, tuple) else None
     coupling = design.coupling if design else NoCoupling()
@@ -132,7 +132,7 @@ def row(layer: Any) -> tuple[float | None, float, float, float, int, float]:
 
 
 def left_alone(loop: Any) -> tuple[int, float]:
-    """Return how many pairs of lossless hands are faster in the last second than at first, and the top speed in it."""
+    """Return how many pairs of lossless hands exceed SLOW in the last second, and their top speed [m/s] in it."""
     scenario, rng, shape = loop.scenario, np.random.default_rng(1), (PAIRS, loop.scenario.channels, 2)
     mass, stiffness = (np.exp(rng.uniform(*np.log(span), shape)) for span in ((0.01, 3.0), (1.0, 1e4)))
     crowd = variants(scenario.device, Crowd(np.stack([mass, np.zeros_like(mass), stiffness], axis=-1)))

@@ -51,7 +51,7 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], a share of ticks, and how many hands grow and how many shake.
+    """Return the peak force [N], a share of ticks, and how many pairs of hands grow and how many shake.
 
     The share is that of ticks with a clipped contact force, or with forces that the shell scaled.
     """
@@ -96,7 +96,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
 
 
 def scenes(folder):
-    """Return the packaged stack of boxes, and a fixed block, tips of 2 kg like a robot's, contacts of 5 ms."""
+    """Return the packaged stack, and a fixed block touched by tips of 2 kg, as of robots, with contacts of 5 ms."""
     stack = load("world-stack")
     (Path(folder) / "block.xml").write_text(BLOCK)
     block = Path(folder) / "block.xml"

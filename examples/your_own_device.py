@@ -1,6 +1,6 @@
 """Rehearse a session of the bridge with an emulator of your device, over the real protocol.
 
-A session in virtual time: handshake, measurement of the delay, coupling certified for it, arming, run, ramp to zero.
+The session runs in virtual time: handshake, measurement of the delay, design for it, arming, run, ramp to zero.
 """
 
 import sys
@@ -15,7 +15,7 @@ SECONDS = 2.0
 
 
 def _wall(delay: float | None) -> float:
-    """Return the damping [N s/m] that a rigid wall behind a spring needs with this delay [s], None for a sample."""
+    """Return the damping [N s/m] that 1000 N/m need at a rigid wall, with this delay [s] or, for None, a sample."""
     theta, latency = ((1,), None) if delay is None else ((0,), ((delay, delay),))
     wall = Loop(1.2e-3, theta, (0,), theta, (MINE["damping"],), RIGID_WALL, latency=latency)
     return certify(wall, SpringDamper([1000.0], [0.0]))["this-environment"].required[0]

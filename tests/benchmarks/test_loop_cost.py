@@ -28,15 +28,15 @@ def test_exact_engine(benchmark):
     simulation = assemble(load(), PUBLISHED["I"])
     benchmark.pedantic(lambda: run(simulation, "exact"), rounds=9, iterations=1, warmup_rounds=1)
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
-    print(f"\nexact: {simulation.scenario.duration / median:.0f} x real time, the reference for errors")
+    print(f"\nexact: {simulation.scenario.duration / median:.0f} x real time; errors are differences from this engine")
     assert simulation.scenario.samples == 12500
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatch):
-    """Compare the least times of a loop with the limiter and of one that clips, in turns.
+    """Run a loop with the limiter and one that clips in turns, and compare their shortest times.
 
-    The box problem is solved only in ticks whose forces are limited.
+    The limiter solves a box problem only in ticks whose forces it limits.
     """
     coupling, solved, solve = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), [], BoxProblem.solve
     monkeypatch.setattr(BoxProblem, "solve", lambda problem, q: [solved.append(1), solve(problem, q)][1])

@@ -1,6 +1,6 @@
 """Attack each guarantee beyond the plain linear loop at its edge: `make validate`.
 
-A loop is drawn, and its devices get a little more or much less damping than its guarantee requires. Then two
+A loop is drawn; its devices get a little more or much less damping (or friction) than its guarantee requires. Then two
 adversaries try to take energy out of the loop, from rest. One moves the devices as it likes: waves, noise, and at every
 tick the step that takes the most, with limits so low that forces are often limited. The other draws pushed lossless
 hands, keeps those whose motion grows most, and varies them. A guarantee says that the energy balance
@@ -42,7 +42,7 @@ _ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
 @dataclass(frozen=True)
 class _Challenge:
-    """What the adversaries found in one loop."""
+    """The findings of the adversaries in one loop."""
 
     guarantee: str
     loop: int  # the number of the draw
@@ -252,9 +252,9 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
-    """any-environment, a limiter without lag, and walls with dampers that make and break contact.
+    """Return a case of any-environment: a limiter with rho = 0, and walls with dampers that make and break contact.
 
-    The environment is the one of eight that needs most of the damping that any-environment requires.
+    Of eight loops it is the one whose environment needs the largest share of what any-environment requires.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:
@@ -273,7 +273,7 @@ def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _budget(rng: np.random.Generator, factor: float) -> _Case:
-    """The budget guards a loop that needs two to four times the available damping."""
+    """Return a case of the energy budget: without it the loop needs two to four times the available damping."""
     loop, coupling = _pair(rng)
     delta = np.array(this_environment(loop.F(coupling), loop).required) / rng.uniform(2, 4)
     simulation = assemble(_scenario(loop, delta), coupling)
@@ -299,9 +299,9 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _friction(rng: np.random.Generator, factor: float) -> _Case:
-    """Encoders of 10 um; the claim is about friction; the damping is what the loop needs with ideal ones.
+    """Return a case of encoder steps of 10 um: the factor applies to friction; damping is that for ideal encoders.
 
-    Hands are let go at a millimetre a second and less, where encoder steps matter."""
+    Hands are let go at a millimetre a second or less, where encoder steps matter."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop).required)

@@ -46,7 +46,7 @@ class Fault:
     stage: Stage
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
-    within: float | None = None  # [ms] from the fault to zero force; None: forces go on
+    within: float | None = None  # [ms] from the fault to zero force; None: not measured
     action: _Call | None = None  # done at _WHEN
     host_stall: float = 0.0  # [s] that the host freezes at _WHEN
     info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
@@ -102,7 +102,7 @@ def _signed(
 
 
 G, A = Stage, Stage.ARMED
-#: only the strongest force, 120 ms later, finds a motion too small
+#: a motion that is too small fails the test only with the strongest force, 120 ms later
 _ENDED: dict[str, Any] = {"action": person("stop"), "within": 2 * (100.0 + _TESTED) + 120.0, "lasts": 1.8}
 _LATE = at("down:jitter=0.0007")
 CASES = (
@@ -344,7 +344,7 @@ class _FaultOutcome:
     cause: str
     peak_force_n: float  # of any motor
     peak_speed: float  # [m/s] of any handle
-    zero_force_ms: float | None  # from the fault on; None: not required, or forces go on
+    zero_force_ms: float | None  # from the fault on; None: not measured, or forces go on
     allowed_ms: float | None
     wrong: tuple[str, ...]  # empty if all went as required
 

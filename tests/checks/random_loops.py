@@ -45,7 +45,7 @@ def _random_network(rng: np.random.Generator) -> Network:
 
 
 def _delayed(rng: np.random.Generator) -> Loop:
-    """Return a random network behind random delays; the dampings are 1 N s/m."""
+    """Return a loop of a random network and random delays, with 1 N s/m of damping on each channel."""
     while True:
         try:
             network = _random_network(rng)

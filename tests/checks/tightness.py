@@ -22,7 +22,7 @@ from haptic_loop.sim.scenario import DEFAULT, Scenario, load
 
 @dataclass(frozen=True)
 class _Attack:
-    """A search against a loop placed short of its required damping."""
+    """A search against a loop whose devices lack a share of the required damping."""
 
     name: str
     short: float  # share of the required damping that is missing

@@ -69,7 +69,7 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_Un
 
 
 def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
-    """Return a random loop that has a required damping, and its coupling."""
+    """Return a random loop whose required damping is 0.01 to 20 N s/m, and its coupling."""
     while True:
         m = int(rng.integers(1, 3))
         names = tuple(f"contact {i + 1}" for i in range(m))

@@ -24,5 +24,5 @@ def driven(*options: str) -> int:
 
 @pytest.mark.slow
 def test_hostile_cases_are_answered_well():
-    """Of pairs with values one in two or three runs, so that each field and value occurs; `make validate` runs all."""
+    """A short run has every second or third pair of a field and a value, so that each of both occurs."""
     assert driven("--short") >= 500

@@ -1,4 +1,4 @@
-"""Ctrl-C at any time, and readers who stop reading: one line, the right exit code, no traceback."""
+"""After Ctrl-C, and for a reader that closes the pipe, a command has the right exit code and no traceback."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ def started(*words, **options):
 
 
 def interrupted_after(module, command, cwd):
-    """Send SIGINT when Python reports that `module` is imported: the same moment of the command on any machine."""
+    """Send SIGINT when Python reports that `module` is imported, and return the exit code and the lines of errors."""
     process = started("-X", "importtime", "-m", *command, cwd=cwd)
     for line in process.stderr:
         if line.rpartition("|")[2].strip() == module:

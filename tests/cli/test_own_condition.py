@@ -144,7 +144,7 @@ def test_in_python_it_is_the_class(folder, monkeypatch):
     assert needs[NAME].proof == "rational"
     assert certify(loop, made.coupling, own)[NAME].required == needs[NAME].required
     assert NAME not in certify(loop, made.coupling)
-    # with Delta = 1.37 I for the full matrix the block would be that of this-environment; its eigenvalues bound s
+    # with Delta = 1.37 I the block would be that of this-environment; the full matrix's eigenvalues bound the ratio
     assert 1 / 1.57 < needs[NAME].ratio / needs["this-environment"].ratio / 1.37 < 1 / 1.17
     assert np.isfinite(needs["any-environment"].ratio)
 

@@ -1,4 +1,4 @@
-"""sim.run as a user meets it: figures, files, exit codes, one line for bad input."""
+"""sim.run reports the agreed figures, writes its files, and answers bad input with one line and exit code 2."""
 
 import json
 import subprocess

@@ -20,7 +20,7 @@ DELTA = np.array([1.37, 0.9])
 
 
 def springs(x, rng):
-    """Return the forces of an unsymmetric stiffness with negative damping, which deliver energy."""
+    """Return a controller that delivers energy: an unsymmetric stiffness with negative damping."""
     K, old = np.array([[6000.0, 2500.0], [-2500.0, 3000.0]]), x
 
     def force(x, v):
@@ -33,7 +33,7 @@ def springs(x, rng):
 
 
 def network(x, rng):
-    """Return the forces of a random recurrent network of saturating units."""
+    """Return a controller that is a random recurrent network of saturating units."""
     A, B, C = rng.normal(size=(30, 30)) / 4, rng.normal(size=(30, 4)) * [300, 300, 5, 5], rng.normal(size=(2, 30)) * 4
     h = rng.normal(size=(30, 1)) * np.ones(x.shape[1])
 
@@ -46,12 +46,12 @@ def network(x, rng):
 
 
 def thief(x, rng):
-    """Return forces of 12 N that always push along the velocity."""
+    """Return a controller whose forces of 12 N always push along the velocity."""
     return lambda x, v: -12.0 * np.sign(v + 1e-12)
 
 
 def each_in_turn(hands, rng):
-    """Return the forces of three controllers, of which each acts in every third simulation."""
+    """Return a function of the forces (m, nsim) [N] of three controllers, each of which acts in a third of nsim."""
     parts = [(slice(k, None, 3), make(hands.x[:, k::3], rng)) for k, make in enumerate((springs, network, thief))]
 
     def force():

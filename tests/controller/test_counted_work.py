@@ -1,4 +1,4 @@
-"""Counted work: it depends on sizes and numbers only, and a budget ends it."""
+"""Counted work depends on sizes and numbers only, and ends when its budget is spent."""
 
 from fractions import Fraction
 

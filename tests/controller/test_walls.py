@@ -1,4 +1,4 @@
-"""Walls solve a complementarity problem in each tick, return at most their energy, and are certified in loops."""
+"""Walls solve a complementarity problem in each tick, return at most the stored energy, and are certified in loops."""
 
 import json
 

@@ -52,7 +52,7 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
 def test_a_linear_scene_is_the_network(tmp_path, coupling):
     """Behind a coupling the scene sends the network's forces for three seconds, and u = x - V f.
 
-    Tendon springs are 1e-12 of 0.1 m longer, which is 8e-11 N; rounding of the lengths adds 1e-14 N a tick.
+    Tendon springs are longer by 1e-12 of their 0.1 m, which is 8e-11 N; rounding of the lengths adds 1e-14 N a tick.
     """
     V = coupling.compliance(T)
     port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
@@ -173,7 +173,7 @@ def test_released_energy_is_that_of_gravity_and_springs(tmp_path):
 
 # ---- the lemma
 
-#: condim, impratio, d, solref, solreffriction of all contacts
+#: condim, impratio, d of solimp, solref, solreffriction of all contacts
 SCENES = (
     (1, 1, 0.9, "0.01 1", None),
     (3, 1, 0.01, "0.01 1", None),

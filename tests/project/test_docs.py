@@ -71,7 +71,7 @@ def shortened(command):
 
 
 def in_full(command):
-    """A parameter set of `make validate`."""
+    """Return a parameter set that only `make validate` runs."""
     return pytest.param(command, id=f"in full: {command}", marks=pytest.mark.validate)
 
 

@@ -1,4 +1,4 @@
-"""Devices with several axes follow closed forms and devices with one axis; impossible ones are refused."""
+"""Devices with several axes match closed forms and devices with one axis; impossible ones are refused."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def test_more_substeps_change_nothing(simulation):
 
 
 def test_the_forces_are_mujocos(simulation):
-    """If springs change after the engine was built, J is old, but the accelerations are those of the new springs.
+    """If springs change after the engine was built, its matrix J is old, but accelerations are of the new springs.
 
     With a wrong J the method is of first order: halving the step halves the error."""
     wrong = 1.5
@@ -312,7 +312,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """Against RK4 x 64 the chosen setting keeps the error; half its substeps exceed a quarter of it."""
+    """Against RK4 x 64 the chosen setting keeps the requested error; RK4 with half its substeps exceeds a quarter."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -331,7 +331,7 @@ def test_friction_keeps_the_error_with_fewest_steps():
 
 
 def test_what_the_finest_run_misses_is_no_chance():
-    """For runs x + c/n the bound is 1.5 c/n; for slower contraction q it is the last gap times q + q^2 + ..."""
+    """The bound of x + c/n is 1.5 c/n; if gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q)."""
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf

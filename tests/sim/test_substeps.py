@@ -1,4 +1,4 @@
-"""The rule picks enough substeps; the one-period map of an engine checks this."""
+"""`default_substeps` picks enough substeps; the one-period map of an engine checks this."""
 
 import json
 

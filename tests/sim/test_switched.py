@@ -1,4 +1,4 @@
-"""With switching delays mode matrices equal the simulated loop, and the search finds switching that grows."""
+"""Products of mode matrices equal the simulated loop with switching delays; the search finds delays with growth."""
 
 import json
 from dataclasses import replace
@@ -74,7 +74,7 @@ def test_mode_products_equal_the_simulated_map():
     for row in wanted:
         xi = _mode_matrix(held, G, depth, row) @ xi
     size = np.abs(buffer.s[:, :, 0]).max()
-    # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
+    # Both results are products of the same 60 matrices; each product rounds numbers of up to `size` by 1e-16.
     np.testing.assert_allclose(xi[:states], buffer.s[ticks, :, 0], atol=1e-11 * size)
     np.testing.assert_allclose(xi[states:][: G.order], buffer.z[ticks, :, 0], atol=1e-11 * size)
 
@@ -146,7 +146,7 @@ def run(tmp_path, *options):
 
 def test_both_engines_meet_the_same_delays(tmp_path):
     report = run(tmp_path, "--varying-delay", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
-    # The exponential integrator has rounding errors only, 2e-14 when measured.
+    # Both engines are exact here: when measured, their positions differed by rounding of 2e-14.
     assert report["error"]["position_relative_rms"] < 1e-7
     varying_delay = report["varying_delay"]
     assert not varying_delay["covered"]
@@ -253,7 +253,7 @@ def test_the_population_meets_lost_packets(tmp_path):
 
 @pytest.mark.slow
 def test_both_engines_see_the_population_grow_alike(monkeypatch):
-    """With four humans and adversarial delays MuJoCo's growth is within 0.01 1/s of the exact one."""
+    """For four humans and adversarial delays MuJoCo's growth rate, if it has one, is within 0.01 1/s of the exact."""
     monkeypatch.setattr("haptic_loop.sim.switching._LONGER", 2)
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"))
     loop = assemble(scenario, STIFF)
@@ -268,7 +268,7 @@ def test_both_engines_see_the_population_grow_alike(monkeypatch):
 
 
 def test_runs_report_the_constant_delays_mismatch():
-    """The process of a switching loop contains G without Theta, but its `felt` is F with the constant theta."""
+    """The law of a switching loop sends G without Theta; `felt`, from which reports are made, is F = Theta G."""
     moved = with_delays(ASSEMBLY, np.ones((5, 2, 1), dtype=int))
     z = np.exp(1j * np.linspace(0.001, 3, 50))
     theta = z[:, None, None] ** -np.array(ASSEMBLY.scenario.theta, dtype=float)[:, None]

@@ -217,9 +217,9 @@ def test_latch_positions_are_the_plants():
 
 
 def test_counted_dissipation_is_a_lower_bound():
-    """The dissipation of two joined devices in a tick is never below the count, and within 1 % of it in most ticks.
+    """Two joined devices dissipate in a tick at least what conditions count, and less than 1 % more in most ticks.
 
-    It is the lost mechanical energy less the work of the forces before and after the latch."""
+    The dissipation is the lost mechanical energy less the work of the forces before and after the latch."""
     late, delta, F, T = np.array([1e-4, 4e-4]), np.array([1.37, 1.1]), PAIR.loop("I").F(SOFT), PAIR.T
     M, K = np.diag([0.5, 0.3]), np.array([[900.0, -300.0], [-300.0, 500.0]])
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, np.diag(delta))]])

@@ -295,7 +295,7 @@ def test_designed_coupling_holds_for_everyone():
     np.testing.assert_allclose(traced.trace, traced.exact, atol=1e-3)
     assert not traced.clipped.any()
     assert (traced.energy >= 0).all()
-    # Definition 3: with these damped humans motions decay within two seconds.
+    # The paper's Definition 3: with these damped humans motions decay within two seconds.
     assert (traced.settling < 1).all()
 
 

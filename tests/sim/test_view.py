@@ -598,7 +598,7 @@ def test_flat_pictures_show_where_things_are(none):
         ]  # between the words and the plots
         return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
 
-    # 520 pixels show two steps and two arrows, 0.42 m; both ends of a motion are rounded.
+    # 520 pixels show 0.42 m: 0.09 m on each side of the handle and two arrows; both ends of a motion are rounded.
     assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
 
 
@@ -687,7 +687,7 @@ def test_mp4_without_ffmpeg_is_refused(monkeypatch, tmp_path):
         run("--video", str(tmp_path / "a.mp4"))
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere a display is not told by the environment")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="on other systems no variable tells of a display")
 def test_without_a_display_there_is_a_line(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

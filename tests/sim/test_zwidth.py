@@ -224,7 +224,7 @@ def test_the_population_is_decided_as_one_by_one(links):
 
 
 def test_cells_without_unstable_leaders_test_everyone():
-    """One unstable human outside the leading ones must still be found."""
+    """Unstable humans are found even if none of them is among the leaders, which are tested first."""
     sweep = rigid(1)
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     F = sweep.force_maps(np.array([1300.0]), np.array([0.0]))[0][0]

@@ -1,7 +1,7 @@
 """Run the commands with every kind of bad input that we know of, in forks of one process.
 
     python tests/tools/hostile.py [WORD]     run the cases whose name contains WORD; exit code 0 if all end well
-    python tests/tools/hostile.py --short    run one in two or three of the pairs of a command or a field with a value
+    python tests/tools/hostile.py --short    run one in two or three pairs of a command (or field) and a value
     python tests/tools/hostile.py --signals  send Ctrl-C or SIGTERM at random moments of a run instead
 
 A case is answered well if the command ends in time with the expected code and, unless it succeeded, one line on
@@ -93,7 +93,7 @@ TOGETHER = 100  # cases per process: starting a process costs more than most cas
 
 
 def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield what is wrong with the end of each case. After a case that ends its process a new process runs the rest."""
+    """Yield each case's name and what is wrong with its end. If a case ends its process, a new one runs the rest."""
     good = {str(path.relative_to(model)): content(path) for path in model.rglob("*")}
     while cases:
         places = [Path(tempfile.mkdtemp(dir=folder)) for _ in cases]
@@ -220,7 +220,7 @@ def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield the cases whose name contains the word, and what is wrong with the end of each."""
+    """Yield the names of the cases that contain the word, and what is wrong with the end of each case."""
     found = [case for part in (hostile_words, hostile_files) for case in part.cases() if word in case.name]
     for first in range(0, len(found), TOGETHER):
         yield from answered(found[first : first + TOGETHER], folder, model)

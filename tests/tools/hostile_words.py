@@ -224,6 +224,7 @@ def silence() -> Iterator[Case]:
 
 
 def feather() -> None:
+    """Write a scenario whose handles and hands weigh 1 mg."""
     put(
         "s.toml",
         TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace(

@@ -1,4 +1,4 @@
-"""make mutate: report small mistakes in the code that verdicts rest on which no test notices.
+"""make mutate: test whether the tests notice small mistakes in the code on which verdicts rest.
 
 The command makes small mistakes, one at a time, in the functions of the modules of TABLE: it reverses a comparison or a
 sign, changes a number, leaves out a refusal, or writes `max` for `min`. Then it runs the tests that call the changed
@@ -52,7 +52,7 @@ TABLE = {
     "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
 }
 _ENOUGH = 6.0  # CPU seconds that the tests of one mutant may take without the mistake; the fastest tests are taken
-_TIMEOUT = 3.0  # A mutant is ended after this many times the usual time of its tests, and 15 s.
+_TIMEOUT = 3.0  # a mutant is ended after 15 s of CPU time plus this many times the usual CPU time of its tests
 
 _COMPARISONS = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),

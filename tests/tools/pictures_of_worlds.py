@@ -1,4 +1,4 @@
-"""python tests/tools/pictures_of_worlds.py FILE.png: draw the packaged worlds while hands move, for docs/worlds.md."""
+"""python tests/tools/pictures_of_worlds.py FILE.png: draw five packaged worlds while hands move, for docs/worlds.md."""
 
 import math
 import sys

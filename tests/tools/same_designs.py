@@ -1,6 +1,6 @@
 """Design the same couplings under different conditions of the machine, and compare the stored files byte for byte.
 
-    python tests/tools/same_designs.py     six designs: idle, under load, three at once of which one is on a single core
+    python tests/tools/same_designs.py     each of six designs idle, under load, and three at once, one on one core
 
 Exit code 1 if a file differs. Designs run through the public command, so each file is what a user stores.
 """
