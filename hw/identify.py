@@ -218,8 +218,11 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
     def error(p: Array) -> Array:
         return spectrum.error(np.append(p, 0.0), 1.0)  # c = 0: friction without memory
 
+    def jacobian(p: Array) -> Array:
+        return spectrum.jacobian(np.append(p, 0.0), 1.0)[:, :7]
+
     how: dict[str, Any] = {"bounds": (_LEAST, np.inf), "x_scale": "jac", "max_nfev": _STEPS}
-    fits = [scipy.optimize.least_squares(error, start[:7], **how) for start in starts([spectrum], found)]
+    fits = [scipy.optimize.least_squares(error, start[:7], jacobian, **how) for start in starts([spectrum], found)]
     fit = min(fits, key=lambda fit: fit.cost)
     if 2 * fit.cost > (_VAGUE * np.linalg.norm(spectrum.motion) / np.abs(spectrum.motion).max()) ** 2:
         return None

@@ -65,18 +65,27 @@ class _Joint:
         p = np.append(p, 0.0)
         return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
 
+    def _derivatives(self, p: Array) -> list[NDArray[np.complex128]]:
+        """Return the derivatives (frequencies, 7) of `errors` with respect to p without its last entry."""
+        p = np.append(p, 0.0)
+        return [-r.derivatives(p, 1.0)[:, :7] / s[:, None] for r, s in zip(self.records, self._scale, strict=True)]
+
     def fitted(self, start: Array, keep: Sequence[NDArray[np.bool_]]) -> Array:
         """Return p without its last entry, fitted from `start` to the frequencies `keep` of each record."""
         import scipy
 
-        def error(p: Array) -> Array:
-            errors = np.concatenate([e[some] for e, some in zip(self.errors(p), keep, strict=True)])
-            return np.concatenate([errors.real, errors.imag])
+        def real(values: list[NDArray[np.complex128]]) -> Array:
+            kept = np.concatenate([each[some] for each, some in zip(values, keep, strict=True)])
+            return np.concatenate([kept.real, kept.imag])
 
         T = self.records[0].T
         low, high = np.append(_FIXED, -0.2 * T), np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T])
         how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "loss": "soft_l1", "max_nfev": _STEPS}
-        return scipy.optimize.least_squares(error, np.clip(start, low + 1e-13, high - 1e-13), **how).x
+        begin = np.clip(start, low + 1e-13, high - 1e-13)
+        fit = scipy.optimize.least_squares(
+            lambda p: real(self.errors(p)), begin, lambda p: real(self._derivatives(p)), **how
+        )
+        return fit.x
 
 
 def transmission_bounds(

@@ -170,10 +170,31 @@ class Spectra:
         impedance = m1 * s + b + c / (1 + tau * s) + handle
         return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * (self.force + end)
 
+    def derivatives(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
+        """Return the exact derivatives (frequencies, 9) of `model` with respect to p and `end`."""
+        (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
+        link, memory = k + d * s, 1 / (1 + tau * s)
+        still = np.zeros_like(s) if self.held else link / (m2 * s * s + link)  # the handle's part of the motor's motion
+        moving = 1 - still
+        impedance = m1 * s + b + c * memory + moving * link / s
+        response = self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)
+        bent = -response / impedance  # the derivative with respect to the impedance
+        per_link = bent * moving**2 / s
+        columns = [bent * m1 * s, bent * m2 * s * still**2, per_link * k, per_link * d * s]
+        columns += [bent, -response * s / (1 + lag * s), -response * s, bent * memory]
+        sums = np.stack(columns).sum(axis=1) * (self.force + end)
+        return np.vstack([sums, response.sum(axis=0)]).T
+
     def error(self, p: Array, tau: float, end: float = 0.0) -> Array:
         """Return the real and imaginary parts of motion less model, over the largest motion."""
-        error = self.motion - self.model(p, tau, end)
-        return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
+        return self._real(self.motion - self.model(p, tau, end))
+
+    def jacobian(self, p: Array, tau: float, end: float = 0.0) -> Array:
+        """Return the derivatives of `error` with respect to p and `end`, (2 frequencies, 9)."""
+        return self._real(-self.derivatives(p, tau, end))
+
+    def _real(self, values: NDArray[np.complex128]) -> Array:
+        return np.concatenate([values.real, values.imag]) / np.abs(self.motion).max()
 
 
 def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False) -> list[Array]:
@@ -210,12 +231,16 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
         """Return errors for p = [log m1, log m2, log k, log d, b, lag, delay, c, end]."""
         return spectra.error(p[:8], tau, p[8])
 
+    def jacobian_of(spectra: Spectra, tau: float, p: Array) -> Array:
+        return spectra.jacobian(p[:8], tau, p[8])
+
     def fitted(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
         """Return the fit that begins at `start`; without tau, c stays near 0."""
         top = np.where(np.arange(9) == _C, 1e-12, high) if tau is None else high
         begin = np.clip(start, low + 1e-13, top - 1e-13)
         how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
-        return scipy.optimize.least_squares(partial(error_of, spectra, tau or 1.0), begin, **how)
+        error, jacobian = (partial(of, spectra, tau or 1.0) for of in (error_of, jacobian_of))
+        return scipy.optimize.least_squares(error, begin, jacobian, **how)
 
     begins = [np.insert(start, _C, 0.0) for start in starts([few], friction)]
     rough = min((fitted(few, start) for start in begins), key=lambda fit: fit.cost)
@@ -238,11 +263,7 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
 
     least, memory, best, part = np.inf, 0.0, float(left @ left), 0.0
     for tau in _TAUS:
-        bent, step = plain.x.copy(), 1e-3 * max(friction.viscous, 1e-3)
-        bent[_C] += step
-        jacobian = plain.jac.copy()
-        jacobian[:, _C] = (error_of(every, tau, bent) - left) / step
-        change, spread, squares = linear(jacobian, left)
+        change, spread, squares = linear(jacobian_of(every, tau, plain.x), left)
         b, c = float(plain.x[_B] + min(change[_B], 0.0)), float(change[_C])
         tried = [_split(start, friction.viscous) for start in (plain.x, begins[0])]
         if unsure := abs(c) + _QUANTILE * spread[_C] > _MUCH * plain.x[_B]:

@@ -1,5 +1,7 @@
 """Energy budgets bound what passive hands receive from any controller, and never act in any-environment loops."""
 
+from itertools import product
+
 import msgspec
 import numpy as np
 import pytest
@@ -199,6 +201,32 @@ def test_coarse_encoders_keep_the_guarantee(told):
     assert most[q] <= W0 + 1e-9
     if told == "constant":
         assert most[0.0] > 2 * W0
+
+
+@pytest.mark.parametrize("told", [1, 2])
+def test_encoder_errors_cost_their_worst_combination(told):
+    """The device reports every tick or every second one; the worst errors of +-q/2 are found among all combinations.
+
+    The previous force bounds the errors of a tick only if it was reported. Other ticks count with their largest loss.
+    """
+    rng, q, ticks = np.random.default_rng(31), 1e-4, 8
+    f, dx = rng.normal(size=(ticks + 1, 2)), 2e-4 * rng.normal(size=(ticks, 2))
+    budget = EnergyBudget(DELTA, T, Packets((0, 0), (1, 1)), encoder_step=q, start=1.0)
+    budget.limit(f[0, :, None], 0 * f[0, :, None])
+    for k in range(ticks):
+        sent = budget.limit(f[k + 1, :, None], dx[k, :, None])
+        np.testing.assert_array_equal(sent[:, 0], f[k + 1])  # 1 J is enough for all forces
+        if k % told == 0:
+            budget.tell(k, f[k, :, None])
+    damping = 0.95 * DELTA
+    losses = T * f**2 / (4 * damping) + 2 * q * np.abs(f)
+    losses[1:] = np.maximum(losses[1:], losses[:-1])  # of the packets of both ages
+    energy = 1 - sum(losses[k].sum() for k in range(ticks) if k % told)
+    for run in [range(ticks)] if told == 1 else [[k] for k in range(0, ticks, told)]:
+        errors = q / 2 * np.array(list(product((-1, 1), repeat=len(run) + 1)))
+        energy -= (np.diff(errors) @ f[run]).max(axis=0).sum()
+        energy += (f[run] * dx[run] + damping * np.maximum(np.abs(dx[run]) - q, 0) ** 2 / T).sum()
+    assert budget.energy[0] == pytest.approx(energy, abs=1e-14)  # two units in the last place per tick
 
 
 def test_reserve_and_scale_match_brute_force():

@@ -25,7 +25,7 @@ from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
-from haptic_loop.hw.viscosity import Viscosity
+from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
@@ -179,10 +179,6 @@ NOT_VISCOUS = {
     "trace of 30 ms, 0.1 N s/m": ({"memory": 0.1, "relax": 3e-2}, 1.0),
     "trace of 3 ms, 0.1 N s/m": ({"memory": 0.1, "relax": 3e-3}, 1.0),
     "trace of 10 ms, 0.02 N s/m": ({"memory": 0.02, "relax": 1e-2}, 1.0),
-    "memory of 4 ms, 1.5 N s/m, behind a lag": (
-        {"memory": 1.5, "relax": 4e-3, "lag": 0.45, "mass": 0.308, "step": 2e-6},
-        1.0,
-    ),
     "dashpot of 8 N s/m behind a spring, 3 ms, on a light handle": (
         {"memory": 8.0, "relax": 3e-3, "mass": 0.2, "motor": 0.97},
         1.0,
@@ -201,6 +197,7 @@ def records():
     rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"]()
     rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in (HANDS | DASHPOTS).items()]
     rigs += [bench["Rig"](name, **more) for name, (more, _) in NOT_VISCOUS.items()]
+    rigs += [bench["Rig"]("behind a lag", memory=1.5, relax=4e-3, lag=0.45, mass=0.308, step=2e-6)]
     x = bench["records"](rigs, signal, substeps=6)
     return {rig.name: (rig, x[:, i]) for i, rig in enumerate(rigs)}, signal, bench
 
@@ -245,6 +242,15 @@ def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
 def test_thinning_and_memory_are_refused(judged, name):
     words = "energy of a stroke does not grow" if "thins" in name else "damping falls with frequency"
     assert words in judged[name]
+
+
+@pytest.mark.slow
+def test_a_lag_hides_no_memory(odd, records):
+    """A lag imitates a memory, so that fits which begin without a memory give a bound above the lasting 1 N s/m."""
+    (rig, x), signal, T = records[0]["behind a lag"], records[1], records[2]["T"]
+    found = viscosity(x, signal, T, rig.step, odd[rig.name])
+    assert 0.8 < found.lasting <= 1.0
+    assert "damping falls with frequency" in doubt(found, odd[rig.name])
 
 
 @pytest.mark.parametrize(("name", "share"), [("viscous", 0.85), ("viscous, half the mass", 0.93)])

@@ -17,6 +17,7 @@ from haptic_loop.controller.loop import DeviceBounds
 from haptic_loop.hw.friction import friction
 from haptic_loop.hw.identify import chirp
 from haptic_loop.hw.transmission import transmission_bounds
+from haptic_loop.hw.viscosity import Spectra
 from haptic_loop.sim.scenario import load
 
 T, STEP, FAR = 1.2e-3, 5e-6, 1e9
@@ -68,6 +69,19 @@ def test_bounds_contain_the_truth(m1, m2, k, b, delta):
     assert found.transmission_damping_min <= b <= found.transmission_damping_max
     assert found.transmission_damping_max - found.transmission_damping_min < 0.3 * b
     assert found.late < 0.02 * T
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_derivatives_of_responses_are_exact(held):
+    """Central differences of these steps agree to 1e-5, their error of second order and rounding."""
+    free = signals(0.2)[0]
+    spectra = Spectra(record(free, *RIGS[0]), free, T, held)
+    p = np.array([*np.log(RIGS[0][:4]), 1.37, 3e-5, 2e-5, 0.3, 0.1])
+    exact = spectra.derivatives(p[:8], 4e-3, p[8])
+    for i, step in enumerate([1e-5] * 5 + [1e-9] * 2 + [1e-5] * 2):
+        high, low = (spectra.model(q[:8], 4e-3, q[8]) for q in (p + step * np.eye(9)[i], p - step * np.eye(9)[i]))
+        difference = (high - low) / (2 * step)
+        np.testing.assert_allclose(exact[:, i], difference, rtol=0, atol=1e-5 * np.abs(difference).max())
 
 
 def test_a_lossless_transmission_has_no_bounds():
