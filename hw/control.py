@@ -437,7 +437,8 @@ def timed(
         return scenario, ages.link_delay(T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
     if most >= min((T_us, *ages.ticks)):
-        raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
+        instead = "use a longer T, or a microcontroller with --latch tick"
+        raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: {instead}")
     return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
 
 

@@ -222,7 +222,7 @@ def test_a_force_that_takes_too_long_is_refused(scenario, read, write, holds):
     else:
         assert session.stage == Stage.REFUSED
         assert "answers come up to" in session.cause
-        assert "T is 1200 us: latch at ticks" in session.cause
+        assert "T is 1200 us: use a longer T" in session.cause
 
 
 def test_forces_later_than_certified_end_in_a_ramp(scenario):
