@@ -35,7 +35,7 @@ from haptic_loop.sim.scenario import Scenario
 
 ENOUGH = 1.02  # times the damping or friction that a guarantee requires
 _GIVEN = 0.005  # [J] that a budget may give
-_PUSHED = 24  # motions at once
+_PUSHED = 24  # motions that are simulated at once
 _GROWN = 1.5  # a hand grows if its rms speed in the last quarter of a run is this many times the first's
 _ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
@@ -63,9 +63,9 @@ class _Case:
     process: Callable[[int, int], Process]  # (simulations, ticks) -> process without actuator limits
     delta: Array  # (m,) [N s/m] of the devices
     T: float
-    size: float  # [m] of a step of the motions
-    friction: Array | float = 0.0  # (m,) [N]
-    given: float = 0.0  # [J]
+    size: float  # [m] usual step of the motions
+    friction: Array | float = 0.0  # (m,) [N] Coulomb friction of the devices
+    given: float = 0.0  # [J] that the budget may give
     start: float = 0.0  # [m] where motions begin
     push: float = 1.0  # factor on the speeds at which hands are let go
 

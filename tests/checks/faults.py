@@ -47,7 +47,7 @@ class Fault:
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from the fault to zero force; None: not measured
-    action: _Call | None = None  # done at _WHEN
+    action: _Call | None = None  # what a person or a faulty controller does at _WHEN
     host_stall: float = 0.0  # [s] that the host freezes at _WHEN
     info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
     baud: int | None = None
@@ -58,7 +58,7 @@ class Fault:
     first_tick: int = 0
     free: bool = False  # nobody holds the handles, and the session knows it
     deadman: bool = False  # forces act only while the dead-man switch at the device is held
-    period: float = 1.0  # of the device's clock, in T
+    period: float = 1.0  # one tick by the device's clock, in T
     lasts: float = _LASTS  # [s] after arming
 
 

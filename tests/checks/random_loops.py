@@ -137,7 +137,7 @@ def _scenario(rng: np.random.Generator) -> Scenario:
 
 
 def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
-    """Yield for `count` runs, half of them in MuJoCo, whether their verdicts agree with the eigenvalues."""
+    """Yield for `count` runs, about half of them in MuJoCo, whether their verdicts agree with the eigenvalues."""
     rng, number = np.random.default_rng(seed), 0
     while number < count:
         scenario, engine = _scenario(rng), str(rng.choice(["exact", "mujoco"]))

@@ -41,7 +41,7 @@ class _UnevenTicks:
     required: float  # [N s/m] of the first device
     energy: float  # largest mechanical energy over that at the start, with ENOUGH
     balance: float  # least sum f'dx + dissipation over the sum of its magnitudes, with ENOUGH
-    grow: int  # hands that grow, with SHORT
+    grow: int  # hands that grow, with _SHORT
     hands: int
 
     @property

@@ -1,4 +1,4 @@
-"""python -m design.check: exit codes and output; the command imports no solver."""
+"""design.check has the right exit codes and output, and imports no solver."""
 
 import json
 import subprocess

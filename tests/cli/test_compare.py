@@ -1,4 +1,4 @@
-"""design.compare: required damping and errors of several couplings for the same devices and hands."""
+"""design.compare reports required damping and errors of several couplings for the same devices and hands."""
 
 import json
 

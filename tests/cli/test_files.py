@@ -1,4 +1,4 @@
-"""Files are written completely or not at all, pipes directly; a full disk gives one error line."""
+"""Files are written completely or not at all, and pipes directly; a full disk gives one error line."""
 
 import errno
 import os

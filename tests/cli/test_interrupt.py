@@ -140,7 +140,7 @@ def test_a_full_standard_output_is_one_line(tmp_path):
 
 
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nfor _ in range(1000): pass\nraise SystemExit(5)\n"
-IN_EXEC = "exec('raise KeyboardInterrupt')\n"  # as dataclass does
+IN_EXEC = "exec('raise KeyboardInterrupt')\n"  # dataclass runs code in this way
 IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise ImportError('failed') from error\n"
 
 

@@ -1,4 +1,4 @@
-"""Tables on narrow terminals: no number loses a digit."""
+"""Numbers in tables keep every digit on narrow terminals."""
 
 import ast
 import io

@@ -53,7 +53,7 @@ def thief(x, rng):
 
 
 def each_in_turn(hands, rng):
-    """Return a function of the forces (m, nsim) [N] of three controllers, each of which acts in a third of nsim."""
+    """Return a function that gives forces (m, nsim) [N]; each of three controllers acts in every third simulation."""
     parts = [(slice(k, None, 3), make(hands.x[:, k::3], rng)) for k, make in enumerate((springs, network, thief))]
 
     def force():
@@ -189,7 +189,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
         for k in range(800):
             now = np.round(hands.x / q) * q
-            wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # forces that change cost energy behind coarse encoders
+            wanted = steal(hands.x, hands.v) * (1 + (k % 2))  # changing forces cost energy behind coarse encoders
             sent = budget.limit(wanted, now - seen)
             if told == "late" and k >= 3:
                 budget.tell(k - 3, acted[k - 3])

@@ -96,7 +96,7 @@ def test_a_matrix_with_a_negative_minor_is_refused():
 
 
 def test_a_spring_by_hand():
-    """G = 1000, L = 1, rho = 20, theta = 0."""
+    """The forces for G = 1000, L = 1, rho = 20 and theta = 0 were computed by hand."""
     limiter = Limiter(Lti.constant([[1000.0]], 1.0), (0,), limit=np.ones(1), rho=np.array([20.0]))
     x = np.array([0, 0.0005, 0.002, 0.003, 0.002, 0.0005, 0, -0.002])
     f = drive(closed(limiter), x[:, None, None]).f[: x.size, 0, 0]

@@ -127,7 +127,7 @@ def test_a_spring_inside_the_matrices_is_split_off():
 
 
 def test_a_pure_spring_and_damper_is_a_link():
-    """A = 0 is one spring at any scale of B and C, and an empty A is none; only damping remains."""
+    """A = 0 is one spring at any scale of B and C; with an empty A there is no spring, only the damper."""
     for A, link in (([[0.0]], Link(0.3, 4.0, 250.0)), (np.zeros((0, 0)), Link(0.3, 4.0, 0.0))):
         n = len(A)
         port = state_space(A, np.full((n, 1), 50.0), np.full((1, n), 5.0), 4.0, 0.3)

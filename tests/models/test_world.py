@@ -451,7 +451,7 @@ def test_the_digest_covers_what_a_scene_includes(tmp_path):
 
 
 def test_the_digest_covers_every_mesh_that_mujoco_reads(tmp_path):
-    """The files include a mesh with a namesake, a mesh whose path is stripped, and those of an attached model."""
+    """The digest covers a mesh with a namesake, a mesh whose path is stripped, and the files of an attached model."""
     for name in ("a.obj", "meshes/a.obj", "part/meshes/b.obj", "part/c.xml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("<mujocoinclude/>")

@@ -46,7 +46,7 @@ def test_figures(report):
 
 
 def test_a_limit_cycle_has_its_forces_deviation():
-    """The deviation is that of the last 4000 ticks of the most varying channel; the exact engine has no error."""
+    """A cycle's deviation is that of the last 4000 ticks of the most varying channel; the exact engine has no error."""
     scenario = load().replace(duration=5.0)
     loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
     row = measure(reference(*loops), "exact", None, None)
@@ -67,7 +67,7 @@ def test_bad_duration():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """The run of Figure 5 leaves the credible limits at 7.35 s; positions alone give its forces and speeds."""
+    """The run of Figure 5 leaves the credible limits at 7.35 s; transmission forces and speeds follow from positions."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
@@ -75,7 +75,7 @@ def test_runs_say_when_they_stop_being_credible():
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
     assert part.transmission_force_n == pytest.approx(force.max(axis=0))
-    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # 10 samples a period
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # a period has only 10 samples
     assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
     assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)

@@ -50,7 +50,7 @@ def test_order_of_convergence(simulation, exact, integrator, substeps, order):
 
 
 def test_the_default_is_exact_to_1e_8(simulation):
-    """Without the tap the default engine is at least as accurate as was agreed for RK4 x 4."""
+    """Without the tap the relative error of the default engine is at most 1e-8, the bound once set for RK4 x 4."""
     quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
@@ -74,7 +74,7 @@ def test_exact_engine_against_a_fine_integration(simulation):
 
 
 def test_discrete_integrator_loses_the_unstable_mode():
-    """A trap: MuJoCo's `discrete` integrator damps the 84 Hz mode away, so an unstable loop looks stable."""
+    """MuJoCo's `discrete` integrator damps the 84 Hz mode away, so an unstable loop looks stable."""
     loop = assemble(load().replace(duration=6.0), NoCoupling())
     late = slice(-400, None)
     truth = np.diff(run(loop, "exact").f[late], axis=0).std()
@@ -126,7 +126,7 @@ def test_uncoupled_limit_cycle_stays_within_the_force_limit():
 
 @pytest.mark.parametrize("engine", ["mujoco", "exact"])
 def test_a_diverging_run_is_reported_not_reset(engine, capfd, tmp_path, monkeypatch):
-    """Without limits a badly delayed loop grows past what MuJoCo accepts (1e10) and past all floating point."""
+    """Without limits a badly delayed loop grows beyond what MuJoCo accepts (1e10) and beyond floating-point numbers."""
     monkeypatch.chdir(tmp_path)
     devices = tuple(d.__class__(force_limit=1e6) for d in SHORT.device)
     scenario = load().replace(device=devices, theta=(40, 40), duration=200.0)

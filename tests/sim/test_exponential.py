@@ -106,7 +106,7 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     exact, scipys = longer(scaled), expm(generator * T) * unit / unit[:, None]
     allowed = np.finfo(float).eps * (states + inputs + expm_cond(scaled)) * np.linalg.norm(exact)
     assert np.linalg.norm(own - exact[:states]) <= allowed
-    assert np.linalg.norm(own - scipys[:states]) <= 2 * allowed  # both are rounded
+    assert np.linalg.norm(own - scipys[:states]) <= 2 * allowed  # SciPy's result is rounded, too
 
 
 @pytest.mark.parametrize("coupling", [NoCoupling(), PUBLISHED["I"]], ids=["no coupling", "published"])
@@ -312,7 +312,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """Against RK4 x 64 the chosen setting keeps the requested error; RK4 with half its substeps exceeds a quarter."""
+    """The chosen setting keeps the error allowed against RK4 x 64; with half the substeps RK4 exceeds a quarter of it."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -331,7 +331,7 @@ def test_friction_keeps_the_error_with_fewest_steps():
 
 
 def test_what_the_finest_run_misses_is_no_chance():
-    """The bound of x + c/n is 1.5 c/n; if gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q)."""
+    """For runs x + c/n the bound is 1.5 c/n; if gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q)."""
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
@@ -359,7 +359,7 @@ def test_errors_that_nothing_keeps(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """The first two runs foretell 100 ticks of 512 steps of 4 evaluations, so that no third run begins."""
+    """The first two runs predict that 100 ticks need 512 steps of 4 evaluations each, so that no third run begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"

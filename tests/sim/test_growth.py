@@ -19,7 +19,7 @@ T, STEP = 1.2e-3, np.full(2, 1e-6)
 
 
 def motion(seconds, *modes):
-    """Return a motion of 15 mm at 0.6 Hz plus modes (final amplitude [m], frequency [Hz], growth [1/s]), rounded."""
+    """Return 15 mm at 0.6 Hz plus modes (final amplitude [m], frequency [Hz], growth [1/s]), in whole encoder steps."""
     t = T * np.arange(round(seconds / T))
     x = 15e-3 * np.sin(2 * np.pi * 0.6 * t + 0.3)
     for size, frequency, rate in modes:

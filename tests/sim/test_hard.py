@@ -1,4 +1,4 @@
-"""In numerically hard loops some settings of integrators fail, but those that the rule picks hold."""
+"""In numerically hard loops some settings of integrators fail, but those that `default_substeps` picks hold."""
 
 import math
 from functools import partial
@@ -22,7 +22,7 @@ from tests.checks.hard import cases, devices, measure, nominal
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """`checks.hard` defines when a setting holds; the rule's choice has the exact verdict and growth to 1e-2 1/s."""
+    """tests/checks/hard.py defines when a setting holds; `default_substeps` errs by at most 1e-2 1/s of growth."""
     row = measure(hard)
     assert row.holds, row
 
@@ -156,7 +156,7 @@ def test_a_rule_that_cannot_be_met_says_so():
 
 
 def test_the_loop_runs_from_any_state():
-    """Both engines agree from a random start under the rule's setting, for a stiff transmission."""
+    """With a stiff transmission both engines agree from a random start, MuJoCo with the default substeps of RK4."""
     loop = assemble(devices(transmission_stiffness=1e6), PUBLISHED["I"])
     start = 1e-3 * np.random.default_rng(0).normal(size=(loop.plant.A.shape[0], 1))
 

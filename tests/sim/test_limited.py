@@ -19,7 +19,7 @@ from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import load
 
-BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
+BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # its limited forces are proved safe in this environment
 
 
 def weak(*limits):
@@ -45,7 +45,7 @@ def test_which_limiter_a_coupling_may_have():
 
 
 def test_the_proved_limiter_is_what_runs(tmp_path):
-    """A run uses the file's limiter, beta = 0.03 instead of 0.01; with other damping beta stays and c is new."""
+    """A run uses the limiter of the file, with beta = 0.03 instead of 0.01, also if the devices have more damping."""
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
@@ -65,7 +65,7 @@ def test_the_proved_limiter_is_what_runs(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
 def test_both_engines_agree_on_limited_forces(coupling, rho):
-    """Motions of 3 cm agree to 1e-9 although forces are often at their limits, which they never exceed."""
+    """Motions of 3 cm agree to 1e-9 of their size, although forces are often at their limits; none exceeds its limit."""
     limits = np.array([0.3, 0.2])
     simulation = assemble(weak(*limits), coupling, rho)
     exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))

@@ -75,7 +75,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
 
 
 def test_the_model_of_a_pair_may_stay_behind():
-    """`model kept` uses V = Q (I - E0 Q)^-1 with the scenario's E0, and so differs from this-environment elsewhere."""
+    """`model kept` uses V = Q (I - E0 Q)^-1 with the scenario's E0; for other E it differs from this-environment."""
     coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)
 

@@ -87,7 +87,7 @@ def test_constant_delay_lines_equal_constant_loops():
 
 
 def test_switching_can_grow_beyond_constant_delays():
-    """The delays (1, 2) are certified, but switching within 1 to 2 makes the loop grow with the scenario's humans."""
+    """The delays (1, 2) are stable, but delays that switch between 1 and 2 make the loop of the scenario's hands grow."""
     worst = _worst_switching(ASSEMBLY, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # the search found 2.05 1/s
     assert set(np.unique(worst.ages)) <= {1, 2}
@@ -110,7 +110,7 @@ def test_switching_can_grow_beyond_constant_delays():
 
 
 def test_greedy_ages_repeat_the_trajectory_that_chose_them():
-    """The loop grows under the packet delays of greedy ages, and decays under random ones."""
+    """The loop grows under packet delays that realise greedily chosen ages, and decays under random delays."""
     varying_delay, ticks = VaryingDelay((1, 1), (2, 2)), 1600
     process, held = ASSEMBLY.process, one(ASSEMBLY.plant)
     delays = realising(_greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
@@ -151,7 +151,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
     varying_delay = report["varying_delay"]
     assert not varying_delay["covered"]
     assert varying_delay["age"]["least"] == [1, 1]
-    assert max(varying_delay["age"]["largest"]) > 2  # losses
+    assert max(varying_delay["age"]["largest"]) > 2  # lost packets make the held force older
     assert min(varying_delay["lost_packets"]) > 0
 
 

@@ -255,7 +255,7 @@ def test_the_energy_audit_sees_late_forces():
 @pytest.mark.parametrize("timed", [True, False])
 @pytest.mark.parametrize("integrator", [EXPONENTIAL, "RK4"])
 def test_no_cycle_keeps_an_engine(integrator, timed):
-    """An engine, with a MiB for every 125 hands, is freed with its last reference, not by the garbage collector."""
+    """An engine holds a MiB for every 125 hands; it is freed with its last reference, without garbage collection."""
     simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
     gc.disable()
     try:

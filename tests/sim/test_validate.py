@@ -220,7 +220,7 @@ def test_batch_engine_is_the_exact_engine(devices):
     for i in range(len(people)):
         one = hold(plant(build(devices, people.humans(i)).model), SCENARIO.T)
         alone = driven(process, ExactEngine(one), outside, 400, rest[:, :1])
-        # sums in another order, and a clipped unstable loop multiplies rounding
+        # Sums are in another order, and a clipped unstable loop multiplies rounding errors.
         np.testing.assert_allclose(together.s[:, :, i], alone.s[:, :, 0], rtol=1e-6, atol=1e-11)
 
 
@@ -389,7 +389,7 @@ def test_ctrl_c_ends_other_processes_batches():
 
 @pytest.mark.parametrize("duration", [0.5, 40.0])
 def test_restless_short_traces_give_no_verdict(duration):
-    """Settling decides only on traces that are long against the slowest decay with the same humans."""
+    """Settling decides only on traces that are long compared with the slowest decay of the same humans."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
     traces = Traces.of(question, found)
@@ -481,7 +481,7 @@ def test_own_engines_need_even_ticks():
 
 
 def slow_question(humans: int, seed: int, duration: float) -> Validation:
-    """Return a validation of three devices with delays around 0.3 kg on soft springs, with decays of seconds."""
+    """Return a validation of three devices with delays around 0.3 kg on soft springs; motions decay in seconds."""
     rng = np.random.default_rng(seed)
     springs = tuple(Spring((end, "m"), float(rng.uniform(20, 400)), float(rng.uniform(0, 0.5))) for end in "abc")
     scenario = load("three-rigid").replace(environment=Network(("a", "b", "c"), springs, {"m": 0.3}), theta=(2, 3, 1))

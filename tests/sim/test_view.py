@@ -165,7 +165,7 @@ def test_switching_keeps_the_plant_state(none):
 
 
 def test_the_oscillation_starts_and_dies(none):
-    """The loop grows to its limits without coupling at more delay, and decays with the published gains at less."""
+    """Without coupling and with more delay forces grow to their limits; published gains with less delay end this."""
     running = session(none, "0:theta+2 2.5:theta-3 2.5:published")
     grown = running.frame(2.5 - 1e-3)
     assert grown.prepared.mode.growth > 3
@@ -514,7 +514,7 @@ class FakeWindow:
 
 
 def test_the_window_s_loop_without_the_window(none):
-    """Frames come at 60 Hz of an injected clock, the mouse reaches the session, the words reach the window."""
+    """Frames come at 60 Hz of an injected clock, the mouse reaches the session, and texts reach the window."""
     running = LiveLoop(none, Inline())
     stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(40, stage), [100.0]

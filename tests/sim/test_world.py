@@ -195,7 +195,7 @@ UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
 def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
-    """Hands carry a tray of 0.3 kg. Without the credit and without W0 the shell limits most forces."""
+    """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
     acted = {}
     for credit in (True, False):

@@ -82,7 +82,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_the_map_is_that_of_design_margin(name):
-    """Maps begin at 1e-5 rad/sample; the error of this grows with the square of the delay, here up to 2e-9."""
+    """Maps begin at 1e-5 rad/sample; the error that this causes grows with the square of the delay, here up to 2e-9."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
@@ -107,7 +107,7 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
 
 @pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
 def test_maps_before_walls_match_designs(theta, least):
-    """K = 2000, B = 2 before a wall of 3000 N/m, 2 N s/m; with delay the frozen contact requires less."""
+    """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; with delay frozen contact needs less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
@@ -177,7 +177,7 @@ def test_suprema_find_what_a_dense_sweep_finds():
         return 1 / (1 + ((w - centre[:, None]) / width[:, None]) ** 2) + 0.3 * np.cos(3 * w)
 
     dense = peaks(np.broadcast_to(np.linspace(0, np.pi, 400_001), (3, 400_001))).max(axis=1)
-    # every point twice, as the grid around a pair of poles has them
+    # every point occurs twice, as in a grid around a pair of poles
     common, own = np.linspace(0, np.pi, 60), np.broadcast_to(np.linspace(0, np.pi, 60), (3, 60))
     found = suprema(peaks, common, own)
     # the sweep's points are 8e-6 apart, a peak bends by at most 800 per rad^2: 1e-8 between them
@@ -413,7 +413,7 @@ def test_the_map_holds_together(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
     ratio = np.array(report["this-environment"]["required_over_available"], float)
-    # At B = 0 the requirement is constant over frequency; rounding at the lowest one is 1e-8.
+    # At B = 0 the requirement is constant over frequency; rounding at the lowest frequency is 1e-8.
     np.testing.assert_allclose(ratio * DELTA, K * T / 2 + B, rtol=3e-8)
     growth = np.array(report["population"]["growth_rate_per_s"], float)
     assert (growth[ratio < 1] <= 1e-9).all()

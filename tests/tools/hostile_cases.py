@@ -22,7 +22,7 @@ SHORT = "--short" in sys.argv
 
 
 def pairs(left: Iterable, right: Iterable, every: int = 2) -> Iterator[tuple]:
-    """Return all pairs. A short run has one in `every`, evenly, so that each entry of both sides still occurs."""
+    """Yield all pairs. A short run yields one in `every`, evenly, so that each entry of both sides still occurs."""
     for (i, one), (j, other) in product(enumerate(left), enumerate(right)):
         if not SHORT or (i + j) % every == 0:
             yield one, other

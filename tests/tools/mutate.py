@@ -285,7 +285,7 @@ def _fails(item: pytest.Item, after: pytest.Item | None) -> str:
 
 
 def _forked(work: Callable[[], Any]) -> Callable[[], Any]:
-    """Begin the work in a fork; the function that is returned waits for its result, None if the fork was ended."""
+    """Begin the work in a fork, and return a function that waits for its result; None if the fork was ended."""
     read, write = os.pipe()
     if not (pid := os.fork()):
         os.close(read)

@@ -1,8 +1,9 @@
 """Design the same couplings under different conditions of the machine, and compare the stored files byte for byte.
 
-    python tests/tools/same_designs.py     each of six designs idle, under load, and three at once, one on one core
+    python tests/tools/same_designs.py
 
-Exit code 1 if a file differs. Designs run through the public command, so each file is what a user stores.
+Each of six couplings is designed on an idle machine, under load, and three times at once, the last time on one core.
+The exit code is 1 if a file differs. Designs run through the public command, so each file is what a user stores.
 """
 
 from __future__ import annotations
