@@ -67,7 +67,7 @@ def test_bad_duration():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """The run of Figure 5 leaves the credible limits at 7.35 s; transmission forces and speeds follow from positions."""
+    """The run of Figure 5 leaves the credible limits at 7.35 s; positions give transmission forces and speeds."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")

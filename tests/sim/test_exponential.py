@@ -312,7 +312,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """The chosen setting keeps the error allowed against RK4 x 64; with half the substeps RK4 exceeds a quarter of it."""
+    """The chosen setting keeps the error allowed against RK4 x 64; RK4 with half the substeps exceeds a quarter."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):

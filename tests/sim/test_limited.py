@@ -65,7 +65,7 @@ def test_the_proved_limiter_is_what_runs(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
 def test_both_engines_agree_on_limited_forces(coupling, rho):
-    """Motions of 3 cm agree to 1e-9 of their size, although forces are often at their limits; none exceeds its limit."""
+    """Motions of 3 cm agree to 1e-9 of their size, although forces are often at their limits and never above."""
     limits = np.array([0.3, 0.2])
     simulation = assemble(weak(*limits), coupling, rho)
     exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))
