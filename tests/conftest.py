@@ -57,7 +57,7 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
     """Share designs between all tests and processes: many tests need the same ones, which take seconds each."""
-    from forked import share_designs
+    from forked import share_designs, wait_silently
 
     folder = tmp_path_factory.getbasetemp()
     folder = (folder.parent if os.environ.get("PYTEST_XDIST_WORKER") else folder) / "designs"
@@ -65,4 +65,5 @@ def a_run_designs_once(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHARED_DESIGNS", str(folder))
         share_designs(folder, patch.setattr)
+        wait_silently(patch.setattr)
         yield

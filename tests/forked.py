@@ -28,8 +28,15 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 
 
+def wait_silently(patch=setattr) -> None:
+    """Keep a command from saying what it waits for: on a slow machine it would say so at any time."""
+    from haptic_loop.cli import render
+
+    patch(render, "_SILENCE", 1e6)
+
+
 def load() -> None:
-    """Import all modules, so that no fork has to."""
+    """Import all modules, so that no fork has to; forks do not say what they wait for."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -39,6 +46,7 @@ def load() -> None:
         package = import_module(f"haptic_loop.{folder}")
         for module in pkgutil.iter_modules(package.__path__):
             import_module(f"haptic_loop.{folder}.{module.name}")
+    wait_silently()
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
