@@ -15,9 +15,16 @@ def compare(tmp_path, *options):
     return json.loads((tmp_path / "r.json").read_text())["alternatives"]
 
 
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """Return the rows of a comparison by coupling and condition, and the folder of its files."""
+    place = tmp_path_factory.mktemp("compared")
+    return {(row["coupling"], row["condition"]): row for row in compare(place, "--case", "I")}, place
+
+
 @pytest.mark.slow
-def test_each_coupling_has_its_price_and_error(tmp_path):
-    rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--case", "I")}
+def test_each_coupling_has_its_price_and_error(compared):
+    rows, place = compared
     assert list(rows)[:2] == [("none", None), ("published", None)]
     none, free = rows["none", None], rows["spring-damper", "any-environment"]
     here, best = rows["spring-damper", "this-environment"], rows["optimal", "this-environment"]
@@ -30,13 +37,13 @@ def test_each_coupling_has_its_price_and_error(tmp_path):
     assert best["force_error_percent"] == pytest.approx(0.58, abs=0.1)
     assert here["force_error_percent"] < free["force_error_percent"]
     assert best["rms_mismatch_db"] == pytest.approx(-34.87, abs=0.3)
-    assert (tmp_path / "out" / "couplings.png").stat().st_size > 50_000
+    assert (place / "out" / "couplings.png").stat().st_size > 50_000
 
 
 @pytest.mark.slow
-def test_a_row_is_the_run_of_that_coupling(tmp_path):
+def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
     """The row and the run have the same error, though the run uses the other engine."""
-    rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--no-plot")}
+    rows, _ = compared
     assert run_once(["--no-plot", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
     error = json.loads((tmp_path / "run.json").read_text())["ideal_force"]["error_percent"]
     assert rows["spring-damper", "this-environment"]["force_error_percent"] == pytest.approx(error, rel=1e-6)

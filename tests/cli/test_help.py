@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from forked import run
 
 from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
@@ -112,15 +113,10 @@ def test_commands_and_functions_compute_with_one_blas_thread(call):
     assert done.stdout.split() == ["{1}"]
 
 
-def script(*words):
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, "-m", "cli", *words], env=environment, capture_output=True, text=True)
-
-
 def test_the_console_script_lists_and_runs_commands():
-    listed = script().stdout
+    listed = run("python -m cli", ROOT).stdout
     assert all(f"({module})" in listed for module in modules())
-    assert script("check", "--help").stdout.startswith("usage: python -m design.check")
-    unknown = script("chekc")
+    assert run("python -m cli check --help", ROOT).stdout.startswith("usage: python -m design.check")
+    unknown = run("python -m cli chekc", ROOT)
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert unknown.stderr == "error: unknown command 'chekc', did you mean check?\n"

@@ -227,11 +227,10 @@ def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
 
 
 def test_json_on_standard_output_is_only_json(tmp_path):
-    process = command("--coupling", "published", "--no-plot", "--json", "-", cwd=tmp_path)
-    out, err = process.communicate()
-    assert process.returncode == 0
-    assert json.loads(out)["case"] == "I"
-    assert "growth" in err
+    done = forked.run("python -m sim.run --coupling published --duration 1 --no-plot --json -", tmp_path)
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["case"] == "I"
+    assert "growth" in done.stderr
 
 
 def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):

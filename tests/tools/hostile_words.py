@@ -219,7 +219,8 @@ def silence() -> Iterator[Case]:
     """Yield options that would be ignored, and lists with empty entries."""
     for words, says in SILENT:
         yield Case(" ".join(words), words, says=says)
-    yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)
+    if not SHORT:
+        yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)
     yield Case("run of a feather", ("run", *QUICK["run"], "--scenario", "s.toml"), (BUT, 0), before=feather)
 
 
