@@ -38,7 +38,7 @@ class TooLong(ValueError):
 # end when a budget is spent. Without a user's time limit they read no clock, so that a busy or slow machine gets the
 # same result as a fast one.
 #
-# One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured there.
+# One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured on it.
 
 
 _PARTS = 10**12
@@ -272,7 +272,7 @@ def times(left: Array, right: Array) -> Array:
 
 
 def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
-    """Return every row as integers, and the common denominator of each row."""
+    """Return the rows multiplied by their common denominators, as integers, and these denominators."""
     common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
     integers = [
         [v.numerator * (den // v.denominator) if v else 0 for v in row]

@@ -248,7 +248,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) that acted in tick number `tick` (from 0), which had no report yet."""
+        """Report the forces (m, nsim) that acted in tick `tick` (from 0). Raises ValueError if no report is missing."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
@@ -344,7 +344,7 @@ class Shell(_Net):
         self._earn(rise)
 
     def charge(self, energy: float) -> None:
-        """Subtract an energy [J] >= 0 that reached the devices other than through the port."""
+        """Subtract from W an energy [J] >= 0 that reached the devices other than through the port."""
         self._earn(np.full_like(self.energy, -energy))
 
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:

@@ -80,8 +80,8 @@ class BoxProblem(_Problem):
     """f = q - M v with lower <= f <= upper; v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
 
     If M is a P-matrix, there is exactly one solution for every q. If minors are zero but none is negative, as for an
-    environment without a connection to ground, f is still unique. Enumeration skips singular active sets, pivoting
-    regularises M.
+    environment without a connection to ground, f is still unique. Then the enumeration skips singular active sets, and
+    pivoting regularises M.
 
     Raises:
         SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.

@@ -1,7 +1,7 @@
 """Virtual couplings, the controllers between the devices and the environment.
 
-V maps force to displacement (a compliance); a `ForceFilter` filters forces instead. In negative feedback around the
-delayed environment Psi E, V turns the devices' displacements x into u = x - V f, which Psi E turns into the forces f.
+A coupling has a compliance V(z) from force to displacement; only a `ForceFilter` filters forces instead. In negative
+feedback around the delayed environment Psi E, the displacements x of the devices become u = x - V f, and f = Psi E u.
 `around` returns this loop, G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems,
 Fractions, or sampled responses (controller.lti). A coupling is stored in a file as a `Form`.
 """
@@ -70,7 +70,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return the V equivalent to an internal-model coupling with this model; None for every other coupling."""
+        """Return an internal-model coupling with this model as a `Compliance`; None for every other coupling."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -128,14 +128,14 @@ class SpringDamper(ReadOnly, Coupling):
 
     K and B are (m,), or (.., m) for many couplings at once.
 
-    The damper may act on a filtered velocity. It is then the backward Euler discretisation of B s/(tau s + 1), which is
-    a damper in series with a spring of stiffness B/tau and therefore passive. In this case
-    1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with beta = tau/(tau + T).
+    The damper may act on a filtered velocity. Its force is then the backward Euler discretisation of B s/(1 + s/a) with
+    a = 2 pi cutoff: a damper in series with a spring of stiffness a B, and therefore passive. In this case
+    1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with beta = 1/(1 + a T).
     """
 
     K: Array  # (..., m) [N/m]
     B: Array  # (..., m) [N s/m]
-    cutoff: float | None = None  # [Hz] cut-off frequency 1/(2 pi tau) of the velocity filter; None without filter
+    cutoff: float | None = None  # [Hz] cut-off frequency of the velocity filter; None without filter
 
     kind = "spring-damper"
 
@@ -406,7 +406,7 @@ class _InternalModel(ReadOnly, Coupling):
             Q = Sampled(environment.z, np.tensordot(basis(self.poles, environment.z), self.Q, axes=1), environment.T)
             return environment - environment @ (Q @ environment)
         if further:
-            raise ValueError("the coupling contains a linear model of the environment, which cannot include walls")
+            raise ValueError("the linear model inside the coupling cannot include the walls of the environment")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         T = environment.T
@@ -500,7 +500,7 @@ class ForceFilter(ReadOnly, Coupling):
                 Sampled(environment.z, np.tensordot(values, _own_columns(self.R), axes=1), environment.T) @ environment
             )
         if further:
-            raise ValueError("the coupling contains a linear model of the environment, which cannot include walls")
+            raise ValueError("the linear model inside the coupling cannot include the walls of the environment")
         if environment.inputs != m or environment.outputs != m:
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         return self.filter(environment.T) @ environment
@@ -514,7 +514,7 @@ NO_PAIRS = np.zeros((0, 2))
 
 
 def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
-    """Return the basis functions b_k(z) of a filter, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
+    """Return the basis functions b_k(z) for n poles and p pairs, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
     b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each function
     is multiplied by the all-pass sections of the poles before it. For real poles this makes it a Takenaka-Malmquist
@@ -541,8 +541,9 @@ def _own_columns(R: Array) -> Array:
 def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
-    A chain ends with the last function whose coefficient is not zero. The chain for the sum of all inputs is the sum of
-    the inputs' chains, so it needs more states only beyond the length of the shortest of these.
+    Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The states of
+    the chain for the sum of all inputs are sums over the chains of the inputs, as far as the shortest of them reaches.
+    Only its states beyond this length are added.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size
@@ -600,7 +601,7 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
-    """V = 0."""
+    """The form of a direct connection, V = 0."""
 
     @property
     def shape(self) -> None:
@@ -749,7 +750,7 @@ def _require_sensible(name: str, rows: _Rows | Array) -> None:
     """Raise ValueError if a coefficient is so large that a sweep would overflow."""
     for value in (value for row in rows for value in row):
         if not abs(value) <= _LARGEST_COEFFICIENT:
-            raise ValueError(f"{name} has an entry {value:g}, allowed are up to {_LARGEST_COEFFICIENT:g}")
+            raise ValueError(f"{name} has an entry {value:g}, allowed are sizes up to {_LARGEST_COEFFICIENT:g}")
 
 
 def _table(name: str, rows: _Rows, height: int, width: int) -> Array:

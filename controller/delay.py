@@ -31,7 +31,7 @@ LOST = -1  # the delay of a packet that never arrives
 
 
 def delay(steps: Sequence[int], T: Number) -> Lti:
-    """Return blockdiag(z^-n_1, ..., z^-n_m) in the arithmetic of T: a chain of n_i unit delays per channel."""
+    """Return blockdiag(z^-n_1, ..., z^-n_m) in the arithmetic of T. Raises ValueError unless all n_i are 0, 1, 2, .."""
     for n in steps:
         if n != int(n) or n < 0:
             raise ValueError(f"a delay is a whole number of samples, zero or more, got {n}")
@@ -113,7 +113,10 @@ class HeldLine:
         self._held = np.zeros((m, nsim))
 
     def carry(self, k: int, force: Array) -> None:
-        """Overwrite `force` (m, nsim), sent at tick k, with the force that the devices apply at tick k."""
+        """Overwrite `force` (m, nsim), sent at tick k, with the force that the devices apply at tick k.
+
+        Raises ValueError if no delays are given for tick k.
+        """
         if k >= self._fresh.shape[0]:
             raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, expected a row for tick {k}, too")
         self._sent[k % self._sent.shape[0]] = force

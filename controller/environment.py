@@ -258,7 +258,7 @@ class Environment:
         raise TypeError(f"{type(self).__name__} has no E(T): define this method")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """Return G: displacements to sent forces, (I + Psi E V)^-1 Psi E with a compliance V. Raises SingularLoop."""
+        """Return G from displacements to the forces before Theta, (I + Psi E V)^-1 Psi E. Raises SingularLoop."""
         return coupling.around(delay(psi, T) @ self.E(T))
 
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
@@ -271,7 +271,7 @@ class Environment:
 
 
 class RigidWall(Environment, enum.Enum):
-    """E -> infinity: a rigid wall behind a coupling, always in contact. One channel."""
+    """A rigid wall (E -> infinity) with one channel, which is always in contact with the coupling in front of it."""
 
     RIGID_WALL = "rigid wall"  # its name in files
 

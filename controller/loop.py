@@ -136,7 +136,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         self._check_axes()
 
     def _check_axes(self) -> None:
-        """Raise ValueError unless axes, levels and values per device fit the channels; replace defaults by None."""
+        """Raise ValueError unless axes, levels and values per device fit the channels; set default values to None."""
         m, axes = self.channels, (1,) * self.channels if self.axes is None else self.axes
         if sum(axes) != m or min(axes) < 1:
             raise ValueError(f"axes is {list(axes)}, expected numbers >= 1 that add up to the {m} contacts")
@@ -230,7 +230,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return self.environment.E(self.period(exact))
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return G: displacements to sent forces, (I + Psi E V)^-1 Psi E with a compliance V. Raises SingularLoop."""
+        """Return G from displacements to the forces before Theta, (I + Psi E V)^-1 Psi E. Raises SingularLoop."""
         if not exact:
             return self.environment.sent(coupling, self.psi, self.T)
         key = (self.environment, coupling, self.psi, self.T)

@@ -80,9 +80,9 @@ _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
-    """Return the work of a response, in the units that `spend` counts.
+    """Return an estimate of the work of a response, in the units that `spend` counts.
 
-    It is right within a factor of 2.5 for up to 200 states and 2000 points.
+    The estimate is right within a factor of 2.5 for up to 200 states and 2000 points.
     """
     return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
@@ -308,9 +308,9 @@ class Lti(ReadOnly):
 
     @cached_property
     def _lines(self) -> tuple[NDArray[np.intp], list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]]:
-        """Split the states into core states and delay lines, given as (index of the core state, states, delays).
+        """Split the states into core states and delay lines, given as (index of the head among them, states, delays).
 
-        The states of a delay line are delayed copies of a core state. No core state reads them.
+        The states of a delay line are delayed copies of a core state, its head. No core state reads these copies.
         """
         reads = self.A != 0
         repeats = (reads.sum(axis=1) == 1) & (self.A.sum(axis=1) == 1) & ~self.B.any(axis=1)

@@ -274,7 +274,7 @@ def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
 
 
 def test_coefficients_that_no_coupling_has_are_refused():
-    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are up to 1e\+12"):
+    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are sizes up to 1e\+12"):
         _InternalModelForm((), (((1e80, 0.0), (0.0, 1e80)),))
     with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
         _ComplianceForm((), (), ((),), ((-1e13,),))
