@@ -27,7 +27,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m]
-_LEAST_EIGENVALUE = 1e-9  # [N s/m] least for a damping matrix: far below any device's, but above rounding errors
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below the damping of any device, above rounding errors
 AXES = ("x", "y", "z")
 
 #: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.

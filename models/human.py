@@ -231,7 +231,7 @@ class Port:
 def directions(axes: int) -> _Array:
     """Return directions (axes^2, axes) of springs: e_i + e_j and e_i - e_j for every two axes, then the axes.
 
-    Springs along these directions can have any diagonally dominant stiffness matrix in total, and no other.
+    Springs along these directions can add up to any diagonally dominant stiffness matrix, and to no other.
     """
     unit = np.eye(axes)
     skew = [unit[i] + sign * unit[j] for i in range(axes) for j in range(i + 1, axes) for sign in (1, -1)]

@@ -223,7 +223,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     point = {int(model.jnt_bodyid[j]): k for k, j in enumerate(order)} | {0: model.njnt}
     mass = np.zeros(model.njnt + 1)
     np.add.at(mass, [point[int(b)] for b in model.body_weldid], model.body_mass)
-    slides = np.zeros((model.njnt, model.njnt + 1))  # derivative of each joint's position by the points and the base
+    slides = np.zeros((model.njnt, model.njnt + 1))  # joint positions = slides @ positions of the points and the base
     for j, b in enumerate(model.jnt_bodyid):
         slides[j, point[int(b)]] = 1.0
         slides[j, point[int(model.body_weldid[model.body_parentid[b]])]] = -1.0
@@ -701,7 +701,7 @@ MIXED = 0  # value of `links`: the humans of a set all have one link or all two,
 def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
     """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
-    The links do not depend on other indices. With `links` = MIXED the humans all have one, or all two.
+    The links do not depend on other indices. With `links` = MIXED all humans have one link, or all have two.
     With `axes` a link has random amounts of damping and stiffness along `directions`. Their weights w make the sum of
     w d d' over all directions d the identity. So the damping and the stiffness in any direction lie within the
     population's ranges.

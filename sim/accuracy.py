@@ -276,7 +276,7 @@ def _not_credible(credible: Credible, until: float) -> str:
     excess = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
     if carried:
         excess = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {excess}"
-    return f"from t = {until:.2f} s on no real device would move like the linear model: {excess}"
+    return f"from t = {until:.2f} s on, no real device would move like the linear model: {excess}"
 
 
 # ---- errors against the ideal environment
@@ -475,7 +475,7 @@ def _refined(
         count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # n + n/2 + ... substeps are 2 n
         if count > _MOST_EVALUATIONS:
             raise InputError(
-                f"--error {error:g}: with friction it requires RK4 with about {needed:.0f} substeps, "
+                f"--error {error:g}: with friction this error requires RK4 with about {needed:.0f} substeps, "
                 f"{1e-6 * count:.0f} million evaluations; allowed are {1e-6 * _MOST_EVALUATIONS:g} million: give a "
                 "shorter --duration or a larger error"
             )
@@ -528,7 +528,7 @@ def _apart(own: Array, truth: Array) -> float:
 #
 # On a smooth scene the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
 # the continuous plant decide: a step h must resolve the fastest weakly damped mode (mode h <= 0.2) and follow the
-# strongest damping (rate h < 1). The number is doubled until the simulated loop has the verdict of the exact loop.
+# strongest damping (rate h < 1). The number of steps is doubled until simulated and exact loop have the same verdict.
 
 MOST = 10_000  # largest number of substeps
 _MODE_LOST = "it damps fast modes away"

@@ -88,7 +88,7 @@ class _Exact:
     run_block: RunBlock | None = None
 
     def back(self, k: int) -> None:
-        """Do nothing, since the exact engines have no state of their own."""
+        """Do nothing, because the exact engines store no state."""
 
     def troubled(self) -> bool:
         return False

@@ -33,7 +33,7 @@ Cells = NDArray[np.intp]
 
 
 _MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes decay slowly and would hide one about to grow
-_LEADING = 0.1  # share of the humans who are tried first; the others are tried in cells that all of these leave stable
+_LEADING = 0.1  # share of the humans who are tried first; the others are tried in cells that are stable with all these
 
 
 @dataclass(frozen=True, eq=False)

@@ -239,8 +239,8 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or a shorter run.
-            If nothing grows and no part stands out (`_stands_out`), there is no zoom.
+        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or the whole run if that is
+            shorter. If nothing grows and no part stands out (`_stands_out`), there is no zoom.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -450,9 +450,10 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Return the part of the first `ticks` in which the forces turn most sharply: six periods, or 60 ticks if longer.
+    """Return the part of the first `ticks` in which the forces turn most sharply.
 
-    It is doubled, up to half of the ticks, until some force has six turning points in it.
+    The part has six periods, or 60 ticks if these are longer. Its length is doubled, up to half of the ticks, until
+    some force has six turning points in the part.
     """
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
@@ -523,7 +524,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
-    """Plot the errors of position and growth rate over computing time, one line per integrator; crosses: wrong."""
+    """Plot errors of position and growth rate over computing time, one line per integrator; a cross: wrong verdict."""
     errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
     figure, axes = _panels("error over computing time (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
     names = list(dict.fromkeys(row.integrator for row in rows if row.integrator))

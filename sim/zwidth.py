@@ -178,8 +178,8 @@ class EnvironmentSweep(_Sweep):
         this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
-    No coupling is designed for a cell: each would be certified, because a Q near E^-1 makes the force nearly 0. Raises
-    ValueError if the network has walls or a block, or no spring at a contact.
+    No coupling is designed for a cell: every cell would then be certified, because a Q near E^-1 makes the force nearly
+    0. Raises ValueError if the network has walls or a block, or no spring at a contact.
     """
 
     coupling: Coupling
