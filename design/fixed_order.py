@@ -266,13 +266,14 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
         Q, U = lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu)
         return p, Q, 2 * np.eye(nq) - Q, U, 2 * np.eye(nu) - U, t[0]
 
-    bounds: list[Callable[[Array], Array]] = [
-        lambda v: parts(v)[1] - _LEAST * np.eye(nq),
-        lambda v: parts(v)[3] - _LEAST * np.eye(nu),
-        lambda v: _MOST * np.eye(nq) - parts(v)[1],
-        lambda v: _MOST * np.eye(nu) - parts(v)[3],
-    ]
-    blocks = [*lemmas.inequalities(parts, every), *(Inequality.of(bound, every) for bound in bounds)]
+    def bound(sign: int, value: float, first: int, n: int) -> Inequality:
+        """Return sign (M - value I) >= 0 for the symmetric matrix M (n, n) whose first unknown is `first`."""
+        own = range(first, first + lmi.packed(n))
+        return Inequality.of(lambda v: sign * (lmi.symmetric_from(v, n) - value * np.eye(n)), own)
+
+    states = [(ends[0], nq), (ends[1], nu)]
+    bounds = [bound(sign, value, *each) for sign, value in ((1, _LEAST), (-1, _MOST)) for each in states]
+    blocks = [*lemmas.inequalities(parts, every), *bounds]
     problem = ConeProgram(np.append(np.zeros(ends[-1]), 1.0), blocks)
     p, Q, _, U, *_ = parts(problem.solve("a step of the inner convex approximation"))
     return lemmas.at + p, lemmas.LQ @ Q @ lemmas.LQ.T, lemmas.LU @ U @ lemmas.LU.T

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -111,9 +113,15 @@ def packed(n: int) -> int:
 
 def symmetric_from(vector: Array, n: int) -> Array:
     """Return the symmetric (n, n) matrix whose upper triangle, row by row, is `vector`."""
-    M = np.zeros((n, n))
-    M[np.triu_indices(n)] = vector
-    return M + np.triu(M, 1).T
+    M, (rows, columns) = np.empty((n, n)), _upper(n)
+    M[rows, columns] = M[columns, rows] = vector
+    return M
+
+
+@lru_cache(maxsize=64)
+def _upper(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows and columns of the upper triangle of a matrix (n, n), row by row."""
+    return np.triu_indices(n)
 
 
 # ----------------------------------------------------------------------------------------------------
