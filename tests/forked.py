@@ -52,8 +52,8 @@ def load() -> None:
 def share_designs(folder: Path, patch=setattr) -> None:
     """Cache slow results that many tests and processes need, so that each is computed once.
 
-    These are designs, bounds, requirements, proofs, searches of ranges, and alternatives to failed designs. Only the
-    names in the listed modules are replaced: other callers still compute.
+    These are designs, bounds, requirements, proofs, searches and samples of ranges, and alternatives to failed designs.
+    Only the names in the listed modules are replaced: other callers still compute.
     """
     import haptic_loop.cli.check
     import haptic_loop.cli.design
@@ -68,6 +68,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (assessment.prove, (assessment,)),
         (assessment.requirements_of, (assessment,)),
         (assessment.search_ranges, (assessment, haptic_loop.cli.check)),
+        (assessment.in_each, (assessment,)),
         (api.instead, (api,)),
     ):
         for module in modules:
