@@ -146,10 +146,10 @@ def test_without_coupling_only_the_compliant_device_oscillates():
     """Figure 5 needs what a first-order device model leaves out."""
     base, unstable = load(), {}
     for name, devices in (("compliant", base.device), ("rigid", (RigidDevice(), RigidDevice()))):
-        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 200)]
+        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 60)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 140 < unstable["compliant"] < 175
+    assert 36 < unstable["compliant"] < 56  # 0.78 of many pairs; binomial, within three standard deviations
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():
@@ -503,5 +503,7 @@ def test_a_guarantee_over_ranges_names_its_vertices():
     """Between them a search supports it, and no proof."""
     scenario = load("omega-pair-ranges")
     delays = scenario.loop("I").delays
-    words = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3).words
-    assert "proved at every vertex, searched between them" in words
+    given = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3)
+    assert "proved at every vertex, searched between them" in given.words
+    half = replace(given, vertices="128 of 256 vertices").words
+    assert half == "these ranges: proved at 128 of 256 vertices, searched between them"

@@ -160,7 +160,7 @@ def test_definiteness_is_proved_beyond_double_precision():
     """Hilbert's matrices of condition 5e5 to 2e28, shifted to both sides of their least eigenvalue by elimination."""
     for n in (5, 12, 20):
         low, high = Fraction(0), Fraction(1, n)
-        while high - low > high / 1000:
+        while high - low > high / 30:
             middle = (low + high) / 2
             low, high = (middle, high) if definiteness(hilbert(n, middle)).definite else (low, middle)
         assert _strictly_positive(hilbert(n))

@@ -138,8 +138,10 @@ def gains_of_least(cost, theta, sigma):
     return solve(cp.Problem(cp.Minimize(cost[0] * k + cost[1] * b), [cones, k >= 0, b >= 0]))
 
 
-@pytest.mark.parametrize("most_stored", [1000, 0])
-@pytest.mark.parametrize(("theta", "sigma"), [(0, np.inf), (12, np.inf), (0, 3.0), (7, 3.0)])
+@pytest.mark.parametrize(
+    ("theta", "sigma", "most_stored"),
+    [(0, np.inf, 1000), (12, np.inf, 1000), (7, 3.0, 1000), (12, np.inf, 0), (7, 3.0, 0)],
+)
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """Its furthest points, by one matrix inequality and by many, against cvxpy: 5e-6, since the many miss 2e-6."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
@@ -231,7 +233,7 @@ def test_failed_searches_claim_no_impossibility():
     assert not isinstance(caught.value, Infeasible)
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_proposed_changes_hold_when_made():
     """Each proposal, designed with more bases, passes the sweep; best first, and never what was asked for."""
     loop = asked((0, 0), psi=(1, 1))

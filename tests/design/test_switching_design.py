@@ -23,6 +23,7 @@ from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.switching import switched_crowd
 
 RANGE = ((1, 1), (2, 2))
+HANDS, SECONDS = 20, 0.7
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,16 @@ def made(tmp_path_factory):
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", str(out / "c.json")]
     assert main([*options, "--json", str(out / "r.json")]) == 0
     return json.loads((out / "r.json").read_text()), load_stored(out / "c.json").coupling.build(load().T)
+
+
+def growing(loop, hands=HANDS, seconds=SECONDS):
+    """Return how many lossless hands grow under the worst switching."""
+    rng = np.random.default_rng(0)
+    low, high = np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0])
+    links = np.exp(rng.uniform(low, high, size=(hands, loop.scenario.channels, 1, 3)))
+    links[..., 1] = 0.0
+    held_by = variants(loop.scenario.device, Crowd(links))
+    return int((switched_crowd(loop, held_by, np.arange(hands), 0, seconds, None).exact > 0).sum())
 
 
 def test_the_designed_gains_are_proved_for_any_switching(made):
@@ -48,20 +59,12 @@ def test_the_designed_gains_are_proved_for_any_switching(made):
 
 @pytest.mark.slow
 def test_no_lossless_human_grows_under_the_worst_switching(made):
-    """The hardest that we have: lossless hands, greedy switching. With 30 % less damping some do grow."""
+    """The hardest that we have: lossless hands, greedy switching. With 20 % less damping some do grow."""
     _, coupling = made
     scenario = load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial"))
-    rng = np.random.default_rng(0)
-    links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, 2, 1, 3)))
-    links[..., 1] = 0.0
-    growing = []
-    for share in (1.0, 0.7):
-        placed = scenario.replace(delta=tuple(share * d for d in scenario.delta))
-        loop, held_by = assemble(placed, coupling), variants(placed.device, Crowd(links))
-        grown = switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact
-        growing.append(int((grown > 0).sum()))
-    assert growing[0] == 0
-    assert growing[1] > 0
+    placed = [scenario.replace(delta=tuple(share * d for d in scenario.delta)) for share in (1.0, 0.8)]
+    assert growing(assemble(placed[0], coupling)) == 0
+    assert growing(assemble(placed[1], coupling)) > 0
 
 
 def test_a_range_that_is_too_wide_says_so():
@@ -99,12 +102,8 @@ def test_an_optimal_coupling_for_switching_delays():
     assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # the margin, nearly all else is spent
     # found: -13.4 dB over this basis, against -3.4 dB of the best spring-damper
     assert 20 * np.log10(made.objective) < -13.3
-    rng = np.random.default_rng(0)
-    links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, 2, 1, 3)))
-    links[..., 1] = 0.0
     loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
-    held_by = variants(loop.scenario.device, Crowd(links))
-    assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact > 0).any()
+    assert growing(loop) == 0
 
 
 def one_known_device():
@@ -128,13 +127,8 @@ def test_optimal_couplings_of_known_devices_take_switching(scenario, basis, most
     lo, hi = (tuple(each[:m]) for each in RANGE)
     loop = scenario.loop("I").switching(DelayRange(lo, hi))
     made = design_with(loop, "known-device", bases=(basis,))
-    guarantee = assess(loop, made.coupling, certificate=made.certificate).guarantee
+    guarantee = assess(loop, made.coupling, limiter=False, certificate=made.certificate).guarantee
     assert (guarantee.condition, guarantee.proof) == ("known-device", "rational")
     assert guarantee.delays == loop.varying_delay
     assert 20 * np.log10(made.objective) < most_db
-    rng = np.random.default_rng(0)
-    links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, m, 1, 3)))
-    links[..., 1] = 0.0
-    loop = assemble(scenario.replace(varying_delay=VaryingDelay(lo, hi, "adversarial")), made.coupling)
-    held_by = variants(loop.scenario.device, Crowd(links))
-    assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact > 0).any()
+    assert growing(assemble(scenario.replace(varying_delay=VaryingDelay(lo, hi, "adversarial")), made.coupling)) == 0

@@ -229,7 +229,7 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
     assert sorted(least)[1] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
     found = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
     assert found.holds
@@ -239,7 +239,7 @@ def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
     assert required_damping(less, SOFT, "this-environment").ratio > 1
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_random_members_switch_without_growing_hands(ranged):
     """Lossless hands, members drawn from the ranges, greedy switching. With half of the damping some grow."""
     rng = np.random.default_rng(1)

@@ -34,7 +34,7 @@ def test_agreed_figures(coupling, lam, sup, rms):
 @pytest.mark.slow
 def test_against_a_dense_sweep():
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
-    hz = np.geomspace(0.5, 80, 400_001)
+    hz = np.geomspace(0.5, 80, 100_001)
     z = np.exp(2j * np.pi * hz * T)
     target = z[:, None, None] ** -np.array([1.0, 2.0])[None, :, None] * E.at(z)
     M = F.at(z) - target
@@ -42,7 +42,8 @@ def test_against_a_dense_sweep():
     ratio = np.linalg.norm(M, 2, axis=(1, 2)) / np.linalg.norm(E.at(z), 2, axis=(1, 2))
     assert figures.relative_mismatch == pytest.approx(ratio.max(), rel=1e-6)
     square = np.sum(np.abs(M) ** 2, axis=(1, 2)) / np.sum(np.abs(E.at(z)) ** 2, axis=(1, 2))
-    assert figures.rms_mismatch == pytest.approx(np.sqrt(square.mean()), rel=1e-6)
+    mean = np.trapezoid(square, np.log(hz)) / np.log(80 / 0.5)
+    assert figures.rms_mismatch == pytest.approx(np.sqrt(mean), rel=1e-6)
 
 
 @pytest.mark.parametrize("lam", [(1, 2), (0, 0)])

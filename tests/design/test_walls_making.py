@@ -148,7 +148,7 @@ def walls_by_hand(loop):
 def test_six_facts_hold_at_every_transition():
     """Random ways into random walls that are touched, left faster than they relax, and made again."""
     rng = np.random.default_rng(0)
-    n = 200_000
+    n = 50_000
     k, b = 10 ** rng.uniform(1, 4, n), 10 ** rng.uniform(1, 4, n) * (rng.random(n) < 0.8)
     size = 10 ** rng.uniform(-5, -2, n)
     y = rng.normal(size=(4, n)) * size
@@ -252,7 +252,8 @@ def test_every_step_of_the_proof(loop):
 
 
 @pytest.mark.parametrize(
-    ("loop", "coupling"), [(held(3000.0), COUPLING), (PAIR, BOTH), pytest.param(DAMPED, BOTH, marks=pytest.mark.slow)]
+    ("loop", "coupling"),
+    [(held(3000.0), COUPLING), (PAIR, BOTH), pytest.param(DAMPED, BOTH, marks=pytest.mark.validate)],
 )
 def test_it_is_proved_stored_and_verified(loop, coupling):
     stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
@@ -339,7 +340,7 @@ def swinging(loop, coupling, damping, seed=11):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("damping", "short"), [(0.0, 0.8), (2.0, 0.55)])
+@pytest.mark.parametrize(("damping", "short"), [pytest.param(0.0, 0.8, marks=pytest.mark.validate), (2.0, 0.55)])
 def test_hands_rest_at_the_requirement_not_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = required_damping(loop, coupling, "this-environment").required[0]
@@ -372,7 +373,7 @@ def test_frozen_walls_fall_to_a_nonnegative_value(loop):
     for tick in range(400):
         there.step(x[tick])
         there.xi = block.A @ there.xi + block.B @ there.v
-        if tick % 40 != 39 or (there.s > 1e-12).any():
+        if tick % 80 != 79 or (there.s > 1e-12).any():
             continue
         on, xi, state, h = there.h > 0, there.xi, there.state[: G.order], there.h
         solve = np.linalg.inv(np.eye(3) - np.where(on, k + b, 0)[:, None] * G.D[m:, m:])
@@ -390,4 +391,4 @@ def test_frozen_walls_fall_to_a_nonnegative_value(loop):
             xi, h, last = block.A @ xi + block.B @ v, after, Z
         assert last >= -1e-12
         assert np.abs(v).max() < 1e-6 * (np.abs(h).max() + 1e-9)  # the frozen motion has come to rest
-    assert frozen > 4
+    assert frozen > 2
