@@ -26,6 +26,12 @@ DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
 LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, PUBLISHED["I"]), "designed": (SCENARIO, DESIGNED)}
 
 
+@pytest.fixture(autouse=True)
+def _few(monkeypatch):
+    """Search with half as many sets of humans in a generation as the command."""
+    monkeypatch.setattr(adversary, "_CANDIDATES", 60)
+
+
 def test_it_finds_what_random_humans_do_not():
     """With 5 % less damping than required, the search finds a lossless hand that destabilises each loop."""
     rows = attempts(LOOPS, np.array([0.05]), generations=60)

@@ -172,7 +172,7 @@ def test_of_first_order_where_devices_rub():
     def positions(integrator, substeps):
         return knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 800).s[:, :2]
 
-    truth = positions("RK4", 64)
+    truth = positions("RK4", 32)
     errors = [np.sqrt(np.mean((positions(EXPONENTIAL, n) - truth) ** 2)) for n in (8, 16)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(1, abs=0.3)
     assert np.sqrt(np.mean((positions("RK4", 4) - truth) ** 2)) < errors[1] / 30
@@ -322,7 +322,7 @@ def test_friction_keeps_the_error_with_fewest_steps():
         return np.sqrt(np.mean((positions(*setting) - truth) ** 2) / np.mean(truth**2))
 
     truth = positions("RK4", 64)
-    for asked, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-4, ("RK4",)), (1e-6, ("RK4",))):
+    for asked, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-6, ("RK4",))):
         found = cheapest(loop, asked, ticks)
         assert found.integrator in expected  # which of two is cheaper depends on the machine's load
         assert missed(found.integrator, found.substeps) <= found.position_relative_rms <= asked

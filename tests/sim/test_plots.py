@@ -21,7 +21,7 @@ def drawn(monkeypatch, tmp_path):
 
     def look(figure, path, dpi=130):
         seen.append(figure)
-        assert save(figure, path, dpi).read_bytes()[:4] == b"\x89PNG"
+        assert save(figure, path, 40).read_bytes()[:4] == b"\x89PNG"
         return path
 
     monkeypatch.setattr(plots, "save", look)

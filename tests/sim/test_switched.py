@@ -245,7 +245,7 @@ def test_the_population_meets_lost_packets(tmp_path):
     assert "lost packet" in part["covers"]
     assert part["humans"] == 8
     assert part["unstable"] == {"exact": 0, "mujoco": None}
-    code, part = validated(tmp_path, "--playout")
+    code, part = validated(tmp_path, "--playout", "--humans", "2")
     assert part["constant"]
     assert part["covered"]
     assert part["humans"] == 0

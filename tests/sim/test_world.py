@@ -81,9 +81,9 @@ class Touch:
 
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
-    """Hands are thrown at each scene with delays 0 to 3; with damped hands the shell never acts."""
+    """Hands are thrown at each scene with delays of 0 and 2 samples; with damped hands the shell never acts."""
     rng, acted, ticks = np.random.default_rng(3), 0, 0
-    for run in range(3):
+    for run in (0, 2):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
         touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
         for _ in range(350):

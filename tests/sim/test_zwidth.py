@@ -105,7 +105,9 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
     np.testing.assert_allclose(sweep.ratios("this-environment", K, B), true, rtol=2e-9)
 
 
-@pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
+@pytest.mark.parametrize(
+    ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
+)
 def test_maps_before_walls_match_designs(theta, least):
     """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; with delay frozen contact needs less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
@@ -440,10 +442,11 @@ def test_the_files_of_a_map(audit):
     )
 
 
-def test_a_seed_gives_the_same_map_again(audit, tmp_path):
-    _, report, _ = audit
-    zwidth.main([*OMEGA3, "--duration", "1.5", "--no-plot", "--out", str(tmp_path)])
-    again = json.loads((tmp_path / "report.json").read_text())
+def test_a_seed_gives_the_same_map_again(tmp_path):
+    few = ["--humans", "10", "--grid", "4", "--points", "1", "--duration", "1.5", "--no-plot", "--out", str(tmp_path)]
+    report, again = (
+        json.loads((tmp_path / "report.json").read_text()) for _ in range(2) if zwidth.main([*OMEGA3, *few]) is not None
+    )
     for part in ("population", "simulation", "this-environment", "any-environment", "marks"):
         assert again[part] == report[part]
 
@@ -471,7 +474,7 @@ def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
         return draw_map(*arguments[:-1], stop)
 
     monkeypatch.setattr(zwidth.zwidth, "draw_map", draw)
-    options = ["--rigid", "--theta", "1", "--humans", "10", "--grid", "12", "--points", "5", "--out", str(tmp_path)]
+    options = ["--rigid", "--theta", "1", "--humans", "10", "--grid", "8", "--points", "2", "--out", str(tmp_path)]
     assert zwidth.main(options) == INTERRUPTED
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["interrupted"]
@@ -537,14 +540,14 @@ def test_maps_cover_latency_and_longest_periods(tmp_path):
         "--mark",
         "1000,0",
         "--grid",
-        "6",
+        "4",
         "--humans",
-        "5",
+        "2",
         "--no-plot",
     ]
     needs = {}
     for name, options in {
-        "late": ["--theta", "0", "--latency", "130e-6:130e-6", "--points", "1"],
+        "late": ["--theta", "0", "--latency", "130e-6:130e-6", "--points", "1", "--duration", "1.5"],
         "whole": ["--theta", "1", "--points", "0"],
         "long": ["--theta", "0", "--T-max", "1.8e-3", "--points", "0"],
     }.items():
