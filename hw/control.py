@@ -293,9 +293,10 @@ class Drive:
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
         about = limits, T, units, still
-        tests = [monitor.EncoderTest(*about, expected, config.theta == 0, closing) for closing in (False, True)]
-        self._test, self._last_test = tests if settings.test_encoders else (None, None)
-        self.remarks = tests[0].remarks  # what the test at arming could not judge
+        first = monitor.EncoderTest(*about, expected, config.theta == 0)
+        last = monitor.EncoderTest(*about, expected, config.theta == 0, first.sizes)
+        self._test, self._last_test = (first, last) if settings.test_encoders else (None, None)
+        self.remarks = first.remarks  # what the test at arming could not judge
         self.encoders = monitor.EncoderMonitor(*about)
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate

@@ -89,6 +89,8 @@ _AXIS = {
     "scale": ("counts that its encoder shows per true count", 0.01, 100.0, 3.0),
     "noise": ("counts of noise (root mean square) in its encoder", 0.0, 100.0, 0.5),
     "motor": ("share of a force that its motor makes: 0 if dead, -1 if reversed", -10.0, 10.0, 0.0),
+    "limit": ("newtons at which its motor saturates", 0.0, 12.0, 0.6),
+    "oneway": ("share of a negative force that its motor makes", -10.0, 10.0, 0.0),
     "own": ("newtons that its motor makes while armed, whatever FORCE says", -12.0, 12.0, 2.0),
 }
 KINDS = _LINE | _DEVICE | _AXIS
@@ -303,7 +305,8 @@ class Emulator:
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick as a multiple of T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
-        self._motor: Array = np.ones(scenario.channels)  # share of its force that each motor makes
+        self._motor: Array = np.ones((2, scenario.channels))  # shares of a positive and of a negative force
+        self._most: Array = np.full(scenario.channels, np.inf)  # [N] forces at which motors saturate
         self._swapped, self._crossed = False, 0.0
         # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
@@ -336,7 +339,8 @@ class Emulator:
 
     def _motor_forces(self, steps: tuple[int, ...]) -> Array:
         """Return the forces (m,) [N] that the motors make of latched forces, with the faults of the motors."""
-        forces = np.array(steps) * self.force_step * self._motor
+        forces = np.clip(np.array(steps) * self.force_step, -self._most, self._most)
+        forces *= np.where(forces > 0, *self._motor)
         forces[1:2] += self._crossed * forces[0]
         return forces
 
@@ -431,7 +435,11 @@ class Emulator:
                     earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
                     self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
                 case "motor":
-                    self._motor[fault.axis] = fault.value
+                    self._motor[:, fault.axis] = fault.value
+                case "oneway":
+                    self._motor[1, fault.axis] = fault.value
+                case "limit":
+                    self._most[fault.axis] = fault.value
                 case "swap":
                     self._swapped = True
                 case "cross":

@@ -38,7 +38,9 @@ _PATIENCE = 5  # wrong ticks in a row at which a session stops
 _CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle not at an end stop
 _IMPULSE = 0.1  # [s] times the unit of _CHANGE: largest integral of such changes without a motion; 1 N for 100 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
-_TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
+_TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
+_PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions are always mixed
+_TEST_SPEED = 0.1  # [m/s] fastest expected motion above this force; a dead direction then leaves 0.4 m/s after a block
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
@@ -47,7 +49,8 @@ _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short one, but n
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
-_STRONG = 2  # first block of the test at the end of a session
+_UNEVEN = 1 / 3  # largest difference of the two directions of a motor, as a share of their sum: a factor of 2
+_WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
@@ -534,33 +537,42 @@ class Expected:
 
     def rest(self) -> None:
         """Set all plants to rest."""
-        self._states = [np.zeros(len(A)) for A, _ in self._plants]
+        self._states = [np.zeros(len(self._plants[which][0])) for which in (0, -1, 0)]
 
-    def advance(self, axis: int, force: float) -> tuple[float, float]:
-        """Apply a motor's force [N] for a tick and return its axis' positions [m], as expected and in a heavy hand."""
-        states = zip(self._plants, self._states, strict=True)
-        self._states = [A @ state + B[:, axis] * force for (A, B), state in states]
-        return float(self._states[0][axis]), float(self._states[-1][axis])
+    def advance(self, axis: int, force: float) -> tuple[float, float, float]:
+        """Apply a motor's force [N] for a tick and return its axis' positions [m].
+
+        They are the expected one, that in a heavy hand, and that under the absolute value of all forces.
+        """
+        plants, forces = (self._plants[which] for which in (0, -1, 0)), (force, force, abs(force))
+        moved = zip(plants, self._states, forces, strict=True)
+        self._states = [A @ state + B[:, axis] * each for (A, B), state, each in moved]
+        own, heavy, even = (float(state[axis]) for state in self._states)
+        return own, heavy, even
 
 
 class EncoderTest:
     """Test whether encoders answer a small force that acts on one axis after the other.
 
-    The force changes its sign every 30 ms, in blocks of 120 ms; each block is twice as strong as the one before. After
-    a block, a polynomial of degree 5 is subtracted from every position. It contains the intended motion of a hand in
-    this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion in shape
-    (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder gives the
-    wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A motion that
-    comes later than expected shows a hidden delay, because friction and hands advance its phase. Dry friction makes
-    weak motions small, so only the strongest force finds a motion too small. Coarse counts leave the delay uncertain,
-    so a stronger force follows until its error is below the limit, or the delay is not tested (`remarks`).
+    Every 30 ms a pulse of 20 ms acts in the other direction, in blocks of 120 ms; each block is twice as strong as the
+    one before. After a block, a polynomial of degree 5 is subtracted from every position. It contains the intended
+    motion of a hand in this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the
+    expected motion in shape (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor
+    or encoder gives the wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another
+    shape. A motion that comes later than expected shows a hidden delay, because friction and hands advance its phase.
+    Dry friction makes weak motions small, so only the strongest force finds a motion too small. Coarse counts leave the
+    delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
+    (`remarks`). A motor that is weak in one direction adds the motion under the absolute value of the force, which
+    pauses make another shape.
 
-    At the end of a session (`closing`) unknown hands may hold the handles, except in rehearsals (`held`). A verdict
-    then needs two blocks in a row that agree, and blocks are repeated until the person lets go, at most for 5 s. A
-    small or late motion is a wrong one only where it has the shape of a free handle and not that of a handle in a hand
-    as heavy as the device. The mode of a transmission makes these shapes differ; a rigid device has equal shapes. If an
-    axis never moves as a free handle does, the session does not finish. Where it swings at the frequency of the force,
-    at any phase, the message names a hand, too, because an axis with a dead motor does not swing.
+    The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
+    motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
+    in rehearsals (`held`). A verdict then needs two blocks in a row that agree, and blocks are repeated until the
+    person lets go, at most for 5 s. A small or late motion is a wrong one only where it has the shape of a free handle
+    and not that of a handle in a hand as heavy as the device. The mode of a transmission makes these shapes differ; a
+    rigid device has equal shapes. If an axis never moves as a free handle does, the session does not finish. Where it
+    swings at the frequency of the force, at any phase, the message names a hand, too, because an axis with a dead motor
+    does not swing.
     """
 
     def __init__(
@@ -571,24 +583,28 @@ class EncoderTest:
         still: Sequence[int],
         expected: Expected,
         at_once: bool = False,
-        closing: bool = False,
+        before: Sequence[float] | None = None,
     ) -> None:
         """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
+        `before` has the sizes of the motions at arming, which the test at arming stores in `sizes`.
         """
-        self._at_once, self._strongest = at_once, [min(cap, _TEST_FORCE * limits.lever) for cap in limits.cap]
-        self._T, self._units, self._still, self._expected, self._closing = T, units, still, expected, closing
+        self._at_once, self._closing, self._before, self.sizes = at_once, before is not None, before, list[float]()
+        push = 2 * _TEST_SPEED / (limits.lever * _PULSE * _TEST_HALF) * self._closing
+        most = [max(_TEST_FORCE * limits.lever, push * mass) for mass in expected.mass]
+        self._strongest = list(map(min, limits.cap, most))
+        self._T, self._units, self._still, self._expected = T, units, still, expected
         self._axis, self._last = -1, None
         self.remarks: list[str] = []  # what the test could not judge
-        self._unknown_hands = closing and not expected.held
-        self._blocks = _BLOCKS + round(_LETTING_GO / (4 * _TEST_HALF)) * self._unknown_hands
+        self._unknown_hands = self._closing and not expected.held
+        self._blocks = _BLOCKS + self._closing + round(_LETTING_GO / (4 * _TEST_HALF)) * self._unknown_hands
         self._next_axis()
 
     def _next_axis(self) -> None:
-        self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._closing else 0
+        self._axis, self._ticks, self._block = self._axis + 1, 0, _BLOCKS - 1 if self._closing else 0
         self._expected.rest()
-        self._rows: list[tuple[float, ...]] = []  # tick, two expected positions [m] and counts (m,) in this block
+        self._rows: list[tuple[float, ...]] = []  # tick, three expected positions [m] and counts (m,) in this block
         self._pushed = 0.0  # [N] largest force on the axis in this block
         self._finding: str | None = None  # the fault that the last block found, "" for none; None without an answer
         self._swings = False  # whether the axis swung at the frequency of the force in a block
@@ -618,29 +634,32 @@ class EncoderTest:
         if since <= 0:
             return (0.0,) * len(self._still)
         size = self._strongest[self._axis] * 2.0 ** min(0, self._block + 1 - _BLOCKS)
-        sign = -1 if (since + half // 2) // half % 2 else 1
+        number, place = divmod(since - 0.5 + half / 2, half)
+        sign = (-1) ** number * (abs(place - half / 2) < half * _PULSE / 2)
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._still)))
 
     @property
     def request(self) -> str | None:
         """Return what the person must do so that the axis can pass its test, or None."""
-        return f"let go of the handle of axis {self._axis + 1}" if self._block >= _BLOCKS else None
+        return f"let go of the handle of axis {self._axis + 1}" if self._block > _BLOCKS else None
 
-    def _compare(self) -> tuple[Array, Array, float, float, float, bool]:
+    def _compare(self) -> tuple[Array, Array, float, float, float, float, bool]:
         """Compare all motions with the expected one.
 
         Returns the relative size and the fit (m,) of all motions. For the tested axis, also returns the size at any
-        phase of the force, the delay and its error [ticks], and whether the shape is that of the expected handle but
-        not that of a handle in a heavy hand.
+        phase of the force, the delay and its error [ticks], how much its two directions differ as a share of their sum
+        (less the error of the counts, and 0 unless this explains the rest of the motion), and whether the shape is that
+        of the expected handle but not that of a handle in a heavy hand.
 
-        The delay is -a/s in the fit s x + a x' of the expected motion x. The row p of the pseudoinverse that yields a
-        turns rounding errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error
-        |p| q/|s| is 3.5 standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
+        The delay is -a/s in the fit s x + a x' + e y of the expected motion x, and of the motion y under the absolute
+        value of the force; the directions differ by e/s. The row p of the pseudoinverse that yields a turns rounding
+        errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error |p| q/|s| is 3.5
+        standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
         """
-        t, expected, loaded, *counts = np.array(self._rows).T
+        t, expected, loaded, even, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
-        parts = expected, np.cumsum(expected), np.gradient(expected, t), loaded
-        wanted, shifted, rate, heavy = (a - smooth @ (smooth.T @ a) for a in parts)
+        parts = expected, np.cumsum(expected), np.gradient(expected, t), loaded, even
+        wanted, shifted, rate, heavy, even = (a - smooth @ (smooth.T @ a) for a in parts)
         moved = np.array(counts).T * self._units.encoder_step
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
@@ -650,17 +669,21 @@ class EncoderTest:
         own = np.maximum((moved**2).sum(axis=0) - len(t) * scatter**2, len(t) * scatter**2)
         fit = size**2 * power / own
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
-        inverse = np.linalg.pinv(np.stack([wanted, rate], axis=1))
-        same, ahead = inverse @ moved[:, self._axis]
-        late = -float(ahead / same) if same else 0.0  # [ticks]
-        doubt = float(12**0.5 * np.linalg.norm(inverse[1]) * scatter[self._axis] / abs(same)) if same else math.inf
-        alike = (heavy @ moved[:, self._axis]) ** 2 / ((heavy @ heavy or 1.0) * own[self._axis])
-        swing = float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power))
-        return size, fit, swing, late, doubt, bool(fit[self._axis] > _FIT > alike)
+        shapes, tested, noise = np.stack([wanted, rate, even], axis=1), moved[:, self._axis], scatter[self._axis]
+        inverse = np.linalg.pinv(shapes)
+        share, lengths = inverse @ tested, np.linalg.norm(inverse, axis=1)
+        same, doubts = float(share[0]) or 1.0, 12**0.5 * noise * lengths
+        late, doubt = -float(share[1]) / same, float(doubts[1]) / abs(same)  # [ticks]
+        rest = max(0.0, float(((tested - shapes @ share) ** 2).sum()) - len(t) * noise**2)
+        explained = share[2] ** 2 > _FIT / (1 - _FIT) * rest * lengths[2] ** 2
+        uneven = explained * (abs(float(share[2])) - float(doubts[2])) / abs(same)
+        alike = (heavy @ tested) ** 2 / ((heavy @ heavy or 1.0) * own[self._axis])
+        swing = float(np.linalg.norm(both.T @ tested) / math.sqrt(power))
+        return size, fit, swing, late, doubt, uneven, bool(fit[self._axis] > _FIT > alike)
 
     def _counted(self, i: int) -> float:
         """Return the range of encoder i in this block [counts]."""
-        return float(np.ptp([row[3 + i] for row in self._rows]))
+        return float(np.ptp([row[4 + i] for row in self._rows]))
 
     def _passed(self) -> bool:
         """Return whether the axis has passed its test. Raises SafetyStop where it answered wrongly.
@@ -680,33 +703,45 @@ class EncoderTest:
 
     def _answered(self) -> bool:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
-        weak, most = self._block < _BLOCKS - 1, _LATE + self._at_once
-        axis, name, (size, fit, swing, late, doubt, free) = self._axis, f"axis {self._axis + 1}", self._compare()
+        retried = self._closing and not self._unknown_hands
+        weak, most = self._block < _BLOCKS - 1 + retried, _LATE + self._at_once
+        axis, name, (size, fit, swing, late, doubt, uneven, free) = (
+            self._axis,
+            f"axis {self._axis + 1}",
+            self._compare(),
+        )
         moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         # A block lasts about as long as the window in which the noise was measured, so one count more is a motion.
         near = [self._counted(i) > max(1, still // 2 + 1) for i, still in enumerate(self._still)]
+        near[axis] = near[axis] and swing > _ALIVE
         follows = [bool(one and good > _FIT) for one, good in zip(near, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
         held = self._unknown_hands and not free  # whether a hand can explain a smaller motion
+        least = _WEAKENED * self._before[axis] if self._before else 0.0
         self._swings = self._swings or (moves[axis] and swing > _ALIVE)
-        if others and not moves[axis] and not follows[axis]:
-            raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
-        if held and follows[axis] and (abs(size[axis]) < 1 / _TEST_RATIO or (doubt < _LATE and late > most)):
+        if not follows[axis]:
+            if others and not moves[axis]:
+                raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
             return False
-        if follows[axis] and size[axis] < 0:
+        if uneven > _UNEVEN and not weak:
+            raise SafetyStop(f"{name} moves much farther in one direction than in the other: its motor is weak in one")
+        if held and (abs(size[axis]) < max(least, 1 / _TEST_RATIO) or (doubt < _LATE and late > most)):
+            return False
+        if size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
         small = size[axis] < 1 / _TEST_RATIO
-        if follows[axis] and small and weak:
+        if weak and (small or uneven > _UNEVEN):
             return False  # dry friction hides much of a weak motion; a stronger force overcomes it
-        if follows[axis] and not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
+        if not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
             brake = ", or dry friction brakes it" if small else ""
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong{brake}")
-        if follows[axis] and others:
+        if self._before and size[axis] < least:
+            share = f"{size[axis] / self._before[axis]:.2g} times as far as at arming"
+            raise SafetyStop(f"{name} moves {share}: its motor has become weak, or saturates at this force")
+        if others:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
-        if not follows[axis]:
-            return False
         if weak and (doubt >= _LATE or abs(late - most) < doubt):
             return False  # a larger motion shows the delay better
         if doubt >= _LATE:
@@ -716,6 +751,7 @@ class EncoderTest:
             raise SafetyStop(
                 f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
             )
+        self.sizes.append(float(size[axis]))
         return True
 
     def _unanswered(self) -> str:

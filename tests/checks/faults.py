@@ -235,6 +235,29 @@ CASES = (
         for fault, cause in ((f"axis{axis}:{kind}=0.4@0.6", f"axis {axis} moves 0.4.* times as far"),)
     ),
     *(
+        Fault(f"motor {axis} {what}, then the end", G.STOPPED, cause, (f"axis{axis}:{fault}",), free=True, **_ENDED)
+        for axis in (1, 2)
+        for what, fault, cause in (
+            ("saturates at 0.6 N before", "limit=0.6", f"axis {axis} moves 0.* times as far"),
+            ("saturates at 0.6 N", "limit=0.6@0.6", f"axis {axis} moves 0.* times as far"),
+            ("is 0.6 times as strong", "motor=0.6@0.6", f"axis {axis} moves 0.6.* times as far as at arming"),
+            ("makes 0.15 of negative forces", "oneway=0.15@0.6", f"axis {axis} moves .*than in the other"),
+        )
+    ),
+    *(
+        Fault(
+            f"motor {axis} makes {share} of negative forces before{', free' * free}",
+            G.STOPPED,
+            f"axis {axis} moves .*than in the other",
+            (f"axis{axis}:oneway={share}",),
+            _AT_ONCE,
+            free=free,
+        )
+        for axis in (1, 2)
+        for share in (0, 0.15)
+        for free in (False, True)
+    ),
+    *(
         Fault(
             f"encoder {axis} is read {n} ticks late before",
             G.STOPPED,

@@ -45,7 +45,7 @@ def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
     session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith(f"encoder of axis {axis} does not follow: it moved by ")
-    assert max(np.abs(m.applied).max() for m in rehearsal.moments) <= 1.0
+    assert max(np.abs(m.applied).max() for m in rehearsal.moments) <= 1.3
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
@@ -53,7 +53,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
     assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
 
 
-@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.13), (1e-4, 0.5)])
+@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.17), (1e-5, 0.17), (1e-4, 0.65)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     """Encoders of 1 to 100 um answer a force of at most `most` [N], held by the scenario's hands or free."""
@@ -80,11 +80,11 @@ def played(test, motion, ticks=6000):
     return np.array(forces)
 
 
-def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6):
+def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6, motor=lambda force: force):
     """Return a `motion` of two free masses: forces are summed twice, independently of the model in the test."""
 
     def motion(k, applied):
-        v = np.cumsum(applied * STEP / mass * T, axis=0)
+        v = np.cumsum(motor(applied * STEP) / mass * T, axis=0)
         x = np.vstack([np.zeros((1, 2)), np.cumsum(v * T, axis=0)])[-1]
         return tuple(round(scale * signs[i] * x[order[i]] / q) for i in range(2))
 
@@ -100,9 +100,9 @@ def free_pair(mass=0.25):
     return nobody(load().replace(device=[device] * 2))
 
 
-def arming_test(cap=12.0, closing=False, q=1e-6, still=1):
-    units = Units((q, q), (STEP, STEP), (10**6, 10**6))
-    return EncoderTest(SafetyLimits((cap, cap)), T, units, (still,) * 2, Expected(free_pair(), False), closing=closing)
+def arming_test(cap=12.0, closing=False, q=1e-6, still=1, before=None, known=False):
+    units, before = Units((q, q), (STEP, STEP), (10**6, 10**6)), () if closing else before
+    return EncoderTest(SafetyLimits((cap, cap)), T, units, (still,) * 2, Expected(free_pair(), known), before=before)
 
 
 def test_axes_are_tested_one_after_another():
@@ -121,11 +121,11 @@ def test_the_test_force_stays_within_the_cap(cap):
         kept.append(applied)
         return (0, 0)
 
-    with pytest.raises(SafetyStop, match=f"axis 1 does not follow: it moved by 0 counts .* up to {min(1, cap):g} N"):
+    with pytest.raises(SafetyStop, match=f"axis 1 does not follow: it moved by 0 counts .* up to {min(1.3, cap):g} N"):
         played(test, still)
     moved, other = (kept[-1] * STEP).T
     assert not other.any()
-    assert np.abs(moved).max() == pytest.approx(min(1.0, cap), rel=0.02)
+    assert np.abs(moved).max() == pytest.approx(min(1.3, cap), rel=0.02)
     assert moved.max() > 0 > moved.min()
     assert abs(moved.sum()) < 0.5 * np.abs(moved).sum()  # a free handle is not pushed away
 
@@ -140,8 +140,10 @@ def cut(test, most):
 
 @pytest.mark.parametrize("closing", [False, True])
 def test_a_force_cut_short_is_no_test(closing):
-    """A test force that an energy budget cuts from 1 N to 0.1 N does not show that the motor is dead."""
-    with pytest.raises(SafetyStop, match=r"the energy left allows 0.1 of 1 N: motor and encoder of axis 1 are not"):
+    """A test force that an energy budget cuts to 0.1 N does not show that the motor is dead."""
+    with pytest.raises(
+        SafetyStop, match=r"the energy left allows 0.1 of (1.3|2.5) N: motor and encoder of axis 1 are not"
+    ):
         cut(arming_test(closing=closing), 0.1)
 
 
@@ -166,13 +168,16 @@ def test_motions_off_by_two_are_refused(scale, refused):
         played(arming_test(), masses(scale=scale))
 
 
-def rubbing(friction, mass=0.25, q=1e-6):
-    """Return a `motion` of two free masses with dry friction [N] that sticks: each tick, friction stops or brakes."""
+def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
+    """Return a `motion` of two free masses with dry friction [N] that sticks: each tick, friction stops or brakes.
+
+    Their weight adds a force `bias` [N].
+    """
     x, v = np.zeros(2), np.zeros(2)
 
     def motion(k, applied):
         if k:
-            v[:] += applied[-1] * STEP / mass * T
+            v[:] += (applied[-1] * STEP + bias) / mass * T
             v[:] = np.sign(v) * np.maximum(np.abs(v) - friction / mass * T, 0.0)
             x[:] += v * T
         return tuple(round(one / q) for one in x)
@@ -184,6 +189,35 @@ def rubbing(friction, mass=0.25, q=1e-6):
 def test_stronger_forces_overcome_dry_friction(friction, closing):
     """A friction of 68 % of a test force leaves 0.4 of its motion, which is no wrong mass."""
     played(arming_test(closing=closing), rubbing(friction))
+
+
+def test_friction_and_weight_are_no_weak_direction():
+    """At 1.3 N, friction of 0.52 N and a weight of 0.26 N, 0.7 of the motion remain, more to one side."""
+    for closing in (False, True):
+        played(arming_test(cap=1.3, closing=closing), rubbing(0.52, bias=0.26))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("share", [0.0, 0.15])
+@pytest.mark.parametrize("q", [1e-6, 1e-5])
+def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
+    """Its motion has 0.5 to 0.575 of the expected size, which a factor of 2 hardly tells from a wrong mass."""
+    weak = masses(q=q, motor=lambda force: np.where(sign * force > 0, force, share * force))
+    with pytest.raises(SafetyStop, match="axis 1 moves much farther in one direction than in the other"):
+        played(arming_test(q=q), weak)
+
+
+@pytest.mark.parametrize(("most", "mass"), [(0.6, 0.25), (0.9, 0.15), (9.0, 0.15)])
+def test_a_saturated_motor_fails_the_last_test(most, mass):
+    """Light handles hide that a motor makes 0.9 of 1.3 N: they move as far as 1.5 times the force predicts."""
+    limited, first = masses(mass=mass, motor=lambda force: np.clip(force, -most, most)), arming_test(cap=1.3)
+    played(first, limited)
+    last = arming_test(cap=1.3, before=first.sizes, known=True)
+    if most > 1.3:
+        played(last, limited)
+    else:
+        with pytest.raises(SafetyStop, match=r"axis 1 moves 0\.(47|69) times as far as"):
+            played(last, limited)
 
 
 def test_friction_hides_no_wrong_sign():
@@ -246,7 +280,7 @@ def test_motors_that_died_never_finish(scenario, rungs, axis, at):
         session, rehearsal = session_with(scenario, rungs, *faults, stop=at, seconds=at + 1.0)
         assert session.stage == stage, session.cause
         assert not rehearsal.moments[-1].applied.any()
-    assert session.cause.startswith(f"motor or encoder of axis {axis} did not answer a test force of up to 1 N")
+    assert session.cause.startswith(f"motor or encoder of axis {axis} did not answer a test force of up to 2.5 N")
 
 
 @pytest.mark.parametrize(("axis", "scale"), checkered([1, 2], [0.4, 2.5]))
@@ -320,7 +354,7 @@ def test_devices_of_three_axes_run_without_hands():
     session = session_for(space, LinkSettings(held=False))
     for axis, mass in enumerate(session._expected.mass):
         session._expected.rest()
-        far, loaded = session._expected.advance(axis, 1.0)
+        far, loaded, _ = session._expected.advance(axis, 1.0)
         assert far == pytest.approx(space.T**2 / (2 * mass), rel=0.01)
         assert loaded == pytest.approx(far / 2, rel=0.01)
     assert nobody(space).channels == len(session._expected.mass) == 6
@@ -406,7 +440,7 @@ def test_coarse_counts_hide_a_calm_tremor(count, dead):
     assert (monitor.dead is not None) == dead
 
 
-@pytest.mark.parametrize("cap", [0.2, 0.3])
+@pytest.mark.parametrize("cap", [0.3, 0.4])
 def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
     """After its test an axis rests within counts of 0.1 mm, although the force has changed by the cap."""
     free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
@@ -457,8 +491,8 @@ def test_the_impulse_decides(axis, sign, newton, after):
 
 
 def test_motions_below_two_counts_test_nothing():
-    """At 0.05 N the free mass swings by 0.056 mm, which an encoder with counts of 0.1 mm hardly shows."""
-    with pytest.raises(SafetyStop, match=r"axis 1 by 0\.056 mm, less than 2 counts of 0\.1 mm"):
+    """At 0.05 N the free mass swings by 0.039 mm, which an encoder with counts of 0.1 mm hardly shows."""
+    with pytest.raises(SafetyStop, match=r"axis 1 by 0\.039 mm, less than 2 counts of 0\.1 mm"):
         played(arming_test(cap=0.05, q=1e-4), masses(q=1e-4))
 
 

@@ -159,7 +159,7 @@ def test_motors_in_worlds_are_tested_at_last():
 def test_a_dead_motor_in_a_world_never_finishes():
     session, _ = in_the_ball_world("axis6:motor=0@0.8")
     assert session.stage == Stage.STOPPED
-    assert session.cause.startswith("motor or encoder of axis 6 did not answer a test force of up to 1 N")
+    assert session.cause.startswith("motor or encoder of axis 6 did not answer a test force of up to 2 N")
 
 
 def test_the_host_delays_forces_beyond_the_link():
