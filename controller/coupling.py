@@ -35,7 +35,7 @@ class Coupling:
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear environment model (no walls)
+    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear model, which cannot have walls
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
@@ -78,11 +78,14 @@ class Coupling:
         return self
 
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> Coupling:
-        """Return the coupling with all K and all B multiplied by factors, if it has such gains."""
+        """Return the coupling with all K times `stiffness` and all B times `damping`; other couplings are unchanged."""
         return self
 
     def turned(self, Q: Array) -> Coupling:
-        """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m)."""
+        """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m).
+
+        Raises ValueError for a class of couplings that cannot be turned, and for velocity filters.
+        """
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
     def in_series(self, T: Number) -> Lti | None:
@@ -312,7 +315,7 @@ class MovingAverage(ReadOnly, Coupling):
 
     @property
     def stiffness(self) -> Array:
-        """1/V(1) [N/m], (m,)."""
+        """The static stiffness 1/V(1) [N/m], (m,)."""
         return 1 / (self.weight * self.terms + self.constant)
 
     def channels(self, T: Number) -> list[Lti]:
@@ -426,7 +429,7 @@ class ForceFilter(ReadOnly, Coupling):
     R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 
     Raises:
-        ValueError: A pole is not stable, or the coefficients do not sum to g I with g >= 0.
+        ValueError: A pole is not stable, a shape does not match, or the coefficients do not sum to g I with g >= 0.
     """
 
     poles: Array  # (n,) in (-1, 1); poles at zero are delays

@@ -325,7 +325,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         )
 
     def delayed(self, theta: _Steps) -> Loop:
-        """Return the loop with these constant delays of its forces."""
+        """Return the loop with these constant delays of its forces, and with lam at most theta + psi."""
         lam = tuple(min(n, t + p) for n, t, p in zip(self.lam, theta, self.psi, strict=True))
         return msgspec.structs.replace(self, theta=theta, lam=lam, varying_delay=None)
 

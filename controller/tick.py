@@ -177,7 +177,8 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether the linear law alone is tried next: ticks are `_straight`, and no force is known to be near its limit
+        #: whether the linear law alone is tried next: in a single simulation without encoder steps, walls, packets and
+        #: net, if no force is known to be near its limit
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
         for ball in process.balls:  # No vector within this box is longer than the limit.

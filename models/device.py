@@ -241,7 +241,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(motor, handle, stiffness, min(damping, most))
 
     def of(self, device: Device) -> Device:
-        """Return the device with these mechanics. Raises ValueError if it is rigid or they are out of bounds."""
+        """Return the device with these mechanics. Raises ValueError for a rigid device, or mechanics out of bounds."""
         if isinstance(device, RigidDevice):
             raise ValueError("a rigid device has no transmission that could be drawn")
         return msgspec.structs.replace(device, **msgspec.structs.asdict(self))

@@ -337,7 +337,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
 
 class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A sinusoidal motion amplitude sin(2 pi frequency t + phase) of the equilibrium; a raised cosine fades it in."""
+    """The motion `amplitude` sin(2 pi `frequency` t + `phase`) of the equilibrium, which a raised cosine fades in."""
 
     amplitude: float  # [m]
     frequency: float  # [Hz]

@@ -128,7 +128,8 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
     """Build one scene of devices, each held by its human. `persons` hold several devices.
 
     Raises:
-        ValueError: The numbers of devices and humans differ, their axes do not match, or a device is held twice.
+        ValueError: The numbers or the axes of devices and humans differ, or a person holds a device that does not
+            exist or that another person holds.
     """
     held = tuple((person.holds, person.port()) for person in persons)
     return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
@@ -333,8 +334,7 @@ def _placed(
 ) -> tuple[_Placed, ...]:
     """Return the placed ports of all devices, then those of the persons who hold several devices.
 
-    Raises ValueError if the numbers of devices and humans differ, if a device is held twice, or if the axes of humans
-    and devices differ.
+    Raises ValueError as `build` does.
     """
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")

@@ -459,7 +459,10 @@ def _refined(
     runs: dict[tuple[str, int], tuple[Array, float]],
     progress: Progress,
 ) -> tuple[Array, float]:
-    """Return (positions of a refined run by RK4, bound of its error), and store every run in `runs`."""
+    """Return (positions of a refined run by RK4, bound of its error), and store every run in `runs`.
+
+    Raises InputError if nothing moves, or if the allowed substeps and evaluations do not suffice.
+    """
     finest, best, gaps = 1, math.inf, list[float]()
     runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
     _require_motion(runs["RK4", 1][0])
@@ -651,7 +654,10 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """Return the growth rate [1/s] of an engine's loop; with walls, that of the worst contact state."""
+    """Return the growth rate [1/s] of an engine's loop; with walls, that of the worst contact state.
+
+    Raises InputError if a tick of the engine gives numbers that are not finite.
+    """
     held = _measured_hold(simulation, engine, integrator, substeps)
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
         raise InputError(f"engine {engine_name(engine)}: a tick from rest gives numbers that are not finite")
