@@ -247,6 +247,8 @@ def positive_definite(M: Any) -> bool:
 def times(left: Array, right: Array) -> Array:
     """Return left @ right. Fractions are multiplied only where they are not zero, because most entries are zero.
 
+    Raises ValueError if the shapes do not fit.
+
     Each row of `left` and each column of `right` becomes integers over a common denominator. A sum of products then
     needs one greatest common divisor instead of one per term.
     """

@@ -64,10 +64,10 @@ class NetFigures:
 class ShellFigures(NetFigures):
     """Figures of a passivity layer that limits forces by an energy W (see the module's docstring)."""
 
-    start_J: float
-    cap_J: float | None
-    smallest_scale: float
-    energy_J: float
+    start_J: float  # W0
+    cap_J: float | None  # the largest W; None if there is no cap
+    smallest_scale: float  # the smallest factor on a force so far
+    energy_J: float  # the present W
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class BudgetFigures(ShellFigures):
     """Figures of an energy budget."""
 
     eps: float = EPS
-    reserved_J: float
+    reserved_J: float  # the largest loss of the packets on their way
     dropped_ticks: int = 0  # ticks in which a device dropped a force that was too old
     surprises: int  # ticks with a reported force larger than any that could have been in use
     idle: str | None = None  # reason why the budget never acts, if that is proved

@@ -495,7 +495,7 @@ class ForceFilter(ReadOnly, Coupling):
         return ForceFilter(self.poles, self.pairs, np.concatenate([first.astype(float)[None], later]))
 
     def around(self, environment: Block, further: int = 0) -> Block:
-        """Return R Psi E for `environment` = Psi E."""
+        """Return R Psi E for `environment` = Psi E. Raises ValueError for walls, or another number of contacts."""
         m = self.R.shape[1]
         if isinstance(environment, Sampled):
             values = basis(self.poles, environment.z, self.pairs)

@@ -254,7 +254,10 @@ class Environment:
         raise ValueError(f"{self.here} is no network of springs, dampers and masses")
 
     def E(self, T: Number) -> Lti:
-        """Return E(z) from contact displacements [m] to forces [N], with every wall touching, in T's arithmetic."""
+        """Return E(z) from contact displacements [m] to forces [N], with every wall touching, in T's arithmetic.
+
+        Raises TypeError if a class does not define this method.
+        """
         raise TypeError(f"{type(self).__name__} has no E(T): define this method")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:

@@ -120,7 +120,7 @@ class Lti(ReadOnly):
 
     @classmethod
     def constant(cls, D: ArrayLike, T: Number) -> Self:
-        """Return the memoryless block y = D u."""
+        """Return the memoryless block y = D u. Raises ValueError unless D has at least 2 axes."""
         gain: Any = numbers(D, T) if isinstance(T, Fraction) else np.asarray(D, dtype=np.float64)
         if gain.ndim < 2:
             raise ValueError(f"expected an array of numbers with 2 axes, got shape {gain.shape}")
@@ -652,7 +652,7 @@ def constant_like(block: Block, D: Any) -> Block:
 
 
 def taps(weights: Sequence[Any], T: Number) -> Lti:
-    """Return the filter w_0 + w_1/z + ... + w_n z^-n of one channel."""
+    """Return the filter w_0 + w_1/z + ... + w_n z^-n of one channel. Raises ValueError without any weight."""
     n = len(weights) - 1
     row = numbers(list(weights), T)
     if n < 0:

@@ -167,7 +167,7 @@ class ComparedCoupling:
 
     name: str
     kind: str
-    states: int
+    states: int  # order of F
     assessment: Assessment
     robustness: Robustness | None = off_table()
     curves: compare.Curves = off_table("inlined")

@@ -522,7 +522,10 @@ def _product_of_each(steps: Array) -> Product:
 
 
 def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """Copy the scene's model for `substeps` steps of `integrator` in a period T."""
+    """Copy the scene's model for `substeps` steps of `integrator` in a period T.
+
+    Raises ValueError for impossible settings, as InputError if the scene excludes the integrator.
+    """
     import mujoco
 
     if integrator not in INTEGRATORS:

@@ -1,8 +1,8 @@
 """Limit cycles of loops in human hands: eigenvalues for every human, and MuJoCo for the worst human.
 
 A cell of a Z-width map has a force map F and a process that computes it. `HeldDevices` closes F around the devices in
-the hands of every human and gives the growth of the dominant mode. `simulate_cells` runs cells in MuJoCo batches, with
-encoder steps, friction and walls.
+the hands of every human and gives the growth of the dominant mode; here a human is a set of hands, one for each device.
+`simulate_cells` runs cells in MuJoCo batches, with encoder steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -60,8 +60,13 @@ class HeldDevices:
         """Draw random humans for the devices.
 
         Args:
-            links: Number of links of each human; None for that of the population.
-            latency: (m,) earliest and latest latching of forces [s]; the latest is used.
+            devices: The devices (m,).
+            population: The distribution of the humans.
+            T: The period [s].
+            seed: The seed of the draws.
+            humans: The number of sets of humans, one human per device.
+            links: The number of links of each human; None for that of the population.
+            latency: The least and the largest latency (m,) of forces [s], of which the largest is used.
         """
         late = None if latency is None else tuple(most for _, most in latency)
         groups = []

@@ -116,8 +116,8 @@ class DelaySpan:
     hi: tuple[int, ...]
     pattern: str
     loss: float
-    playout: bool
-    constant: bool
+    playout: bool  # whether a buffer in the device makes the delay hi
+    constant: bool  # whether every force has the delay theta
 
     @classmethod
     def of(cls, varying: VaryingDelay) -> DelaySpan:
@@ -148,8 +148,8 @@ class _DelaysMet:
     """The delays that occurred in a run, and the growth of its linear loop under them."""
 
     age: _Age | None  # None if some channel receives no force
-    lost_packets: list[int]
-    held_ticks: list[int]
+    lost_packets: list[int]  # (m,)
+    held_ticks: list[int]  # (m,) ticks in which no newer force arrived
     growth_rate_per_s: float
     verdict: str | None  # None if the rate is too small for the trace's duration
     judged_s: float  # duration of the trace that gave the growth

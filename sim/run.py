@@ -277,7 +277,7 @@ def run_blocks(
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), block by block.
 
     `each_block` is called after each block and returns True to stop. Row 0 of the buffer is the block's first tick. The
-    default block is small enough for the processor's cache.
+    default block is small enough for the processor's cache. Raises InputError for an engine without `advance`.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
@@ -324,7 +324,8 @@ def outside_forces(
 ) -> Array:
     """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, outside).
 
-    The voluntary force acts on the end of each human, the tap on one handle.
+    The voluntary force acts on the end of each human, the tap on one handle. Raises InputError for a voluntary force
+    of wrong shape, or one that is not finite.
     """
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))

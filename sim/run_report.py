@@ -37,7 +37,7 @@ class Ran:
     duration_s: float
     samples: int
     wall_s: float
-    real_time_factor: float
+    real_time_factor: float  # simulated time over wall time
     theta: tuple[int, ...]
     psi: tuple[int, ...]
     lam: tuple[int, ...]
@@ -49,7 +49,7 @@ class Ran:
     interrupted: bool
     scenario_digest: str
     encoder_step_m: Array
-    steady_ticks: list[list[int]]
+    steady_ticks: list[list[int]]  # [first, stop] of the ticks before the first clipped one
     environment: str
     unsolved: int  # number of times that limited forces were set to 0 because no solution was found
 

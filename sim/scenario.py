@@ -459,9 +459,9 @@ def load(source: str | Path = DEFAULT) -> Scenario:
 
 
 def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenario:
-    """Parse TOML text as a scenario. Raises InputError with the path of the field and its value.
+    """Parse TOML text as a scenario. The path of a world's file is relative to `folder`.
 
-    The path of a world's file is relative to `folder`.
+    Raises InputError with the path of the field and its value, and TypeError for anything but text.
     """
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
@@ -695,7 +695,10 @@ def _require_keys(raw: dict[str, Any]) -> None:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace each name of a device in the catalogue by the device's fields, in `device` and in [[device]] tables."""
+    """Replace each name of a device in the catalogue by the device's fields, in `device` and in [[device]] tables.
+
+    Raises InputError for an unknown name or a missing field.
+    """
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -787,7 +790,10 @@ _DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact."""
+    """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact.
+
+    Raises ValueError for an impossible world, and for keys of worlds in another environment.
+    """
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
         _require_no_along(table)

@@ -312,20 +312,20 @@ class _Frozen(ExactVerdict):
 class _Contact:
     """Contacts with walls in a run, and the linear loops between which contacts switch."""
 
-    made: int
-    ticks: int
-    slopes_n_per_m: list[float]
-    frozen: list[_Frozen]
+    made: int  # number of times that a wall was touched
+    ticks: int  # ticks in which some wall was touched
+    slopes_n_per_m: list[float]  # largest stiffness of each wall (controller.environment.Wall.slope)
+    frozen: list[_Frozen]  # one for every set of touching walls
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stability(Eigenvalues):
     """The verdicts of the trace and of the exact loop's eigenvalues (with walls, of the worst contact state)."""
 
-    verdict: str | None
+    verdict: str | None  # of the run; None if nothing decides it
     clipped_ticks: int
-    growth_rate_per_s: float | None
-    frequency_hz: float | None
+    growth_rate_per_s: float | None  # if None, `reason` says why
+    frequency_hz: float | None  # strongest frequency of the forces at the end of the trace
     contact: _Contact | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
 

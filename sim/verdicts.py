@@ -148,17 +148,17 @@ class Traces:
 
     duration_s: float
     humans: int
-    clipped_runs: int
-    contacts: int
+    clipped_runs: int  # traces in which a force reached its limit
+    contacts: int  # number of times that a wall was touched
     measured: int  # traces with a growth rate
     witnessed: int  # traces that MuJoCo, or a user's own engine, also made
     undecided: int  # traces that are too short for the sign of their rate; eigenvalues decide there
-    largest_difference_per_s: float | None
-    stable_and_settling: int
+    largest_difference_per_s: float | None  # between the growth rates of trace and exact loop
+    stable_and_settling: int  # stable loops whose handles were slower in the last quarter than in the second
     stable: int
-    slowest_settling: float | None
-    slowest_decay_s: float | None
-    settling_decides: bool
+    slowest_settling: float | None  # largest ratio of these speeds among the stable loops
+    slowest_decay_s: float | None  # decay time of the slowest mode that decays
+    settling_decides: bool  # whether the traces are long enough for handles to slow down
     reason: str | None = off_table("if given", None)
 
     @classmethod
@@ -201,10 +201,10 @@ class Traces:
 class EnergyAudit:
     """Test that W(N) >= 0 (sim.crowds) on traces; traces with clipped forces are left out, unless a limiter clips."""
 
-    audited: int
-    clipped: int
+    audited: int  # number of tested traces
+    clipped: int  # number of traces that are left out
     violated: int
-    least_J: float | None
+    least_J: float | None  # least W(N) of the tested traces
     holds: bool
 
     @classmethod

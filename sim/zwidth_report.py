@@ -42,9 +42,9 @@ class _Population:
     humans: int
     seed: int
     growth_rate_per_s: Array  # (rows, columns)
-    unstable_humans_at_least: Array  # (rows, columns)
+    unstable_humans_at_least: Array  # (rows, columns), among the humans that were tried in the cell
     stable_cells: int
-    decided_cells: int
+    decided_cells: int  # cells that were reached before an interruption
     reason: str | None = off_table("if given")
 
 
