@@ -4,14 +4,14 @@
     Shell               scales forces at the port of the environment, behind a coupling certified for any environment
 
 *The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the
-energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), of which the device feels -a[k], and
+energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), the device feels -a[k], and
 dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta (on vectors, ' is the transpose) the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
-For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. Let R
-be the sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
-they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
+By completing a square, a tick adds at least -r(a) for every dx, with r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the
+sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until they
+have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
 exists at every tick: a tick lowers R by its largest loss, and W by at most this loss, so that s = 0 is allowed. So
 W >= 0 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the
 energy that the devices dissipate, devices and hands receive at most W0, and

@@ -219,8 +219,8 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Let G map displacements x to forces before Theta. The limiter subtracts a slip e from x (e_- at the previous tick), so
-# that the forces f_e that it sends satisfy |f_e,i| <= L_i:
+# Let G map displacements x to forces before Theta. The limiter subtracts a slip e from x (e_- at the previous tick). A
+# stiffness rho >= 0 resists changes of e. The forces f_e that the limiter sends satisfy |f_e,i| <= L_i:
 #
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #

@@ -188,7 +188,7 @@ class EnvironmentSweep(_Sweep):
 
     def __post_init__(self) -> None:
         if self.loop.environment.walls:
-            raise ValueError("environment.walls: with --coupling the map is over linear environments; take them out")
+            raise ValueError("environment.walls: with --coupling the map is over linear environments; remove the walls")
         if self.loop.network.block:
             raise ValueError(
                 "environment.block: with --coupling the map varies springs at contacts; leave --coupling out"
