@@ -382,7 +382,7 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
     """
     rng = np.random.default_rng(3)
     links = [(5e-4, "down:jitter=0.0005", "down:burst=0.0017")]
-    for _ in range(10):
+    for _ in range(6):
         T = float(rng.choice([3e-4, 5e-4, 1e-3, 1.2e-3, 2e-3]))
         sizes = rng.uniform(0.05, 1.0) * T, rng.uniform(0.5, 5.0) * T
         links.append((T, *(f"down:{kind}={size:.6f}" for kind, size in zip(("jitter", "burst"), sizes, strict=True))))
@@ -403,7 +403,7 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
         assert session.counters.misses <= 2 * 15 + 2  # an answer that the device was told to ignore is no miss
         if seed == 0:
             assert ages.link_delay(1e6 * T, 0.99, 0.0) >= 7 == int(-(-np.percentile(true, 99) // (1e6 * T)))
-    assert rounds > 4
+    assert rounds > 2
 
 
 def test_ages_while_forces_act_count_skipped_answers(scenario):

@@ -70,7 +70,7 @@ def account(trace, link, coupling, T):
 
 
 def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
-    code, report, shown = session(tmp_path, capsys, "--scenario", "world-ball", "--duration", "1")
+    code, report, shown = session(tmp_path, capsys, "--scenario", "world-ball", "--duration", "0.4")
     (world,) = report["world"]
     assert code == 0
     assert "no passive hand is given more than W0 = 2 mJ" in shown

@@ -60,7 +60,7 @@ def printed():
 
 
 #: the most humans, generations, cells, points and pictures for commands whose output no page shows
-FEW = {"humans": 10, "generations": 2, "grid": 5, "points": 1, "fps": 1}
+FEW = {"humans": 4, "generations": 2, "grid": 5, "points": 1, "fps": 1}
 
 
 def shortened(command):
