@@ -4,11 +4,11 @@ A lossless chain of masses and springs takes no energy out, and can present any 
 loop is weakest. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above 3 kHz, errors of the matrix
 exponential would decide the verdict.
 
-The conditions assume that a device with unit damping dissipates |dx|^2 / T in a tick. It dissipates the integral of
-v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f, |dx|^2 / T is (sin a / a)^2
-times the integral, with a = pi f T. A condition therefore requires too much damping by about this factor at the
-frequency where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). No search has found an
-unstable human within this gap; most searches find one if the damping is below the gap.
+The conditions assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact it dissipates the
+integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f, |dx|^2 / T is
+(sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore requires too
+much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). No search has found an unstable human
+within this gap; most searches find one if the damping is below the gap.
 """
 
 from __future__ import annotations

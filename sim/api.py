@@ -131,13 +131,13 @@ def simulate(
         substeps: Steps per period. None is the default of the plant.
         seed: Seed of varying delays, periods and latencies.
         environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
-            [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes it
-            passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for any
-            environment, with psi = 0.
+            [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes the
+            function passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for
+            any environment, with psi = 0.
         energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the shell's (default 0, in a scene START_J).
             Otherwise it is the energy budget of the devices; None is no budget.
-        limiter: False to clip forces. By default the limiter that the coupling's guarantee covers limits them, if
-            there is one (`meta["assessment"]["force_limits"]`).
+        limiter: False to clip forces. By default a limiter limits them, if the coupling's guarantee covers a limiter
+            (`meta["assessment"]["force_limits"]`).
 
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],

@@ -3,7 +3,7 @@
 Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
 the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4
 integrator, which shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a
-fifth of RK4's cost, but RK4 under varying delays or ticks. The exact engine simulates all humans, MuJoCo all or a
+fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates all humans, MuJoCo all or a
 sample (`_witnessed`). Workers end when their parent ends.
 """
 
@@ -135,7 +135,7 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """The results for every set of humans, sorted by index; nan (counts: 0) without the engine or the trace.
+    """The results for every set of humans, sorted by index. Without engine or trace, figures are nan and counts 0.
 
     The energy W(N) is the work of the forces plus the least dissipation of the devices, up to tick N.
 
@@ -295,7 +295,7 @@ def _other_engine(
 ) -> tuple[_Other | None, Array | None]:
     """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
 
-    `frozen` are the force maps of the contact states. The map of a user's own engine is measured by every basis state.
+    `frozen` are the force maps of the contact states. A user's own engine steps every basis state once to give its map.
     """
     if not isinstance(validation.engine, str):
         drawn = crowd.mechanics or ((),) * len(crowd)
@@ -362,7 +362,7 @@ def _traced(
 ) -> ImpulseTest:
     """Return the exact engine's impulse test; growth, error and clipped ticks of `witnesses` are those of `other`.
 
-    Periods are constant, and forces latch in the middle of their range; `switched_crowd` tests varying ones.
+    Periods are constant, and forces latch in the middle of their range; `switched_crowd` varies both.
     """
     process, T = simulation.process, validation.scenario.T
     late, ticks = validation.scenario.usual_latency, validation.ticks

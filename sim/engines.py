@@ -524,7 +524,7 @@ def _product_of_each(steps: Array) -> Product:
 def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
     """Copy the scene's model for `substeps` steps of `integrator` in a period T.
 
-    Raises ValueError for impossible settings, as InputError if the scene excludes the integrator.
+    Raises ValueError for impossible settings (InputError if the scene excludes the integrator).
     """
     import mujoco
 

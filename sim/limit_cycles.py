@@ -64,8 +64,8 @@ class HeldDevices:
             population: The distribution of the humans.
             T: The period [s].
             seed: The seed of the draws.
-            humans: The number of sets of humans, one human per device.
-            links: The number of links of each human; None for that of the population.
+            humans: The number of humans, each of whom is a set of hands.
+            links: The number of links of each hand; None for that of the population.
             latency: The least and the largest latency (m,) of forces [s], of which the largest is used.
         """
         late = None if latency is None else tuple(most for _, most in latency)

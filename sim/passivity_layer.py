@@ -1,6 +1,6 @@
 """Passivity layers of a simulated controller: the energy budget, and the shell around a user's own environment.
 
-    traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
+    figures = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
 A net is such a layer. With a net, the linear block of a tick does not contain the delays Theta. The budget scales the
 forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces them by forces of the user's

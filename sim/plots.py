@@ -48,7 +48,7 @@ class Run(Protocol):
 
 #: titles of two conditions; every other condition has its name as its title
 TITLES = {"this-environment": "this environment", "any-environment": ANY}
-#: Okabe and Ito's palette, with a line style each
+#: Okabe and Ito's palette, with a line style for each colour
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#D55E00", "linestyle": "--"},
@@ -311,7 +311,7 @@ _ALIKE = 0.005  # curves that differ by less, relative to the largest value, loo
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return the end of each curve's label, (N, m) -> m texts: the name of an earlier curve that looks the same."""
+    """Return the end of the label of each curve in values (N, m): the name of an earlier equal curve, or ""."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -404,7 +404,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
     # The prediction is fitted to the last third of the amplitudes, where only the dominant mode is left.
-    # It is drawn 25 % higher, so that it does not hide them.
+    # The drawn curve is 25 % higher than the fit, so that it does not hide the amplitudes.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
@@ -599,7 +599,7 @@ def plot_singular_values(report: Comparison, path: Path) -> Path:
 
 
 def plot_required_damping(report: Comparison, path: Path) -> Path:
-    """Plot the damping that each condition requires at each frequency, the available one, and where it binds."""
+    """Plot the damping that each condition requires at each frequency, the available one, and where conditions bind."""
     title = "required damping over frequency; o: where it binds, ^: above the picture"
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))

@@ -398,7 +398,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
 
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
-        """Return the loop of the first device alone before a rigid wall. Raises ValueError.
+        """Return the loop of the first device alone before a rigid wall. Raises ValueError if psi is not 0.
 
         The wall of a device with several axes may face any direction, so the loop has the least damping of all
         directions.
@@ -649,7 +649,7 @@ def save_humans(
 
 
 def _is_rotary(text: str) -> bool:
-    """Return whether a file has unit = "rad", even if the file is refused for something else."""
+    """Return whether a file has unit = "rad", even if the file is refused for another reason."""
     try:
         return toml(text, "").get("unit") == "rad"
     except InputError:

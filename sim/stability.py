@@ -489,7 +489,7 @@ def impulse_test(
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
 ) -> ImpulseTest:
-    """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact closed loops.
+    """Simulate `ticks` periods with every set of humans after an impulse. `loops` are the exact closed loops.
 
     With walls the impulse is large enough to reach them, and the growth of the trace is not measured.
     """
@@ -511,8 +511,8 @@ def impulse_growth(
     """Return growth and clipping, (nsim,) each, after an impulse on every handle, for constant or varying timing.
 
     `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
-    the second: inf where numbers overflow, -inf at exact rest. Without force limits it does not depend on the size of
-    the impulse.
+    the second: inf where numbers overflow, -inf at exact rest. Without force limits the growth does not depend on the
+    size of the impulse.
     """
     T, quarter = process.F.T, ticks // 4
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)

@@ -7,8 +7,8 @@ that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
 [lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
 because a device holds its newest force. Candidates for the worst period are windows of this sequence that may be
-repeated, and constant delays at the ends of their ranges; the product of mode matrices over the worst one grows fastest
-per tick. A spectral radius above 1 proves instability.
+repeated, and constant delays at the ends of their ranges. Over the worst candidate the product of the mode matrices
+grows fastest per tick. A spectral radius above 1 proves instability.
 """
 
 from __future__ import annotations

@@ -302,7 +302,7 @@ class HandsInWorld:
 
     @property
     def excess_J(self) -> float:
-        """The energy given beyond W0 and the released energy; the guarantee bounds it by 0."""
+        """The energy given beyond W0 and the released energy; under a guarantee it is at most 0."""
         return self.figures.given_J - self.figures.start_J - self.figures.released_J
 
 
@@ -317,8 +317,8 @@ def thrown(
 ) -> list[HandsInWorld]:
     """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
 
-    In every second set all chains are lossless, without dampers; persons and measured hands keep theirs. `start` is W0
-    [J].
+    In every second set all chains are lossless, without dampers; persons and measured hands are unchanged. `start` is
+    W0 [J].
     """
     from haptic_loop.sim.crowds import Validation
 

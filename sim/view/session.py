@@ -314,7 +314,7 @@ class Frame:
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks in `history` in which some force is at its limit (controller.tick.at_limit)
     prepared: PreparedLoop
-    note: str  # the last event, that it is being prepared, why it was refused, or that the loop diverged
+    note: str  # the last event, with its state or the reason of its refusal, or a remark that the loop diverged
     overruns: int
     lost: float  # [s]
     factor: float  # simulated over real time

@@ -612,7 +612,7 @@ class _FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw range and mean of the felt force -f since the last frame, and the push; for several axes the mean."""
+        """Draw range and mean of the force -f since the last frame, and the push; for several axes only the mean."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
