@@ -177,7 +177,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-#: correcting spring that needs no finer search, and the largest one, relative to the mean gain
+#: size of a correcting spring at which the search ends, and the largest size, relative to the mean gain
 _ENOUGH, _MOST_LIFT = 1e-8, 1e-6
 
 
@@ -535,8 +535,8 @@ def environment(network: Network, T: Number) -> Lti:
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
     previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
-    dampers and masses. The block is added. The arithmetic is that of T. Raises ValueError if an internal node has no
-    mass and nothing holds it, or if the rounding of directions alone holds it.
+    dampers and masses. The network's block is added to E(z). The arithmetic is that of T. Raises ValueError if an
+    internal node has no mass and nothing holds it, or if the rounding of directions alone holds it.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
     key = parts, type(T), T  # the type of T decides the arithmetic
@@ -550,7 +550,7 @@ def environment(network: Network, T: Number) -> Lti:
     return E + network.block.at(T) if network.block else E
 
 
-#: E(z) without blocks of the networks seen last. A design asks for the same one about eighty times.
+#: E(z), without blocks, of the networks seen last. A design asks for the same E(z) about eighty times.
 _computed: dict[Any, Lti] = {}
 _MOST_COMPUTED = 32
 
