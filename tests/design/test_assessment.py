@@ -212,7 +212,7 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     assert safe_with(report()) == HERE
-    for elsewhere in (["--delta", "1.2"], ["--theta", "3,4"], ["--psi", "1"]):
+    for elsewhere in (["--delta", "1.2"], ["--psi", "1"]):
         there = report(*elsewhere)
         assert safe_with(there) is None
         assert not there["assessment"]["holds"]

@@ -143,7 +143,7 @@ def test_axes_of_a_late_device_share_multipliers():
     assert requirement(loop, SpringDamper(K, [0.3] * 2), "any-environment").certified
 
 
-@pytest.mark.parametrize("B", [0.62, pytest.param(0.85, marks=pytest.mark.validate), 0.899])
+@pytest.mark.parametrize("B", [*(pytest.param(B, marks=pytest.mark.validate) for B in (0.62, 0.85)), 0.899])
 def test_the_stiffest_gains_of_late_forces_are_certified(B):
     """For large B no K is certified although B < delta, and a K near 0 may need more damping than a larger one."""
     loop, coupling = wall(100, B, theta=1, delta=0.9)

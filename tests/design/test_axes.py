@@ -647,7 +647,7 @@ def test_designs_turn_with_the_axes(condition: str) -> None:
     assert prove(aslant, design.coupling, condition).proof == "rational"
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_optimal_couplings_take_full_levels() -> None:
     Q = np.zeros((4, 4))
     Q[:2, :2] = Q[2:, 2:] = TURN

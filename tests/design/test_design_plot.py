@@ -13,6 +13,7 @@ from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.compare import curves, grid, ideal, judge
 from haptic_loop.design.result import DesignFailed
+from haptic_loop.sim import plots
 from haptic_loop.sim.scenario import InputError
 
 T, DELTA = 1.2e-3, 1.37
@@ -128,7 +129,14 @@ def test_required_damping_is_perceived_with_the_hold():
 
 
 @pytest.mark.slow
-def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
+def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
+    save = plots.save
+
+    def small(figure, path, dpi=40):
+        figure.set_layout_engine("none")  # tests/sim/test_plots.py draws with the layout
+        return save(figure, path, dpi)
+
+    monkeypatch.setattr(plots, "save", small)
     out = tmp_path / "o"
     assert main(["--coupling", "none,published", "--out", str(out), "--json", "-"]) == 0
     stdout, stderr = capsys.readouterr()

@@ -48,6 +48,9 @@ def test_the_bound_is_above_and_close():
 def test_first_order_closed_form(pole):
     one = Lti([[pole]], [[1.0]], [[1 - pole]], [[0.5]], T)
     assert _l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
+
+
+def test_a_gain_that_decays_slowly_is_bounded():
     slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed, but still bounded
     assert 1e9 <= _l1_gain(slow)[0, 0] < np.inf
 

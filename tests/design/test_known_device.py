@@ -654,7 +654,9 @@ def test_a_spring_damper_on_known_devices_feels_stiffer():
     assert known.requirement.certified
     assert known.objective < 0.05 * plain.objective
     assert "this-environment" in known.notes[0]
-    assert verify(Stored.of(KNOWN, known.coupling, prove(KNOWN, known.coupling, "known-device"))).proved
+    assert verify(
+        Stored.of(KNOWN, known.coupling, prove(KNOWN, known.coupling, "known-device", swept=known.requirement))
+    ).proved
 
 
 def test_the_stiffest_spring_damper_for_any_environment():
@@ -771,7 +773,7 @@ def test_necessary_and_proved_damping_nearly_agree():
     assert left.required_damping[0] == pytest.approx(0.96269, rel=1e-4)
     assert left.known_device_damping[0] == pytest.approx(0.96294, rel=1e-4)
     other = change(KNOWN, known_devices=(DEVICE, change(DEVICE, motor_mass_min=0.1)))
-    assert not left_over(other, PUBLISHED["I"]).attained
+    assert not left_over(other, PUBLISHED["I"], required_damping(KNOWN, PUBLISHED["I"], "this-environment")).attained
     assert left_over(PAIR, PUBLISHED["I"]) is None
 
 

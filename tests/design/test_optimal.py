@@ -87,8 +87,8 @@ def dense() -> np.ndarray:
 
 #: loop, largest rms mismatch [dB] with the two smallest bases, least share of the static stiffness
 REACHED = [
-    *(("n0", -33.7, 0.99), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)),
-    pytest.param("n1", -12.6, 0.9, marks=pytest.mark.validate),
+    *(("n0", -33.7, 0.99), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5)),
+    *(pytest.param(*each, marks=pytest.mark.validate) for each in (("n1", -12.6, 0.9), ("n4", -22.9, 0.9))),
 ]
 
 
@@ -101,7 +101,9 @@ def test_figures_are_reached(name, most, stiffness):
     assert found.g >= stiffness
 
 
-@pytest.mark.parametrize("name", ["n0", "n2", "n3", "n4", pytest.param("o13", marks=pytest.mark.validate)])
+@pytest.mark.parametrize(
+    "name", ["n0", "n2", "n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n4", "o13"))]
+)
 def test_the_sweep_that_knows_no_solver_certifies_it(name):
     loop, found = loop_of(name), best(name)
     requirement = this_environment(force(loop, found.coupling), loop.delta)
@@ -127,7 +129,7 @@ def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
     np.testing.assert_array_equal(read.built().R, old.R)
 
 
-@pytest.mark.parametrize("name", ["n0", "n2", "n4"])
+@pytest.mark.parametrize("name", ["n0", "n2", pytest.param("n4", marks=pytest.mark.validate)])
 def test_static_stiffness_is_an_exact_share(name):
     """F(1) = g E(1) in fractions, also with other springs, so F(1) stays symmetric."""
     loop, coupling = loop_of(name), best(name).coupling
@@ -143,10 +145,10 @@ def test_static_stiffness_is_an_exact_share(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["n3", "n4", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "o12"))]
+    "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n4", "o12"))]
 )
 def test_the_bound_is_below_and_close(name):
-    limit = bound(loop_of(name), knots=16)
+    limit = short_bound(loop_of(name))
     assert limit.rms < best(name).figures.rms_mismatch
     assert best(name).figures.rms_mismatch_db - limit.rms_db < 4.0
 
@@ -164,7 +166,7 @@ def test_causal_parts_match_the_transform():
     np.testing.assert_allclose(_causal(grid, heights, w[at]), -np.fft.rfft(D, n=2**18)[:, at].T, atol=1e-5)
 
 
-@pytest.mark.parametrize("channels", [3, pytest.param(4, marks=pytest.mark.validate)])
+@pytest.mark.parametrize("channels", [2, *(pytest.param(n, marks=pytest.mark.validate) for n in (3, 4))])
 def test_parallel_walls_have_one_walls_bound(channels):
     """Parallel walls are separate problems, so their bound is that of one wall."""
     one, several = (bound(wall(3000.0, 3, 1.0, channels=n), knots=4) for n in (1, channels))
@@ -285,8 +287,8 @@ def random_loop(seed: int) -> Loop:
 @pytest.mark.parametrize(
     "seed",
     [
-        *range(2),
-        *(pytest.param(n, marks=pytest.mark.validate) for n in range(2, 12)),
+        1,
+        *(pytest.param(n, marks=pytest.mark.validate) for n in (0, *range(2, 12))),
     ],
 )
 def test_there_is_always_an_answer(seed):
@@ -476,7 +478,7 @@ def test_a_bound_says_what_it_does_not_know(monkeypatch):
 def test_the_rms_bound_bounds_the_supremum(monkeypatch):
     """|M|_F <= sqrt(m) |M| and |E|_F >= |E|, so rms <= sqrt(m) sup."""
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
-    for name in ("n0", "n2", "n4"):
+    for name in ("n0", "n2"):
         figures = best(name).figures
         assert figures.rms_mismatch <= np.sqrt(2) * figures.relative_mismatch
     found = BoundBeside.of(loop_of("n3"), best("n3"), -5.0, (0.5, 80.0), replace(SHORT, objective="sup"))

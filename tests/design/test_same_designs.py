@@ -3,9 +3,16 @@
 import os
 import subprocess
 import sys
+import time
 
+import msgspec
 import pytest
 from tools.same_designs import LOOPS, ROOT
+
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.optimal import design
+from haptic_loop.design.program import Options
+from haptic_loop.sim.scenario import load
 
 #: a clock that runs ten thousand times as fast: a search that it ended would end at once
 HURRIED = """
@@ -19,7 +26,27 @@ door("design")
 """
 
 
-@pytest.mark.slow
+def hurried(clock):
+    return lambda: 1e4 * clock()
+
+
+def test_a_racing_clock_changes_no_byte(monkeypatch):
+    """Two bases are designed in this process by the clock as it is, and by one that races."""
+    loop = load(LOOPS / "o01-wall-light-device.toml").loop("I")
+
+    def stored():
+        made = design(loop, Options(bases=((4, 3), (8, 6))))
+        return len(made.bases), msgspec.json.encode(Stored.of(loop, made.coupling, made.certificate))
+
+    plain = stored()
+    with monkeypatch.context() as racing:
+        for name in ("monotonic", "perf_counter", "process_time", "thread_time", "time"):
+            racing.setattr(time, name, hurried(getattr(time, name)))
+        assert stored() == plain
+    assert plain[0] == 2
+
+
+@pytest.mark.validate
 def test_clock_and_cores_change_no_byte(tmp_path):
     """One design as it is, one on a single core by a clock that races. `make kernels` has six, under load."""
     words = ["--scenario", str(LOOPS / "o01-wall-light-device.toml"), "--coupling", "optimal"]

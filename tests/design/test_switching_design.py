@@ -113,12 +113,12 @@ def one_known_device():
     return load("one-wall").replace(device=load("omega-pair-known").device[:1], environment=object_)
 
 
+@pytest.mark.validate
 @pytest.mark.parametrize(
     ("scenario", "basis", "most_db"),
     [
-        pytest.param(one_known_device(), (3, 2), -70.0, marks=pytest.mark.slow),
-        # found: -29.3 dB over this basis
-        pytest.param(load("omega-pair-known"), (4, 3), -29.0, marks=pytest.mark.validate),
+        (one_known_device(), (3, 2), -70.0),
+        (load("omega-pair-known"), (4, 3), -29.0),  # found: -29.3 dB over this basis
     ],
 )
 def test_optimal_couplings_of_known_devices_take_switching(scenario, basis, most_db):
