@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def wait_silently(patch=setattr) -> None:
-    """Keep a command from saying what it waits for: on a slow machine it would say so at any time."""
+    """Keep a command from saying what it waits for, which would depend on the speed of the machine."""
     from haptic_loop.cli import render
 
     patch(render, "_SILENCE", 1e6)
@@ -76,7 +76,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 
 def draw_once(folder: Path) -> None:
-    """Draw each command's picture of a name only once, and an empty one afterwards: drawing takes most of a second."""
+    """Draw a picture with this name and command once, then an empty one: drawing takes most of a second."""
     from matplotlib.figure import Figure
 
     from haptic_loop.sim import plots
@@ -171,7 +171,7 @@ def run(command: str | list[str], folder: Path, **environment: str) -> subproces
 
 
 def begin(module: str, *options: str, out: Path, err: Path) -> int:
-    """Begin `python -m MODULE ...` in a new session that writes to these files, and return its process id."""
+    """Begin `python -m MODULE ...` in a new session of processes, which writes to `out` and `err`; return its id."""
     return _asked_for(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
 
 

@@ -2,7 +2,7 @@
 
 Changed tests come first. A file of a package is tested by the files under tests/ named like it or its folder, else by
 those that import it, else by the folder of its package. Files with few tests come first: `make check` ends after a
-minute. Changed are the files that differ from HEAD or, if there are none, those of the last commit.
+minute. Changed files are those that differ from HEAD or are untracked or, if there are none, those of the last commit.
 """
 
 import re

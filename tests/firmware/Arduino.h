@@ -1,4 +1,4 @@
-/* As much of the Arduino interface as hw/firmware/example.ino uses; stub.cpp is behind it. */
+/* The part of the Arduino interface that hw/firmware/example.ino uses; stub.cpp implements it. */
 #pragma once
 #include <stddef.h>
 #include <stdint.h>

@@ -1,6 +1,6 @@
 /* The calls of Force Dimension's library that hw/force_dimension.py makes, by the public prototypes of dhdc.h.
 
-   Two devices with the serial numbers 4711 and 4712, which stand still. The test writes every other symbol that the
+   Its two devices, with the serial numbers 4711 and 4712, stand still. The test writes every other symbol that the
    binding looks up into a second file, as a call that fails. */
 #include <string.h>
 
@@ -31,7 +31,7 @@ int dhdSetForce(double x, double y, double z, signed char ID) {
     forces[(int)ID][0] = x, forces[(int)ID][1] = y, forces[(int)ID][2] = z;
     return 0;
 }
-/* what the test asks and orders */
+/* Calls with which the test sets the status and reads forces, limits and watchdogs. */
 void stub_status(int ID, int index, int value) { status[ID][index] = value; }
 double stub_force(int ID, int axis) { return forces[ID][axis]; }
 double stub_limit(int ID) { return limits[ID]; }

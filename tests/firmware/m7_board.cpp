@@ -58,7 +58,7 @@ void interrupts() {}
 uint8_t digitalPinToInterrupt(uint8_t pin) { return pin; }
 void attachInterrupt(uint8_t pin, void (*handler)(), int) { handlers[pin] = handler; }
 
-/* An edge of channel A, which the sketch counts up where both channels are equal then. */
+/* Each edge of channel A changes the sketch's count by one: up if both channels are equal after the edge, else down. */
 static void move(int axis, int target)
 {
     int a = axis ? 4 : 2, b = a + 1;

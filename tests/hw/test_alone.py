@@ -217,7 +217,7 @@ def test_limits_that_limit_nothing_are_not_armed(board, limit, value):
 
 
 def test_separate_presses_of_a_still_handle_never_add(board):
-    """The force ramps out after 0.5 s without a motion under a force; a pause without a force ends this time."""
+    """The force ramps out after 0.5 s of force without a motion; after a pause without force this time begins anew."""
     bench = Bench(board)
     assert bench.armed() == (RUNNING, 0)
     for force, ticks in [(2.0, 400), (0.0, 10)] * 4:

@@ -51,7 +51,7 @@ def rehearsal_of(scenario, alone, made, clock=1.0, faults=((), ()), begin_us=300
 
 
 def watched(emulator):
-    """Record count and force of every tick of an emulated board by the board's tick number."""
+    """Return {tick number of the board: (count, force in steps)}, which fills at every tick of the emulated board."""
     ticks, tick = {}, emulator.device.tick
 
     def noted(now, counts):

@@ -195,7 +195,7 @@ def test_theta_zero_forces_act_on_arrival():
         after = 25 * k
         carried = rig.device.applied
         rig.answer((10 * k, -10 * k), after=after - 1)
-        rig.answer((7, 7), after=after)  # the first one counts
+        rig.answer((7, 7), after=after)  # the first FORCE counts
         assert carried == (10 * (k - 1), -10 * (k - 1))
         assert rig.device.applied == (10 * k, -10 * k)  # before the next tick
         rig.tick()
@@ -353,7 +353,7 @@ def test_stops_ramp_down_and_keep_their_cause(cause):
 
 def test_a_stop_before_arming_needs_no_ramp():
     rig = Rig()
-    rig.say(Stop(200))  # a reason nobody knows stops all the same
+    rig.say(Stop(200))  # an unknown reason stops the device, too
     rig.tick()
     assert rig.at == (Phase.STOPPED, Cause.HOST)
     rig = Rig(config=None)

@@ -226,7 +226,7 @@ def test_emergency_stops_repeat_until_latched(scenario, rungs):
 @pytest.mark.parametrize("configuring", [False, True])
 @pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
 def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
-    """STOP answers a force without arming, whatever the status; 50 ms of it after CONFIG stop the session."""
+    """STOP answers a force without arming, whatever the status. After CONFIG, such a force soon stops the session."""
     session, port = Session(scenario, SafetyLimits((12.0, 12.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
@@ -245,7 +245,7 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
 
 
 def test_fake_device_clocks_are_found(scenario, rungs):
-    """The device's clock reports T while STATEs come every 2 T: after 20 of them, 10 % of 200 ticks are behind."""
+    """The device's clock reports T while STATEs come every 2 T: 20 STATEs differ by 20 T, 10 % of a block."""
     session, send = hand_driven(scenario, rungs)
     assert session.link.last
     begun = session.link.last.t_us
@@ -337,7 +337,7 @@ def test_lost_answers_have_no_age():
 
 
 def measured(scenario, faults, needed, seed=0):
-    """Measure a link in virtual time. Return the session, the true ages [us] of all answers, and those of a round 2."""
+    """Measure a link in virtual time. Return session, true ages [us] of all answers, and those of round 2 or None."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=needed))
     emulator, true, exact = Emulator(scenario, faults), [], None
     accept = emulator.device.accept
@@ -364,7 +364,7 @@ BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T
 @pytest.mark.parametrize("where", ["down", "both"])
 @pytest.mark.parametrize(("T", "every"), BURSTS)
 def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
-    """The measured delay is at least the greatest age that the emulator noted, and at most one tick longer."""
+    """The measured delay in ticks covers the greatest age that the emulator noted, with at most one tick more."""
     direction = "" if where == "both" else f"{where}:"
     session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 400)
     ages = session.measurement.result
@@ -440,7 +440,7 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
 
 
 def test_estops_repeat_until_acknowledged(scenario):
-    """The first STOP may be lost, and the STATEs that would show it too."""
+    """The first STOP may be lost, and so may the STATEs that would show the loss."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)))
     session.start(0)
     stop = (Stop(Reason.ESTOP),)

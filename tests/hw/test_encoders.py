@@ -1,4 +1,4 @@
-"""Find encoders that do not follow, on every axis, at arming and under force; do not stop a hand that holds still."""
+"""Encoders that do not follow are found on every axis, at arming and under force; a hand that holds still is not."""
 
 from pathlib import Path
 from runpy import run_path
@@ -28,7 +28,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
     faults = tuple(map(FaultInjection.parse, faults))
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, **settings))
     emulator = Emulator(scenario, faults)
-    if place is not None:  # where the handles are before anything begins
+    if place is not None:  # the handles are there when the session begins
         emulator.plant.s[: emulator.plant.scene.model.nq] = place
     actions = [(stop, lambda session, now: session.stop("asked to", now))] if stop else []
     rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, actions=actions)
@@ -56,7 +56,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
 @pytest.mark.parametrize(("step", "most"), [(1e-6, 0.17), (1e-5, 0.17), (1e-4, 0.65)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
-    """Encoders of 1 to 100 um answer a force of at most `most` [N], held by the scenario's hands or free."""
+    """Encoders with counts of 1 to 100 um answer a force of at most `most` [N], with hands on the handles or not."""
     still = scenario if held else nobody(scenario)
     forces = []
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))
@@ -68,7 +68,7 @@ def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
 
 
 def played(test, motion, ticks=6000):
-    """Run a test on encoders of counts `motion`(k, applied so far); return the requested forces (ticks, m) [N]."""
+    """Run a test on encoders that read `motion`(k, steps applied so far); return its forces (ticks, m) [N]."""
     forces, applied = [], np.zeros((ticks, 2), int)
     for k in range(ticks):
         counts = motion(k, applied[:k])
@@ -81,7 +81,7 @@ def played(test, motion, ticks=6000):
 
 
 def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6, motor=lambda force: force):
-    """Return a `motion` of two free masses: forces are summed twice, independently of the model in the test."""
+    """Return a `motion` of two free masses: it sums forces twice, independently of the model of EncoderTest."""
 
     def motion(k, applied):
         v = np.cumsum(motor(applied * STEP) / mass * T, axis=0)
@@ -169,7 +169,7 @@ def test_motions_off_by_two_are_refused(scale, refused):
 
 
 def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
-    """Return a `motion` of two free masses with dry friction [N] that sticks: each tick, friction stops or brakes.
+    """Return a `motion` of two free masses with dry friction [N], which slows or stops a mass in each tick.
 
     Their weight adds a force `bias` [N].
     """
@@ -187,7 +187,7 @@ def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
 
 @pytest.mark.parametrize(("friction", "closing"), [(0.17, False), (0.34, False), (0.34, True)])
 def test_stronger_forces_overcome_dry_friction(friction, closing):
-    """A friction of 68 % of a test force leaves 0.4 of its motion, which is no wrong mass."""
+    """A friction of 68 % of a test force leaves 0.4 of the motion, and is not taken for a wrong mass."""
     played(arming_test(closing=closing), rubbing(friction))
 
 
@@ -235,7 +235,8 @@ def later(motion, ticks):
 def test_coarse_counts_are_no_hidden_delay(q):
     """At 1 N the free mass swings by 9 counts of 0.1 mm, whose rounding shifts its delay by at most 0.72 ticks.
 
-    That is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks; coarser ones are named instead.
+    This shift is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks; for coarser counts the test
+    remarks that it does not test the delay.
     """
     test = arming_test(q=q)
     played(test, masses(q=q))
@@ -291,9 +292,9 @@ def test_wrong_scales_are_found_under_hands(scenario, rungs, axis, scale):
 
 
 def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
-    """Run a session: a `hand` (mass, damping, stiffness) takes both handles at 0.7 s, a person ends it at 0.9 s.
+    """Run a session that a person ends at 0.9 s.
 
-    The hand lets go at `lets_go` [s].
+    A `hand` (mass, damping, stiffness) takes both handles at 0.7 s and lets go at `lets_go` [s].
     """
     hands = Human((Link(*hand),))
     still, faults = nobody(scenario), tuple(FaultInjection.parse(text) for text in faults)
@@ -314,7 +315,7 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
 
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
 def test_handles_that_are_let_go_finish(scenario, rungs, hand):
-    """A hand is asked to let go, and is not taken for a wrong scale. One of 0.25 kg at most halves the motion."""
+    """A hand is asked to let go, and is not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
     session = ended_live(scenario, rungs, hand, lets_go=2.5)
     assert session.stage == Stage.FINISHED, session.cause
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
@@ -334,7 +335,7 @@ WRONG = ["motor=-1", "motor=0.3", "motor=3", "scale=0.3", "reverse", "late=2", "
 
 @pytest.mark.parametrize("fault", WRONG)
 def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
-    """A firm hand hides a fault after full gain until it lets go."""
+    """A firm hand hides a fault that begins at full gain, until the hand lets go."""
     session = ended_live(scenario, rungs, (0.5, 20.0, 1500.0), f"{fault}@0.8", lets_go=1.5)
     assert session.stage == Stage.STOPPED, session.cause
     assert "a hand held it" not in session.cause
@@ -442,7 +443,7 @@ def test_coarse_counts_hide_a_calm_tremor(count, dead):
 
 @pytest.mark.parametrize("cap", [0.3, 0.4])
 def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
-    """After its test an axis rests within counts of 0.1 mm, although the force has changed by the cap."""
+    """After its test an axis shows no motion in counts of 0.1 mm, although the force has changed by the cap."""
     free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
     session = Session(free, SafetyLimits((cap, cap)), LinkSettings(measure=60, held=False))
     stop = (2.0, lambda session, now: session.stop("asked to", now))
@@ -452,7 +453,7 @@ def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
 
 @pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
 def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
-    """Whichever way people begin, the axis with the dead encoder is named within 0.5 s."""
+    """Whichever way people begin, the axis with the dead encoder is named, within 0.7 s of the log's previous entry."""
     turned = tuple(
         replace(h, voluntary=replace(h.voluntary, phase=h.voluntary.phase + np.pi * (sign < 0))) for h in scenario.human
     )
@@ -473,7 +474,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_the_impulse_decides(axis, sign, newton, after):
-    """An impulse of 0.1 N s since the last motion stops: 1 N for 100 ms, 5 N for 20 ms. Less than 1 N never does."""
+    """An impulse of 0.1 N s since the last motion raises SafetyStop: 1 N for 100 ms or 5 N for 20 ms, never 0.95 N."""
     monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
@@ -497,7 +498,7 @@ def test_motions_below_two_counts_test_nothing():
 
 
 def test_forces_that_return_stop_nothing():
-    """The allowed 8 sqrt(q M F) is 0.028 N s for 0.1 mm, 2.5 kg and 0.05 N; 0.3 s of this force are 0.015 N s."""
+    """The allowed impulse 8 sqrt(q M F) is 0.028 N s for 0.1 mm, 2.5 kg and 0.05 N; 0.3 s of 0.05 N are 0.015 N s."""
     monitor = monitor_of(1e-4, 1e-5, cap=(0.05,))
     for force in (0.05, 0.0):
         for _ in range(round(0.3 / T)):
@@ -505,7 +506,7 @@ def test_forces_that_return_stop_nothing():
 
 
 def test_coarse_encoders_get_more_time():
-    """The allowed 8 sqrt(q M F) is 0.283 N s for 0.1 mm, 2.5 kg and 5 N, which lasts 57 ms or 48 ticks."""
+    """The allowed impulse 8 sqrt(q M F) is 0.283 N s for 0.1 mm, 2.5 kg and 5 N: 57 ms or 48 ticks of 5 N."""
     monitor = monitor_of(1e-4)
     monitor.check((0,), (0,), 1)
 
@@ -525,7 +526,7 @@ def test_a_motion_of_two_counts_begins_anew():
 
 
 def test_no_still_hold_is_stopped():
-    """The test draws 300 holds; tests/benchmarks/still_holds.py draws 10,000."""
+    """This test draws 300 hands that hold still; tests/benchmarks/still_holds.py draws 10,000."""
     still_holds = run_path(str(Path(__file__).parent.parent / "benchmarks/still_holds.py"))["still_holds"]
     assert still_holds(300, seed=1)[0] == 0
 
@@ -535,7 +536,7 @@ def test_no_still_hold_is_stopped():
 
 @pytest.mark.parametrize("place", [0.03, -0.03])
 def test_handles_off_centre_are_left_in_peace(scenario, rungs, place):
-    """Free handles at 30 mm feel less than 0.5 N if positions count from there, more than 3 N if from the middle."""
+    """Free handles at 30 mm feel less than 0.5 N if positions count from there; counted from the middle, over 3 N."""
     still = nobody(scenario)
     session, rehearsal = session_with(still, rungs, place=place, seconds=0.6, held=False)
     assert session.stage == Stage.ARMED

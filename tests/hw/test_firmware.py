@@ -109,7 +109,7 @@ class Firmware:
 
 
 class Traffic:
-    """Random events between a device's ticks, from a seed: those of a host with lapses and a line with faults."""
+    """Draw random events between a device's ticks from a seed: a host that errs, and a line with faults."""
 
     def __init__(self, seed: int, device: Device) -> None:
         self.rng, self.hand, self.device = random.Random(seed), random.Random(~seed), device
@@ -215,7 +215,10 @@ def mutated(rng: random.Random, frame: bytes) -> bytes:
 
 
 def episode(seed: int, ticks: int, silent: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
-    """Play traffic to the Python device. Return info, operations, answers to ticks ("T", now, counts) and states."""
+    """Play traffic to the Python device. Return info, operations, answers to the ticks, and the phases and causes seen.
+
+    The operations are those of `between_ticks` and the ticks themselves, ("T", now, counts).
+    """
     rng = random.Random(seed)
     about = info(rng.randint(1, 8), rng.choice((100_000, 333_333, 1_200_000, 1_200_000, 2_000_001)))
     device, now, period = Device(about), rng.choice((0, 2**32 - 50_000)), about.period_ns // 1000
@@ -255,7 +258,7 @@ def described(answer) -> str:
 
 
 EPISODES = [(seed, 400, 0) for seed in range(int(os.environ.get("HAPTIC_FUZZ_EPISODES", "50")))]
-EPISODES.append((1_000_000, 1500, 64_800))  # crosses tick 65535
+EPISODES.append((1_000_000, 1500, 64_800))  # this episode crosses tick 65535
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +364,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 @needs_gcc
 def test_the_headers_need_no_library_or_heap(tmp_path):
-    """The headers include only standard C99 headers, and the object file's undefined symbols show what it calls."""
+    """The headers include standard C99 headers only; the compiled harness calls memcpy, memset and strncpy only."""
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
         '#include "haptic_frame.h"',
@@ -471,7 +474,7 @@ def test_the_sketch_counts_edges_and_obeys_its_button(sketch):
     sketch.lib.stub_set_pin(SKETCH_PINS["stop"], 0)
     (state,) = sketch.run(1200)
     assert (state.phase, state.deadman) == (Phase.ESTOP, True)
-    sketch.lib.stub_set_pin(SKETCH_PINS["deadman"], 1)  # let go, or the wire is broken
+    sketch.lib.stub_set_pin(SKETCH_PINS["deadman"], 1)  # the button is released, or its wire is broken
     (state,) = sketch.run(1200)
     assert not state.deadman
 
@@ -483,7 +486,7 @@ def test_the_sketch_never_waits_for_the_host(sketch):
     sketch.lib.stub_room(0)
     assert sketch.run(12_000) == []
     sketch.lib.stub_room(1000)
-    assert [state.tick for state in sketch.run(1200)] == [11, 12]  # the newest that waited, and the next one
+    assert [state.tick for state in sketch.run(1200)] == [11, 12]  # the newest STATE that waited, and the next one
     sketch.now += 100_000  # the board was held up for 83 periods
     (state,) = sketch.run(1200)
     assert (state.tick, state.phase, state.cause) == (13, Phase.STOPPED, Cause.DEVICE)
@@ -565,7 +568,7 @@ def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
         device.tick()
         forces.append(device.force)
     assert forces[-3 if ramp > 1 else -4] != (0, 0)
-    assert forces.index((0, 0)) == due + hold + ramp - 1  # the tick (due + hold + ramp) T after the last STATE answered
+    assert forces.index((0, 0)) == due + hold + ramp - 1  # (due + hold + ramp) T after the last answered STATE
     assert forces[due + hold - 1] == (1000, -1000)
 
 
@@ -586,7 +589,7 @@ def test_emergency_stops_replace_earlier_causes(device):
     device.armed()
     device.tell(Stop(0))
     device.device.fault()
-    assert device.state().cause == Cause.HOST  # the first one stays
+    assert device.state().cause == Cause.HOST  # the first cause stays
     device.tell(Stop(Reason.ESTOP))
     state = device.state()
     assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_HOST)
@@ -595,7 +598,10 @@ def test_emergency_stops_replace_earlier_causes(device):
 
 
 def test_late_double_and_mistimed_forces_are_counted(device):
-    """A late FORCE sets only echo and a negative margin; a double one or a wrong theta nothing. None is an error."""
+    """A late FORCE sets only echo and a negative margin; a second one for a tick, or one with a wrong theta, nothing.
+
+    None of them counts as a CRC error.
+    """
     device.armed(theta=2)
     before = device.state()
     k = device.k
@@ -609,7 +615,7 @@ def test_late_double_and_mistimed_forces_are_counted(device):
     device.tell(Force(2, shifted(k, 2), k, (600, 0)), after=200)
     device.tell(Force(2, shifted(k, 1), k, (700, 0)), after=300)
     state = device.state()
-    assert (state.echo, state.margin_us) == (k, 2300)  # those of the first FORCE
+    assert (state.echo, state.margin_us) == (k, 2300)  # echo and margin of the first FORCE
     assert device.state().applied == (500, 0)
     assert state.crc_errors == before.crc_errors
 

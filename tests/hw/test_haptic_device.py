@@ -38,7 +38,7 @@ def scenario():
 
 
 class StandIn:
-    """The calls of forcedimension_core.dhd over the scenario's devices and hands, in its own time.
+    """The calls of forcedimension_core.dhd over the scenario's devices and hands, with a virtual clock.
 
     The plant is integrated exactly between any two calls, so that a force acts from the instant it is written.
     """
@@ -156,7 +156,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     """The session has handshake, delay, certificate, forces, ramp and replay, as over the serial link."""
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still during arming
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # no push during arming
     session, recorder, (made,) = held_session(scenario, sdk)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     assert session.info.firmware == "omega.3"
@@ -198,7 +198,7 @@ def test_certificates_say_that_the_host_clocks(scenario):
 
 
 def test_host_clocks_charge_microseconds_not_ticks(scenario):
-    """The same coupling needs less damping 0.13 ms after a sample than a tick after it."""
+    """A coupling needs less damping if its forces act 0.13 ms after a sample than if they act a tick after it."""
     judged, link = timed(scenario.replace(theta=(0, 1)), Ages((50,) * 50 + (130,) * 50), 1.0, 0.0, at_once=True)
     assert judged.latency[1] == pytest.approx((50e-6, 130e-6))
     assert link == 0
@@ -209,7 +209,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     constant = certified_coupling(judged.replace(latency=((130e-6, 130e-6),) * 2), "I", None, None, 0, given)
     latest, ranged = (
         max(one.assessment.requirements["this-environment"].required) for one in (constant, host)
-    )  # a range needs at least what its latest end needs, but less than both longest parts of a period: 0.637433
+    )  # a range needs at least what its latest end needs, but less than a period whose two parts are longest: 0.637433
     assert latest - 1e-6 <= ranged < 0.637433
     assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 
@@ -278,7 +278,7 @@ def test_saturated_motors_are_device_faults(scenario):
 
 def test_the_emergency_stop_is_at_once(scenario):
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still during arming
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # no push during arming
     held = []
 
     def watch(session):
@@ -418,7 +418,7 @@ def test_the_serial_link_has_the_same_four_calls():
     assert (state.phase, state.applied) == (Phase.ARMED, (70, -80))
     device.stop(Reason.DONE)
     assert device.exchange(None).phase == Phase.RAMP
-    answers = [device.configure(config) for _ in range(200)]  # the running device refuses; asked again each 0.1 s
+    answers = [device.configure(config) for _ in range(200)]  # None until the ramp is over; CONFIG repeats each 0.1 s
     assert set(answers[: answers.index(Refused.ACCEPTED)]) == {None}
     line.gone = True
     with pytest.raises(PortLost, match="hung up"):

@@ -34,7 +34,7 @@ STEP = 5e-6  # [m] half of an Omega's encoder step of 0.01 mm
 
 
 def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
-    """Record a chirp of 1 N and a release through the whole link."""
+    """Record a chirp of 1 N and the motion after it over the emulated link; return recorder and session."""
     recorder = Recorder(scenario.channels)
     session = Session(
         scenario.replace(delta=(1e-6,) * scenario.channels),
@@ -109,7 +109,7 @@ def test_dry_friction_is_told_from_viscous():
 
 
 def test_a_knob_is_identified_in_radians():
-    """A knob of 100 g cm2 has 0.2 mN m s/rad and 0.1 mN m of dry friction, and a hand holds it at 20 mm."""
+    """A knob of 100 g cm2 has viscous friction of 0.2 mN m s/rad and dry friction of 0.1 mN m; its lever is 20 mm."""
     T, lever, count = 1.2e-3, 0.02, 1e-4
     force = chirp(1, T, 1, 0.2 * lever, (3.0, 60.0), 1.5).signal[:, 0]
     at_hand = played(force / lever, T, 1e-5 / lever**2, 2e-4 / lever**2, 1e-4 / lever, substeps=16)
@@ -215,14 +215,14 @@ class _Made(dict):
 
 @pytest.fixture(scope="module")
 def odd(records):
-    """Return the estimated friction of a rig by its name."""
+    """Return {name of a rig: estimated friction}."""
     rigs, signal, bench = records
     return _Made(lambda name: friction(rigs[name][1], signal, bench["T"], rigs[name][0].step))
 
 
 @pytest.fixture(scope="module")
 def judged(records):
-    """Return the command's friction of a rig by its name, or why there is none."""
+    """Return {name of a rig: friction that the command reports, or the reason why it reports none}."""
     rigs, signal, bench = records
     return _Made(lambda name: bench["judged"](*rigs[name], signal)[0])
 
@@ -230,7 +230,7 @@ def judged(records):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(NOT_VISCOUS))
 def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
-    """Neither truth nor bound includes dry friction: friction that bends with speed is viscous at no level."""
+    """Neither truth nor bound includes dry friction, also where it depends on speed."""
     found, least = judged[name], NOT_VISCOUS[name][1]
     if isinstance(found, str):
         assert re.search("energy of a stroke does not grow|damping falls with frequency", found)
@@ -275,7 +275,7 @@ def test_the_swing_reaches_its_speed_within_its_travel():
 
 @pytest.mark.parametrize("name", _marked(HANDS))
 def test_hands_on_the_handle_are_detected(judged, name):
-    """A hand's damping, 0.1 to 3 N s/m, is not the device's. The hand's spring reveals it."""
+    """A hand's damping, 0.1 to 3 N s/m, is not the device's. The hand's spring reveals the hand."""
     assert re.search(r"handle is sprung by .* does a hand or a finger rest on it", judged[name])
 
 
@@ -422,7 +422,7 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("viscous", "suspicious"), [(1.37, False), (1.49, False), (1.52, True)])
 def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
-    """A damping hand looks like the device. Only damping of 10 % above the declared 1.37 N s/m reveals it."""
+    """A hand's damping looks like the device's. Only a sum over 10 % above the declared 1.37 N s/m reveals it."""
     scenario = load()
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
     estimate = SimpleNamespace(viscous=viscous)
@@ -441,9 +441,9 @@ def coarse():
 
 
 def test_bounds_hold_wherever_the_encoder_stands(coarse):
-    """For five origins within a step, bounds are below the truth by at most 2 %.
+    """For five origins of the encoder within a step, bounds are below the truth by at most 2 %.
 
-    With the standstill as 1000 samples, half of them were above.
+    When the fit counted the standstill as 1000 samples, half of the bounds were above the truth.
     """
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):

@@ -123,7 +123,7 @@ def test_limits_cannot_be_loosened(field, least, most):
 
 
 def test_devices_are_sent_limited_forces():
-    """The host sends 0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN, 4 ticks of hold and 5 to zero."""
+    """CONFIG has 0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN, a hold of 4 ticks and a ramp of 5."""
     config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
     assert (config.cap, config.slew) == ((30_000, 7500), (6000, 6000))
@@ -260,7 +260,7 @@ def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
 
 
 def test_force_steps_obey_the_slew_limit():
-    """Otherwise the smallest change of force, one step, would exceed the slew limit."""
+    """A step that exceeds the slew limit in a tick is refused: no change of force could be smaller."""
     slow = SafetyLimits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
     assert slow.objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), None) == []
     (reason,) = slow.objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), None)
@@ -269,7 +269,7 @@ def test_force_steps_obey_the_slew_limit():
 
 def test_shaking_encoders_are_found():
     limits = SafetyLimits((12.0,))
-    limits.check_jolt((2e-3,), (0.0,), (0.0,))  # 2 mm is no jump either
+    limits.check_jolt((2e-3,), (0.0,), (0.0,))  # a change of 2 mm is allowed
     limits.check_jolt((4e-3,), (2e-3,), (0.0,))  # at constant speed
     with pytest.raises(SafetyStop, match=r"encoder 1 shakes: its speed changed by 5\.8 mm in a tick, allowed are 3 mm"):
         limits.check_jolt((2.9e-3,), (0.0,), (2.9e-3,))
@@ -331,7 +331,10 @@ def test_invalid_forces_are_found_on_both_channels(channel, value):
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
 def test_motor_heat_grows_with_squared_force(channel, sign):
-    """At twice its continuous force a motor is hot after tau ln(4/3), at 0.99 of it never. Missed ticks count."""
+    """At twice its continuous force a motor is hot after tau ln(4/3), at 0.99 times that force never.
+
+    Missed ticks heat the motor, too.
+    """
     limits = SafetyLimits((12.0, 12.0), continuous=(2.0, 2.0), thermal=5.0)
     heat, ticks = Heat(limits, T), 0
     for _ in range(20_000):

@@ -39,7 +39,7 @@ names = [type(m).__name__ for m in EVERY]
 
 
 def crc_bitwise(data: bytes) -> int:
-    """CRC-32 from its definition: reflected polynomial 0xEDB88320, all ones before and inverted after."""
+    """Return CRC-32 by its definition: reflected polynomial 0xEDB88320, initial value all ones, inverted at the end."""
     crc = 0xFFFFFFFF
     for byte in data:
         crc ^= byte
@@ -198,7 +198,10 @@ def test_the_pieces_do_not_matter(sent, rng):
 
 
 def test_one_and_two_bit_errors_are_detected():
-    """None of the 248 single and 30628 double bit flips of a STATE frame gives a message, though COBS spreads them."""
+    """None of the 248 single and 30628 double bit flips of a STATE frame gives a message.
+
+    This needs a test since COBS can spread a flipped bit over more bytes.
+    """
     frame = encode(STATE)
     bits = range(8 * (len(frame) - 1))
     whole = int.from_bytes(frame[:-1], "little")
@@ -244,7 +247,7 @@ def test_unknown_types_and_lengths_are_malformed(payload):
 
 
 def test_a_status_without_a_name_is_malformed():
-    """This keeps State.phase and State.cause from failing on a decoded STATE."""
+    """The phase and the cause of every decoded STATE have a name, so State.phase and State.cause never fail."""
     for status in range(256):
         got = Decoder().feed(encode(STATE._replace(status=status)))
         if got:
@@ -295,7 +298,10 @@ def test_a_million_random_bytes_move_no_motor():
 
 
 def mutations(rng: random.Random, frame: bytes):
-    """Yield copies of a frame without delimiter with wrong bits or bytes, holes, insertions, cuts or swapped halves."""
+    """Yield damaged copies of a frame, which has no delimiter; the copies have one.
+
+    Copies have wrong bits or bytes, holes, insertions, cuts or swapped halves.
+    """
     while True:
         data = bytearray(frame)
         for _ in range(rng.choice((1, 1, 2, 5))):

@@ -193,7 +193,7 @@ def test_damaged_traces_are_one_line(trace, tmp_path):
 def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
     """Steady ticks end at the first force that the cap or the slew rate changed, as the counters saw it.
 
-    They agree to two ticks, since a force that is cut by less than a step is sent unchanged.
+    Both agree to two ticks, since a force that is cut by less than a step is sent unchanged.
     """
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((cap, cap), slew), FAST)

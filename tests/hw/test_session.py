@@ -65,7 +65,7 @@ def test_faults_of_two_axes_have_two(kind):
 
 
 def one_of_each_kind():
-    """Return one case of each group that differs by numbers alone, and vary its place in the group."""
+    """Return one case of each group whose cases differ only by numbers; its place in the group varies."""
     kinds = {}
     for case in CASES:
         kinds.setdefault((re.sub(r"-|\b([\d.]+|inf|nan)\b", "", case.name), case.stage), []).append(case)
@@ -94,7 +94,7 @@ def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
 
 
 def test_free_handles_arm_in_the_table(scenario, rungs):
-    """The table's speeds of free handles are those of sessions that nobody holds."""
+    """A session whose faulty device nobody holds arms, so the table's speeds of free handles mean something."""
     session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 
@@ -226,7 +226,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
 
 
 def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
-    """The session equals a separate loop: held plant, rounded encoders, F with the whole delay, rounded forces."""
+    """The session equals a separate loop: plant with held forces, rounded encoders, F with delays, rounded forces."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(1.5)
@@ -329,7 +329,10 @@ def optimal_rungs(scenario):
 
 
 def assert_in_reserve(rungs):
-    """Check that each reserve is softer where its delay is longer, stiffer nowhere, and needs less damping there."""
+    """Check each reserve: it is softer where its delay is longer, and stiffer nowhere.
+
+    In the loop with the longer delay, it needs less damping than the coupling before it, and no more than available.
+    """
     for before, reserve in pairwise(rungs):
         loop, slower = (made.scenario.loop("I") for made in (before, reserve))
         later = np.greater(slower.theta, loop.theta)
@@ -419,7 +422,7 @@ def test_a_wrong_fault_is_one_line(text, words):
 
 
 def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
-    """With caps of 0.3 and 0.2 N, the limiter keeps all forces within the caps and limits over a third of the ticks."""
+    """With caps of 0.3 and 0.2 N, the limiter keeps all forces within the caps and acts in a third of the ticks."""
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
     session.record = recorder
@@ -486,7 +489,10 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
 
 
 def test_a_rehearsed_wall_pushes_and_never_pulls():
-    """Forces solve coupling and wall in series: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap)."""
+    """Forces solve coupling and wall in series: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap).
+
+    Here d is the deflection of the coupling, h the penetration of the wall, and dd and dh are their changes in a tick.
+    """
     scenario = load_scenario("one-wall")
     session = rehearse(scenario, seconds=3.0)
     assert (session.stage, session.assessment.guarantee.condition) == ("finished", "any-environment")
@@ -504,7 +510,7 @@ def test_a_rehearsed_wall_pushes_and_never_pulls():
         way = brentq(lambda way, give=give, push=push: push(way) - give(way), -0.1, 0.1, xtol=1e-16)
         pushes.append(give(way))
         d, h = way, max(0.0, x - way - wall.gap)
-    felt = session.result.f[400:-120, 0]  # full gain
+    felt = session.result.f[400:-120, 0]  # these are ticks at full gain
     assert felt.max() > 1.0
     assert (felt == 0).mean() > 0.3
     np.testing.assert_allclose(felt, pushes[399:-121], atol=6e-4)  # the force is rounded to steps of 0.5 mN

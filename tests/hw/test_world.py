@@ -149,7 +149,7 @@ def in_the_ball_world(*faults):
 
 @pytest.mark.slow
 def test_motors_in_worlds_are_tested_at_last():
-    """The devices give at most W0 and what was released, by their motion and the applied forces."""
+    """The devices give at most W0 and what was released; their motion and the applied forces show this."""
     session, given = in_the_ball_world()
     assert session.stage == Stage.FINISHED, session.cause
     assert given.max() <= 2e-3 + session.worlds[0].port.released
