@@ -209,7 +209,9 @@ class _EmulatedPlant:
         self._held = lru_cache(256)(self._hold)
         self.s = np.zeros(len(self._plant.A))
         self._w = np.zeros(self.scene.outside)
-        self._limit = np.array([device.force_limit for device in scenario.axis_devices])
+        limit = np.array([device.force_limit for device in scenario.axis_devices])
+        self._limits = -limit, limit
+        self._motors = slice(self.scene.model.nq, self.scene.model.nq + scenario.channels)  # speeds of motors in s
         self.still = False
         self.fastest = 0.0  # [m/s] highest speed of any motor so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
@@ -229,16 +231,16 @@ class _EmulatedPlant:
         """
         if begins and self.tick is not None:
             self._w = self._next_outside() * (not self.still)
-        f, m, n = np.minimum(np.maximum(f, -self._limit), self._limit), self.scenario.channels, self.scene.model.nq
-        held, size = self._held(share), len(self.s)
+        f, held, motors = np.minimum(np.maximum(f, self._limits[0]), self._limits[1]), self._held(share), self._motors
         if not self.coulomb:
-            self.s = held @ np.concatenate([self.s, self._w, f])
-            return self._note_speed(self.s[n : n + m])
-        A, B, slip = held[:, :size], self.coulomb * held[:, -m:], _SLIP / self.scenario.lever
+            self.s = held.dot(np.concatenate((self.s, self._w, f)))
+            return self._note_speed(self.s[motors])
+        size = len(self.s)
+        A, B, slip = held[:, :size], self.coulomb * held[:, -len(f) :], _SLIP / self.scenario.lever
         pushed = held[:, size:] @ np.concatenate([self._w, f])
         for _ in range(self._substeps):
-            self.s = A @ self.s + pushed + B @ np.tanh(self.s[n : n + m] / slip)
-            self._note_speed(self.s[n : n + m])
+            self.s = A @ self.s + pushed + B @ np.tanh(self.s[motors] / slip)
+            self._note_speed(self.s[motors])
         return None
 
     def _note_speed(self, v: Array) -> None:
@@ -307,7 +309,7 @@ class Emulator:
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
         self._motor: Array = np.ones((2, scenario.channels))  # shares of a positive and of a negative force
         self._most: Array = np.full(scenario.channels, np.inf)  # [N] forces at which motors saturate
-        self._swapped, self._crossed = False, 0.0
+        self._swapped, self._crossed, self._motors_fail = False, 0.0, False
         # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
@@ -339,7 +341,10 @@ class Emulator:
 
     def _motor_forces(self, steps: tuple[int, ...]) -> Array:
         """Return the forces (m,) [N] that the motors make of latched forces, with the faults of the motors."""
-        forces = np.clip(np.array(steps) * self.force_step, -self._most, self._most)
+        forces = np.array(steps) * self.force_step
+        if not self._motors_fail:
+            return forces
+        forces = np.clip(forces, -self._most, self._most)
         forces *= np.where(forces > 0, *self._motor)
         forces[1:2] += self._crossed * forces[0]
         return forces
@@ -421,6 +426,7 @@ class Emulator:
     def _misbehave(self, now: int) -> None:
         for fault in [u for u in self._waiting if u.active(self.since_armed(now))]:
             self._waiting.remove(fault)
+            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "cross")
             match fault.kind:
                 case "stall":
                     self.stalled_until = now + round(1e6 * fault.value)
