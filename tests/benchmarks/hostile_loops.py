@@ -2,8 +2,8 @@
 
     PYTHONPATH=. python tests/benchmarks/hostile_loops.py --count 20 --seed 1
 
-One to three devices, delays 0 to 16 and inside the object 0 to 2 samples, dampings of .02 to 5 N s/m, masses of 1 g to
-100 kg, stiffnesses of .01 to 1e6 N/m, dampings of the object from none to a critical one.
+A loop has one to three devices with dampings of .02 to 5 N s/m, delays of 0 to 16 samples, and 0 to 2 in its object.
+The object has masses of 1 g to 100 kg, stiffnesses of .01 to 1e6 N/m, and dampings from none to critical.
 """
 
 from __future__ import annotations

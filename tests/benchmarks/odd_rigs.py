@@ -53,8 +53,8 @@ class Rig:
     eccentric: float = 0.0  # [m]
     turn: float = 0.04  # [m] of eccentricity
     gap: float = 0.0  # [m] backlash
-    lag: float = 0.0  # [T] first order
-    late: float = 0.0  # [T] pure delay
+    lag: float = 0.0  # [T] time constant of the force, first order
+    late: float = 0.0  # [T] pure delay of the force
     hand: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [kg], [N s/m], [N/m]
     tremor: float = 0.0  # [N]
 

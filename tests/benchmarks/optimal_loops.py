@@ -1,4 +1,4 @@
-"""Design the optimal coupling of the loops n and o of benchmarks/loops: its mismatch, its cost, and the bound.
+"""Design optimal couplings for the loops n* and o* of benchmarks/loops: their mismatch, their cost, and the bound.
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 

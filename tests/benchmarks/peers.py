@@ -2,9 +2,9 @@
 
 PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (pip install drake control)
 
-The default scenario with the published coupling of case I: same process, same force limits, same outside forces, same
-plant, one tool after the other in every round; the median of their CPU times counts. Growth is measured on the tool's
-trace, projected on the exact loop's dominant mode. A tool that is not installed is listed as not measured.
+Every tool gets the default scenario with the published coupling of case I: same process, force limits, outside forces
+and plant. The tools take turns in every round, and the median of a tool's CPU times counts. Growth is measured on the
+tool's trace, projected on the exact loop's dominant mode. A tool that is not installed is listed as not measured.
 
 Drake gets a MultibodyPlant of prismatic joints, springs as bushings, and the forces of a period as an applied
 generalised force, since its discrete controllers are Python systems, which cost more. python-control gets the sampled

@@ -2,7 +2,7 @@
 
 The cheap columns are computed from each loop in a second. `designed` takes up to a minute for eight devices. The
 columns of the best coupling and of the bound are kept from the file (tests/benchmarks/optimal_loops.py prints their
-figures), except that those of the loops p are computed.
+figures), except that those of the loops p* are computed.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def test_exact_engine(benchmark):
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatch):
-    """Run a loop with the limiter and one that clips in turns, and compare their shortest times.
+    """Run in turns a loop with the limiter and one that clips, and compare their shortest times.
 
     The limiter solves a box problem only in ticks whose forces it limits.
     """

@@ -1,6 +1,6 @@
 """PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure a tick of the host, beside the bare loop.
 
-A whole tick is one of the bridge's loop at full gain over a pseudo-terminal: from the waiting STATE, through every
+A whole tick is a tick of the bridge's loop at full gain over a pseudo-terminal: from the waiting STATE, through every
 check and record, to the written FORCE and the next wait. A bare tick decodes a STATE, steps the controller, and encodes
 a FORCE. Blocks of 200 whole and 200 bare ticks alternate. Times are CPU times of this thread with its system calls; the
 time of writing is also printed. The emulated device ticks while the host waits, and so leaves caches as cold as another
@@ -91,7 +91,7 @@ def tick_cost(ticks: int) -> dict[str, list[float]]:
     with _Bench() as port:
         session = port.session
         live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
-        live.clock = lambda: port.clock  # the emulated device's, since ticks take longer here than T
+        live.clock = lambda: port.clock  # the emulated device's clock, since ticks take longer here than T
         session.start(0)
         gc.collect()
         gc.freeze()

@@ -221,7 +221,7 @@ def test_any_environment_with_switching_takes_levels() -> None:
 
 
 def test_a_multiplier_stays_below_full_levels() -> None:
-    """With psi = 1 E-hat + Phi is passive, and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1, as printed."""
+    """With psi = 1 E-hat + Phi is passive, and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1 of the paper."""
     soft = Plane(4, MASS.matrices[0], MASS.matrices[1], 0.25 * SPRINGS)
     loop = msgspec.structs.replace(LOOP, environment=soft, psi=(1, 1, 0, 0))
     design = design_by_kind(loop, "moving-average")
@@ -278,7 +278,7 @@ def test_limiter_has_one_weight_per_device() -> None:
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment", LimitedForces()])
 def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> None:
-    """A proof exists above the requirement; 2 % below it, a sweep of an environment condition refuses."""
+    """A proof exists above the requirement; 2 % below it, the sweeps of the two environment conditions refuse."""
     least = required_damping(LOOP, BUILT, condition).ratio
     enough = scaled(LOOP, float(f"{1.02 * least:.6g}"))
     if not isinstance(condition, str):  # the limiter's rho is a share of the damping
@@ -305,7 +305,7 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
 
 @pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
 def test_a_wall_meets_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
-    """s Delta >= c n n' holds for s = c n' Delta^-1 n, with the c [N s/m] that a bare wall needs of a single axis."""
+    """s Delta >= c n n' (n is the normal) holds for s = c n' Delta^-1 n; a bare wall needs c [N s/m] of one axis."""
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
     network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})
@@ -501,7 +501,7 @@ def test_full_levels_take_ranges() -> None:
 
 
 def test_turned_filters_keep_a_symmetric_compliance() -> None:
-    """A general V in other coordinates equals Q V Q' to its digits, and V(1) is exactly symmetric."""
+    """A general V in other coordinates equals Q V Q' to 1e-5, and V(1) is exactly symmetric."""
     V = Lti.diag(Lti([[0.37]], [[1.0]], [[2.1e-4]], [[6e-4]], 1e-3), Lti([[-0.2]], [[0.7]], [[1.3e-4]], [[9e-4]], 1e-3))
     after, z = Compliance(V).turned(TURN), np.exp(1j * np.array([0.1, 1.0, 3.0]))
     np.testing.assert_allclose(after.V.at(z), TURN @ V.at(z) @ TURN.T, rtol=1e-5, atol=1e-9)
@@ -666,7 +666,7 @@ def test_a_turned_filter_keeps_its_static_share() -> None:
 
 
 def test_switching_search_shares_a_multiplier() -> None:
-    """Options give delays per device; the slope by gains and multipliers is that of differences."""
+    """An option gives delays per device; the slope by gains and multipliers equals that of central differences."""
     loop = msgspec.structs.replace(LOOP, levels=None)
     span = delay_range(((0, 1), (2, 2)), loop, 9)
     assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))
@@ -732,7 +732,7 @@ def test_reports_show_matrix_gains_on_their_diagonal() -> None:
 
 @pytest.mark.parametrize("loop", [ONE_DEVICE, pytest.param(LOOP, marks=pytest.mark.validate)])
 def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
-    """The multiplier has one row per device; a second basis starts from the first one's certificate."""
+    """The multiplier of a design over two bases has one row per device."""
     design = design_by_kind(loop, "optimal", limiter=True, bases=((1, 1), (2, 1)))
     needs = required_damping(loop, design.coupling, LimitedForces(0.0, 1))
     assert design.requirement.certified

@@ -28,7 +28,7 @@ def wall(stiffness, damping):
 
 
 def held(*walls):
-    """Return a mass of 50 g, held by 20 N/m and 0.3 N s/m at the tip, with walls."""
+    """Return a mass of 50 g at the tip, held to ground by 20 N/m and 0.3 N s/m, with walls."""
     return Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
 
 
@@ -52,7 +52,10 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most):
-    """`most` is from code with m = 0 that bounds both parts of a period apart; a frozen contact needs less."""
+    """`most` is from code with the walls' multiplier m = 0 that bounds both parts of a period separately.
+
+    A wall that never loses contact needs less.
+    """
     loop = loop_of(Network(("tip",), walls=(wall(k, damping),)), theta=theta, latency=(latency,))
     touched = loop_of(Network(("tip",), (Spring(("tip", GROUND), k, damping),)), theta=theta)
     least = need(change(touched, latency=(latency[1:] * 2,)), BARE)  # with the constant latest latency
@@ -61,7 +64,7 @@ def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, mo
 
 @pytest.mark.parametrize(("theta", "known", "alone"), [(1, 1.2623, 1.2452), (0, 0.99051, 0.99051)])
 def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
-    """rho is 0.01/T times the requirement without limiter; `known` was computed with m = 0."""
+    """rho is 0.01/T times the requirement without limiter; `known` was computed with the walls' multiplier m = 0."""
     loop = loop_of(held(wall(3000.0, 2.0)), 1e-3, theta)
     linear = need(loop, COUPLING)
     assert alone * 0.999 < linear <= alone * (1 + 5e-5)
@@ -72,7 +75,7 @@ def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
     ("theta", "walls", "known"), [(1, (), 1.3905), (0, (), 0.8172), (1, (1,), 1.3910), (0, (1,), 0.8177)]
 )
 def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
-    """rho is 13 N/m and the latency 0.3 ms; the known figures with the wall were computed with m = 0."""
+    """rho is 13 N/m and the latency 0.3 ms; `known` was computed with the walls' multiplier m = 0."""
     loop = loop_of(held(*(wall(3000.0, 2.0) for _ in walls)), 1e-3, theta, latency=((0.3e-3, 0.3e-3),))
     found = need(loop, COUPLING, 13.0)
     assert known * (1 - 5e-4) < found < known * (1 + 5e-5)

@@ -121,7 +121,7 @@ def test_definiteness_below_rounding_is_not_proved():
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
 def test_what_rounding_makes_definite_is_not_proved(monkeypatch, bits):
-    """J + u M with |M| <= 1/2: rounded to multiples of u it is J + u I, which is definite; the matrix itself is not."""
+    """J + u M (J has ones, |M| <= 1/2) is not definite, but rounded to multiples of u it is J + u I, which is."""
     monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
     M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
@@ -157,7 +157,7 @@ def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
 
 
 def test_definiteness_is_proved_beyond_double_precision():
-    """Hilbert's matrices of condition 5e5 to 2e28, shifted to both sides of their least eigenvalue by elimination."""
+    """Hilbert's matrices of condition 5e5 to 2e28 are shifted to both sides of a bisected least eigenvalue."""
     for n in (5, 12, 20):
         low, high = Fraction(0), Fraction(1, n)
         while high - low > high / 30:
@@ -212,7 +212,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
     G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
     assert _prove_positive_real(G, Matrix.of([["1/2"]])) is None
     assert "negative direction" in _prove_positive_real(G, Matrix.of([[5]]))
-    # with P = 1 the matrix is diag(3/4, 2 D - 1): 1e-30 below zero, or zero, is beyond floating point
+    # with P = 1 the matrix is diag(3/4, 2 D - 1): floating point cannot tell its entry of 2e-30 from zero
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
         told = _prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
         assert told is reason or told.startswith(reason)
@@ -251,7 +251,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
 
 
 def test_the_kyp_matrix_is_the_storage_increase():
-    """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u, is supplied minus stored energy."""
+    """Its form in x and u is x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du): the supply less the storage increase."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
     P = numbers(half + half.T, Fraction(1)) / 7

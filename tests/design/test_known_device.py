@@ -130,7 +130,7 @@ def test_a_bare_spring_gains_nothing():
 
 @pytest.mark.parametrize(("theta", "known", "present"), [(0, 5913.6, 2283.3), (1, 1887.4, 1141.7), (2, 1029.7, 761.1)])
 def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present):
-    """V(1) = 2 mean(chi) over the circle; without the known device the mean is n T/(4 delta)."""
+    """The coupling has V(1) = 2 mean(`chi_by_hand`) over the circle; unknown devices have the mean n T/(4 delta)."""
     z = np.exp(2j * np.pi * (np.arange(512) + 0.5) / 512)
     loop, top = one(1.2e-3, 1.37, theta), 2 * np.sqrt(1.37 * 0.5) / 14500
 
@@ -143,14 +143,14 @@ def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present)
 
 
 def chi_by_hand(z, n, loop, beta):
-    """Return l Lam^-1 l*/4 (k,); the matrix Lam of L on (dx, v) is inverted numerically."""
+    """Return chi = l Lam^-1 l*/4 at k points z, with n = theta + 1; Lam of `cost_by_hand` is inverted numerically."""
     inverse = np.linalg.inv(cost_by_hand(z, loop, beta))
     left = np.stack([(z**n - 1) / (z - 1), beta * z**n], axis=1)
     return np.einsum("ki,kij,kj->k", left, inverse, np.conj(left)).real / 4
 
 
 def cost_by_hand(z, loop, beta):
-    """Return the Hermitian matrix (k, 2, 2) of L on (dx, v)."""
+    """Return the Hermitian matrix Lam (k, 2, 2) on (dx, v) of L, the least cost of a period, at k points z."""
     T, (device,) = loop.T, loop.known_devices
     P, b, m = (
         device.transmission_stiffness_max**2 / device.transmission_damping_min,
@@ -206,7 +206,7 @@ def test_the_least_cost_of_a_period(seed):
 
 
 def test_the_cost_is_concave_in_damping_and_beta():
-    """The form in (dx, vb, dv) is concave along random lines.
+    """The form in dx and the mean and the change of v is concave along random lines of damping and beta.
 
     Tangents therefore bound a block from above, and the search for beta and multipliers bounds the requirement from
     below.
@@ -226,7 +226,7 @@ def test_the_cost_is_concave_in_damping_and_beta():
 
 
 def test_tangents_bound_a_sweep_over_beta():
-    """c2 limits beta here, and the least share is far below the one from which the search begins."""
+    """Here c2 > 0 limits beta, and the least share of the damping is far below that from which the search begins."""
     T, high = 1e-3, 3.0
     loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
     sweep = sweep_of(wall(309.8, 3.44, 1, T), loop)
@@ -315,7 +315,7 @@ def test_the_tail_costs_at_most_the_storage():
 
 @pytest.mark.parametrize("theta", [0, 2])
 def test_the_block_is_the_energy_of_periods(theta):
-    """x'block x summed over the ticks of a motion that ends equals sum f'(dx + beta dv) + sum L, from rest."""
+    """The block's supply over a motion from rest that ends equals sum f'(dx + beta dv) + sum L."""
     rng = np.random.default_rng(theta)
     loop, F, beta = one(1e-3, 1.3, theta), wall(900.0, 0.7, theta, 1e-3), np.array([3e-5])
     cost = period_cost(loop, 1.0, beta)
@@ -350,7 +350,7 @@ def test_sums_over_aliases_have_a_closed_form():
 
 @pytest.mark.parametrize("coupling", ["none", "I"])
 def test_the_proof_is_tight_for_the_papers_loop(coupling):
-    """No condition requires less than Theorem A for equal devices; it is at most 0.1 % below Theorem B."""
+    """For equal devices no condition can require less than Theorem A, which is at most 0.1 % below Theorem B."""
     F = KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"])
     exact = _necessary_share(F, KNOWN)
     assert exact.held
@@ -660,7 +660,7 @@ def test_a_spring_damper_on_known_devices_feels_stiffer():
 
 
 def test_the_stiffest_spring_damper_for_any_environment():
-    """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid satisfy it."""
+    """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid are certified."""
     loop = one(1.2e-3, 1.37)
     found = design_coupling(loop, "spring-damper", "known-device-any")
     assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # the design leaves 0.1 % of the damping unused
@@ -755,7 +755,7 @@ def test_designs_refuse_what_known_devices_exclude():
 
 @pytest.mark.parametrize("name", ["known-device", pytest.param("known-device-any", marks=pytest.mark.slow)])
 def test_a_map_agrees_with_single_sweeps(name):
-    """The ratios of a stack before a rigid wall are those of single sweeps to 3 %, and at most 2 % below them."""
+    """The ratios of two couplings at once agree with single sweeps to 3 % above 0.05, and are at most 2 % below."""
     loop = one(1e-3, 1.37, environment=RIGID_WALL)
     K, B = np.array([1500.0, 4000.0]), np.array([0.4, 3.0])
     drawn = named(name).ratios(loop, SpringDamper(K[:, None], B[:, None]))
@@ -874,7 +874,7 @@ def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=400
 
 @pytest.mark.slow
 def test_any_environment_gets_walls_and_limiter_free():
-    """Under known-device-any at 1.01 no lossless hand gains energy at a limited one-sided wall; at a tenth some do."""
+    """At 1.01 of the need of known-device-any no lossless hand gains energy at a limited wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)
     loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])
     needed = required_damping(loop, coupling, "known-device-any").ratio
@@ -922,7 +922,7 @@ WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5), (1000.0, 5.
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
 def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, plain):
-    """Separate code with a coarse sweep and m = 0 gives `known`; permanent contact with the wall needs less."""
+    """Separate code with a coarse sweep and the multiplier m = 0 gives `known`; permanent contact needs less."""
     touched = sweep_of(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
 
@@ -979,7 +979,7 @@ def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, p
 
 
 def test_hands_that_never_leave_walls_need_less_damping():
-    """A hand that never leaves the wall feels a spring-damper; some lossless hand grows below the figure."""
+    """A hand that never leaves the wall feels a spring-damper; at 0.9 of its need some lossless hand grows."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
     left = left_over(loop, NoCoupling(), required_damping(loop, NoCoupling(), "known-device"))
     assert left.attained
@@ -1032,7 +1032,7 @@ LINEAR_OR_WALL = pytest.mark.parametrize("name", ["linear", pytest.param("wall",
 
 @LINEAR_OR_WALL
 def test_limited_forces_cost_little_on_known_devices(name):
-    """They need no less damping than unlimited forces, and less than on a device of known damping only."""
+    """Limited forces need no less damping than unlimited ones, and less than on a device of known damping only."""
     loop = LIMITED_LOOPS[name]
     unlimited = required_damping(loop, COUPLING, "known-device").required[0]
     plain = required_damping(loop, COUPLING, LimitedForces(held=(RHO,))).required[0]
@@ -1049,7 +1049,7 @@ def test_no_hand_gains_energy_from_limited_forces(name):
 
 
 def test_the_block_is_the_energy_of_limited_periods():
-    """x'block x, summed over a motion that ends, is sum f'(dx + beta dv) + sum L - sum (M f_e)'de, from rest."""
+    """The block's supply over a motion from rest that ends equals sum f'(dx + beta dv) + sum L - sum (M f_e)'de."""
     rng, N, active, T, K, B = np.random.default_rng(6), 300, 40, 1e-3, 900.0, 0.7
     loop, beta, c = one(T, 1.3, 1), np.array([3e-5]), 0.4
     G = taps([K + B / T, -B / T], T)
@@ -1185,7 +1185,7 @@ def test_an_assessment_guarantees_switching_on_known_devices():
 
 
 def test_longest_period_alone_proves_no_known_device():
-    """A declared T_max means that periods vary, even where it equals T; with ticks of 1 ms and 10 us hands grow."""
+    """A declared T_max means that periods vary, even where T_max equals T, so that the proof needs a T_min."""
     loop = msgspec.structs.replace(KNOWN, T_max=KNOWN.T)
     refused = assess(loop, PUBLISHED["I"])
     assert "T_min" in refused.requirements["known-device"].shortfall

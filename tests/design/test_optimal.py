@@ -253,7 +253,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition number of 1e15 and is stored whole; without a heavier weight g would be 0.017."""
+    """P has a condition number of 1e15, and all its digits are stored; without a heavier weight g would be 0.017."""
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
@@ -300,7 +300,7 @@ def test_there_is_always_an_answer(seed):
 
 
 def test_ties_prefer_less_error_at_small_forces():
-    """Hands of case I that move together get less than 2 % of the force at 0.6 Hz; its error is below 5 %."""
+    """At 0.6 Hz, hands of case I that move together get less than 2 % of the largest force, with an error below 5 %."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -572,8 +572,8 @@ ORDINARY = {
 
 @pytest.mark.parametrize("name", [*list(ORDINARY)[:2], pytest.param(list(ORDINARY)[2], marks=pytest.mark.slow)])
 def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
-    """With four taps and three poles, cvxpy reaches the same objective to 0.1 dB, with many frequencies."""
-    monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # the cone program has neither
+    """With four taps and three poles, cvxpy with many frequencies reaches the same objective to 0.1 dB."""
+    monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # the cone program has neither of these terms
     monkeypatch.setattr("haptic_loop.design.program._EVEN", 0.0)
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
@@ -583,7 +583,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
     def map_of(z: np.ndarray) -> np.ndarray:
-        """Return Theta b R_ij Psi E of each unknown, (unknowns, k, m, m): g first, then b by b, entry by entry."""
+        """Return Theta b R_ij Psi E of each unknown, (unknowns, k, m, m): g, then each entry of each function b."""
         late = [z[:, None] ** -np.asarray(delays) for delays in (loop.theta, loop.psi)]
         inner = late[1][:, :, None] * E.at(z)
         shapes, units = basis(span.poles, z, span.pairs)[:, 1:] - 1, np.eye(m * m).reshape(m, m, m, m)
@@ -758,7 +758,7 @@ def test_a_longer_period_is_a_smaller_damping():
 
 
 def test_late_walls_match_their_closed_form():
-    """K of (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2 needs all of delta; a design reaches 0.98 of this K."""
+    """The K that solves (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2 needs all of delta; a design reaches 0.98 K."""
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))

@@ -192,7 +192,7 @@ def test_stronger_forces_overcome_dry_friction(friction, closing):
 
 
 def test_friction_and_weight_are_no_weak_direction():
-    """At 1.3 N, friction of 0.52 N and a weight of 0.26 N, 0.7 of the motion remain, more to one side."""
+    """Friction of 0.52 N and a weight of 0.26 N leave 0.7 of the motion at 1.3 N, more of it to one side."""
     for closing in (False, True):
         played(arming_test(cap=1.3, closing=closing), rubbing(0.52, bias=0.26))
 
@@ -201,7 +201,7 @@ def test_friction_and_weight_are_no_weak_direction():
 @pytest.mark.parametrize("share", [0.0, 0.15])
 @pytest.mark.parametrize("q", [1e-6, 1e-5])
 def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
-    """Its motion has 0.5 to 0.575 of the expected size, which a factor of 2 hardly tells from a wrong mass."""
+    """The axis moves 0.5 to 0.575 times as far as expected, which the limit of a half for wrong masses hardly finds."""
     weak = masses(q=q, motor=lambda force: np.where(sign * force > 0, force, share * force))
     with pytest.raises(SafetyStop, match="axis 1 moves much farther in one direction than in the other"):
         played(arming_test(q=q), weak)
