@@ -58,7 +58,7 @@ def test_a_design_for_it_is_proved_and_tight(folder):
         ("validate", ["--coupling", "joined.json", "--humans", "3", "--duration", "0", "--no-plot"]),
         pytest.param(
             "zwidth",
-            ["--grid", "4", "--points", "0", "--humans", "2", "--mark", "900,.4", "--no-plot"],
+            ["--grid", "4", "--points", "0", "--humans", "2", "--no-plot"],
             marks=pytest.mark.slow,
         ),
         ("zwidth", ["--coupling", "joined.json", "--grid", "4", "--points", "0", "--humans", "2", "--no-plot"]),

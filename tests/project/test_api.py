@@ -109,7 +109,7 @@ def test_a_session_is_rehearsed():
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
     assert force[-1] <= 2.5 + 1e-9  # [N] of the last test, after the coupling's forces have ended
-    given = rehearse(scenario, SOFT, seconds=0.5)
+    given = rehearse(scenario, SOFT, seconds=0.1)
     assert given.coupling is SOFT
     assert given.assessment.requirements["this-environment"].certified
 

@@ -44,9 +44,9 @@ def test_no_certified_coupling_beats_the_bound():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.validate)])
+@pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.validate)])
 def test_numpy_alone_finds_the_published_requirements(every):
-    """`make suite` checks one row in four, `make validate` checks all."""
+    """`make suite` checks one row in six, `make validate` checks all."""
     checker, compared = runpy.run_path(ROOT / "check.py"), 0
     for loop, row in list(ROWS.items())[::every]:
         for column in ("reference_this_environment", "reference_any_environment"):

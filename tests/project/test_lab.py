@@ -41,10 +41,9 @@ def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
     for name, asked in DESIGNS:
         go("design", *lab, *asked, "--out", f"{name}.json")
         go("check", f"{name}.json")
-        go("audit", *lab, "--coupling", f"{name}.json", "--out", "audit")
-        few = ("--humans", "10", "--duration", "0", "--no-plot", "--out", "v")
-        go("validate", *lab, "--coupling", f"{name}.json", *few)
         go("export", f"{name}.json", "--process", "--out", f"{name}.c")
+    go("audit", *lab, "--coupling", "best.json", "--out", "audit")
+    go("validate", *lab, "--coupling", "best.json", "--humans", "5", "--duration", "0", "--no-plot", "--out", "v")
     said = capsys.readouterr().err
     assert "error" not in said
     assert "not possible" not in said

@@ -19,7 +19,9 @@ def installed(tmp_path_factory):
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "env")], check=True)
     wheel = next(place.glob("haptic_loop-*.whl"))
     python = place / "env/bin/python"
-    subprocess.run([*pip, "--python", str(python), "install", "--no-deps", "--no-index", str(wheel)], check=True)
+    subprocess.run(
+        [*pip, "--python", str(python), "install", "--no-deps", "--no-index", "--no-compile", str(wheel)], check=True
+    )
     libraries = next(Path(path) for path in sys.path if path.endswith("site-packages"))
     site = next((place / "env/lib").glob("python*/site-packages"))
     for entry in libraries.iterdir():  # without our own editable installation

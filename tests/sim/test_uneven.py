@@ -15,6 +15,7 @@ from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.delay import Periods, Timing, VaryingDelay
 from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.files import InputError
 from haptic_loop.models.hold import at_the_latch, hold
 from haptic_loop.models.scene import Plant, plant
@@ -134,8 +135,9 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
     file = tmp_path / "r.json"
     recorded = tmp_path / "ticks.txt"
     recorded.write_text("# s\n1.1e-3\n0.8e-3\n\n1.4e-3\n")
-    options = ["--case", "I", "--no-plot", "--duration", "1", "--out", str(tmp_path)]
-    assert main([*options, "--coupling", "spring-damper", "--period", str(recorded), "--json", str(file)]) == 0
+    save(Stored(PAIR.loop("I"), SOFT.form()), tmp_path / "soft.json")
+    options = ["--coupling", str(tmp_path / "soft.json"), "--no-plot", "--duration", "1", "--out", str(tmp_path)]
+    assert main([*options, "--period", str(recorded), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
     assert report["run"]["timing"]["period_s"] == pytest.approx({"least": 0.8e-3, "mean": 1.1e-3, "largest": 1.4e-3})
     assert needs(report, "this-environment")["certified"]
