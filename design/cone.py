@@ -114,7 +114,7 @@ def _real(H: Array | Complex) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ConeProgram:
-    """minimise cost'x under the blocks."""
+    """The problem to minimise cost'x subject to the blocks."""
 
     cost: Array  # (p,)
     blocks: Sequence[Inequality]

@@ -87,7 +87,7 @@ class OverRanges:
 
     @classmethod
     def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
-        """Evaluate a coupling over the members; members that no device feels have no mismatch."""
+        """Evaluate a coupling over the members; members that exert no force have no mismatch."""
         ratios, figures = [], {}
         for member in members:
             here = loop.at(member.network)

@@ -48,7 +48,7 @@ class DualMatrix:
     points: Array  # (n,) x_i [rad/sample], in (0, pi)
     bends: Complex  # (n, m, m) c_i times 4/T, scaled
     slopes: Array  # (n, m, m) sum of the absolute values of the two slopes beside each bend, in units of `bends`
-    mean: Array  # (m, m)
+    mean: Array  # (m, m) H_0 times 4/T, scaled
     sums: Array  # (K + 1, m, m): C_0 and C_k
 
     @classmethod

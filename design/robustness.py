@@ -99,8 +99,8 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return `robustness`, with changes of ten percent, or None.
 
-    Returns None for a condition that holds in any environment or that sweeps over varied loops skip, for walls, for
-    environments given by a block, and if a stiffness or mass plus ten percent is too large.
+    Returns None if the condition holds in any environment or is not evaluated for varied loops (`not_varied`), if the
+    environment is no network, has walls or a block, or if a stiffness or mass plus ten percent is too large.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return None

@@ -115,7 +115,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     peak, _ = supremum(lambda w: sizes(w)[0], grid)
     least, _ = supremum(lambda w: -sizes(w)[2], grid)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
-    rounding = 1e-9 * float(np.abs(environment.D).max())  # error of a zero stiffness that is a difference
+    rounding = 1e-9 * float(np.abs(environment.D).max())  # rounding error of a static stiffness that should be zero
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     worst = supremum(relative, grid)[0]
     if worst < _ROUNDING:
