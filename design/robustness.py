@@ -100,7 +100,7 @@ def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THI
     """Return `robustness`, with changes of ten percent, or None.
 
     Returns None if the condition holds in any environment or is not evaluated for varied loops (`not_varied`), if the
-    environment is no network, has walls or a block, or if a stiffness or mass plus ten percent is too large.
+    environment is no network, has walls or has a block, or if a stiffness or mass plus ten percent is too large.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return None

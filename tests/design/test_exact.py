@@ -251,7 +251,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
 
 
 def test_the_kyp_matrix_is_the_storage_increase():
-    """Its form in x and u is x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du): the supply less the storage increase."""
+    """The form of this matrix, x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), is supply less storage increase."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
     P = numbers(half + half.T, Fraction(1)) / 7

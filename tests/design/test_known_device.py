@@ -641,7 +641,7 @@ def test_the_slope_of_the_sampled_condition():
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
     steps = 1e-6 * np.eye(x.size)
     slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
-    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta: finite differences
+    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta: a finite difference
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Encoders that do not follow are found on every axis, at arming and under force; a hand that holds still is not."""
+"""Encoders that do not follow are found on every axis, at arming and under force; still hands stop no session."""
 
 from pathlib import Path
 from runpy import run_path

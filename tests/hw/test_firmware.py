@@ -463,7 +463,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
 def test_the_sketch_counts_edges_and_obeys_its_button(sketch):
     sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
-    for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # edges of A, of which the last counts back
+    for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # five edges of A; the last one counts back
         sketch.lib.stub_set_pin(SKETCH_PINS["encoder B"], level_b)
         sketch.lib.stub_set_pin(SKETCH_PINS["encoder A"], level_a)
     (state,) = sketch.run(1200)
@@ -598,9 +598,9 @@ def test_emergency_stops_replace_earlier_causes(device):
 
 
 def test_late_double_and_mistimed_forces_are_counted(device):
-    """A late FORCE sets only echo and a negative margin; a second one for a tick, or one with a wrong theta, nothing.
+    """A late FORCE sets only echo and a negative margin. None of the three kinds counts as a CRC error.
 
-    None of them counts as a CRC error.
+    A second FORCE for the same tick sets nothing, nor does one with a wrong theta.
     """
     device.armed(theta=2)
     before = device.state()

@@ -422,7 +422,7 @@ def test_a_wrong_fault_is_one_line(text, words):
 
 
 def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
-    """With caps of 0.3 and 0.2 N, the limiter keeps all forces within the caps and acts in a third of the ticks."""
+    """With caps of 0.3 and 0.2 N, the limiter keeps forces within the caps and acts in over a third of the ticks."""
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
     session.record = recorder
