@@ -53,7 +53,9 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
     assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
 
 
-@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.17), (1e-5, 0.17), (1e-4, 0.65)])
+@pytest.mark.parametrize(
+    ("step", "most"), [(1e-6, 0.17), pytest.param(1e-5, 0.17, marks=pytest.mark.validate), (1e-4, 0.65)]
+)
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     """Encoders with counts of 1 to 100 um answer a force of at most `most` [N], with hands on the handles or not."""

@@ -68,7 +68,7 @@ def test_known_parameters_come_back():
         encoder_step=STEP,
     )
     scenario = scenario.replace(device=(compliant, RigidDevice(mass=0.16, damping=2.0, encoder_step=STEP)))
-    recorder, session = record_of(scenario, seconds=2.5, coulomb=0.02)
+    recorder, session = record_of(scenario, coulomb=0.02)
     first, second = estimate(recorder, session, scenario)
     found = first.transmission
     assert first.friction.mass == pytest.approx(0.38, rel=2e-3)
