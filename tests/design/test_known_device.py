@@ -104,7 +104,10 @@ def best_for(coupling: str) -> _Best:
     return sweep_of(KNOWN.F(made), KNOWN).best(present / 1.37)
 
 
-@pytest.mark.parametrize(("coupling", "required", "beta"), [("none", 1.3120, 3.255e-5), ("I", 0.96294, 3.375e-5)])
+@pytest.mark.parametrize(
+    ("coupling", "required", "beta"),
+    [pytest.param("none", 1.3120, 3.255e-5, marks=pytest.mark.validate), ("I", 0.96294, 3.375e-5)],
+)
 def test_required_damping_of_the_papers_loop(coupling, required, beta):
     """A beta per channel and one common beta both require the stated damping."""
     found = best_for(coupling)
@@ -348,7 +351,7 @@ def test_sums_over_aliases_have_a_closed_form():
     assert sig2 == pytest.approx(turn * (weight * g * np.conj(a)).sum(axis=1), rel=1e-9)
 
 
-@pytest.mark.parametrize("coupling", ["none", "I"])
+@pytest.mark.parametrize("coupling", [pytest.param("none", marks=pytest.mark.validate), "I"])
 def test_the_proof_is_tight_for_the_papers_loop(coupling):
     """For equal devices no condition can require less than Theorem A, which is at most 0.1 % below Theorem B."""
     F = KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"])
@@ -689,7 +692,7 @@ def test_rigid_wall_refuses_designs_that_need_its_model(kind):
         design_coupling(change(loop_of(1e-3, (1.37,), (0,)), environment=RIGID_WALL), kind)
 
 
-@pytest.mark.parametrize(("theta", "stiffness"), [(0, 5913.6), (2, 1029.7)])
+@pytest.mark.parametrize(("theta", "stiffness"), [pytest.param(0, 5913.6, marks=pytest.mark.validate), (2, 1029.7)])
 def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     loop = one(1.2e-3, 1.37, theta)
     found = design_coupling(loop, "moving-average", "known-device-any")
@@ -917,7 +920,10 @@ def wall_needs(k, damping, theta):
     return required_damping(on_a_wall(k, damping, theta), NoCoupling(), "known-device").required[0]
 
 
-WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5), (1000.0, 5.0, 1, 2.07, 5.5455)]
+WALLS = [
+    *((3000.0, 2.0, 0, 1.524, 3.5), (1000.0, 5.0, 1, 2.07, 5.5455)),
+    pytest.param(1000.0, 5.0, 0, 0.566, 5.5, marks=pytest.mark.validate),
+]
 
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)

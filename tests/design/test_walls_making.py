@@ -369,8 +369,8 @@ def test_frozen_walls_fall_to_a_nonnegative_value(loop):
     G, block, P, S, _ = steps_of(loop, BOTH, delta)
     there, frozen = Walled(loop, BOTH, block), 0
     k, b, gap, m = there.k, there.b, there.gap, 2
-    x = np.cumsum(rng.standard_normal((400, m)) * rng.choice([1e-5, 3e-4], (400, 1)), axis=0)
-    for tick in range(400):
+    x = np.cumsum(rng.standard_normal((240, m)) * rng.choice([1e-5, 3e-4], (240, 1)), axis=0)
+    for tick in range(240):
         there.step(x[tick])
         there.xi = block.A @ there.xi + block.B @ there.v
         if tick % 80 != 79 or (there.s > 1e-12).any():
@@ -391,4 +391,4 @@ def test_frozen_walls_fall_to_a_nonnegative_value(loop):
             xi, h, last = block.A @ xi + block.B @ v, after, Z
         assert last >= -1e-12
         assert np.abs(v).max() < 1e-6 * (np.abs(h).max() + 1e-9)  # the frozen motion has come to rest
-    assert frozen > 2
+    assert frozen > 1
