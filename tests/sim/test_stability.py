@@ -105,7 +105,7 @@ springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
 
 
 @pytest.mark.slow
-def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys):
+def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys, monkeypatch):
     path = tmp_path / "soft.json"
     monkeypatch.setattr("haptic_loop.cli.design._BISECTIONS", 1)  # enough for the ratio, not for the stiffest coupling
     assert design_command(["--decay", "0.01", "--out", str(path), "--json", str(tmp_path / "r.json")]) == 0
