@@ -88,8 +88,8 @@ def children(pid: int) -> list[int]:
 @pytest.mark.parametrize(
     ("end", "words", "workers_and_their_clerk"),
     [
-        (signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
-        (signal.SIGKILL, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
+        (signal.SIGTERM, ["sim.validate", "--case", "none", "--humans", "100000", "--shards", "2"], 3),
+        (signal.SIGKILL, ["sim.validate", "--case", "none", "--humans", "100000", "--shards", "2"], 3),
     ],
 )
 def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, workers_and_their_clerk):
