@@ -40,7 +40,7 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_SHAKING = 10  # most ticks in a row with a speed change above jump/5; at T = 1.2 ms ten such changes add up to 5 m/s
+_JOLT = 20.0  # [N] more than motor and hand apply for a tick in one direction, and for the next in the other
 _FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves where the requested kind gives none
 
 
@@ -301,8 +301,14 @@ class Drive:
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
-        self._shaking = 0  # ticks in a row with a jolt
-        self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
+        self._path = deque[tuple[float, ...]](maxlen=4)  # [m] displacements since the last gap
+        self._uneven = deque[float](maxlen=3)  # [s] differences of the last ticks from T
+        axes = zip(expected.mass, still, units.encoder_step, settings.behind or (0,) * config.axes, strict=True)
+        #: (m,) [m] displacement by such a force, by noise and rounding of four counts, and by a repeated sample
+        self._jolts = [
+            _JOLT * limits.lever * T**2 / mass + 2 * n * q + limits.speed * T * (late > 0) for mass, n, q, late in axes
+        ]
+        self._clock_us = 0  # the device's clock at the last STATE
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
@@ -328,7 +334,8 @@ class Drive:
         if self.reference is None:
             self.reference = state.counts if self._rereference else (0,) * state.axes
         x = self.units.positions(map(sub, state.counts, self.reference))
-        self._check_motion(x, ticks)
+        lasted, self._clock_us = (state.t_us - self._clock_us) % 2**32, state.t_us
+        self._check_motion(x, ticks, 1e-6 * lasted)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
         if self.gain.value > 0:  # otherwise only test forces act
@@ -358,7 +365,7 @@ class Drive:
                 self._counters.limited += 1
         if self.world:
             force, steps = self._through_shell(self.world, force, steps, x, state, ticks, test)
-        self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
+        self.x, self.force = x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
         if self._commands:
@@ -391,17 +398,17 @@ class Drive:
                 sent = tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
-    def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
-        """Raise SafetyStop where the handles jumped to x (m,) [m], shake, or moved faster than the speed limit."""
+    def _check_motion(self, x: tuple[float, ...], ticks: int, seconds: float) -> None:
+        """Raise SafetyStop where handles jumped to x (m,) [m] in `seconds`, or moved faster than the speed limit."""
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
-            if ticks == 1 and self._before is not None:
-                shakes = self.limits.check_jolt(x, self.x, self._before)
-                self._shaking = self._shaking + 1 if shakes else 0
-                if self._shaking > _SHAKING:
-                    raise SafetyStop(
-                        f"encoder {shakes} shakes: at every tick its speed changes by more than a hand can cause"
-                    )
+        if ticks > 1:
+            self._path.clear()
+        self._path.append(x)
+        self._uneven.append(abs(seconds - self.T))
+        if len(self._path) == 4:
+            longer = 2 * self.limits.speed * max(self._uneven)  # uneven ticks change displacements, not speeds
+            self.limits.check_jolt(self._path, [most + longer for most in self._jolts])
         recent = self._recent
         if ticks == 1 or self.x is None:
             recent.append(x)

@@ -85,6 +85,8 @@ _AXIS = {
     "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
     "drift": ("metres per second by which its encoder drifts", -10.0, 10.0, 2.0),
     "late": ("ticks by which its encoder is read late", 1.0, 50.0, 2.0),
+    "wrap": ("millimetres after which its encoder wraps", 0.001, 1000.0, 2.0),
+    "bit": ("number of the bit of its count that is stuck at 0", 0.0, 30.0, 8.0),
     "reverse": ("no value: its encoder counts backwards", 0.0, 0.0, 0.0),
     "scale": ("counts that its encoder shows per true count", 0.01, 100.0, 3.0),
     "noise": ("counts of noise (root mean square) in its encoder", 0.0, 100.0, 0.5),
@@ -129,8 +131,8 @@ class FaultInjection:
             require(f"{kind} ({what})", number, low, high, "")
             require("START", begins or 0.0, 0.0, _FOREVER, "s")
             require("DURATION", lasts, 1e-6, _FOREVER, "s")
-            if kind in ("leap", "late") and number != int(number):
-                raise ValueError(f"VALUE is {number:g}, expected a whole number of ticks")
+            if kind in ("leap", "late", "bit") and number != int(number):
+                raise ValueError(f"VALUE is {number:g}, expected a whole number")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
         return cls(kind, number, where or ("axis1" if kind in _AXIS else "both"), begins, lasts)
@@ -401,6 +403,10 @@ class Emulator:
                 return lambda n: min(n, most) if most >= 0 else max(n, most)
             case "reverse":
                 return lambda n: -n
+            case "wrap":
+                return lambda n: (n + most // 2) % most - most // 2
+            case "bit":
+                return lambda n: n & ~(1 << int(fault.value))
             case "scale":
                 return lambda n: round(fault.value * n)
             case "late":
@@ -437,9 +443,6 @@ class Emulator:
                     self.device.deadman = held
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
-                case "freeze" | "toggle" | "saturate" | "shake" | "drift" | "reverse" | "scale" | "late" | "noise":
-                    earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
-                    self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
                 case "motor":
                     self._motor[:, fault.axis] = fault.value
                 case "oneway":
@@ -464,6 +467,9 @@ class Emulator:
                     self.device.fault()
                 case "letgo":
                     self.device.deadman = False
+                case kind if kind in _AXIS:  # all others of an axis happen to its encoder
+                    earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
+                    self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:

@@ -164,22 +164,17 @@ class SafetyLimits:
                 allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
-    def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> int | None:
-        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no hand can cause.
+    def check_jolt(self, path: Sequence[tuple[float, ...]], most: Sequence[float]) -> None:
+        """Raise SafetyStop where an axis gained and lost a speed within two ticks, by more than `most` (m,) [m/tick].
 
-        `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row. Returns the number of an axis
-        whose speed changed by more than a fifth of `jump` per tick, or None. A fifth is two counts of the coarsest
-        allowed encoder.
+        `path` has the displacements (m,) [m] of four ticks in a row. A counting error leaves such a pulse of speed. No
+        hand or motor makes one, and a handle that hits a stop only loses its speed.
         """
-        shaken = None
-        for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
-            if not (change := abs(now - 2 * last + first)) <= self.jump:
-                most = f"{1e3 * self.jump:g} mm in a tick"
-                raise SafetyStop(
-                    f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
-                )
-            shaken = i if change > 2 * _COARSEST * self.jump else shaken
-        return shaken
+        for i, (a, b, c, d, allowed) in enumerate(zip(*path, most, strict=True), start=1):
+            gained, lost = c - 2 * b + a, d - 2 * c + b
+            if gained * lost < 0 and not (jump := min(abs(gained), abs(lost))) <= allowed:
+                limit = f"no force can move it by {1e3 * allowed:.3g} mm in one tick"
+                raise SafetyStop(f"encoder {i} jumped by {1e3 * jump:.3g} mm: {limit} and stop it in the next")
 
     def check_speed(self, x: Sequence[float], before: Sequence[float], seconds: float) -> None:
         """Raise SafetyStop where an axis moved from `before` to x (m,) [m] within `seconds` faster than `speed`."""

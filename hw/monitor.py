@@ -635,7 +635,7 @@ class EncoderTest:
             return (0.0,) * len(self._still)
         size = self._strongest[self._axis] * 2.0 ** min(0, self._block + 1 - _BLOCKS)
         number, place = divmod(since - 0.5 + half / 2, half)
-        sign = (-1) ** number * (abs(place - half / 2) < half * _PULSE / 2)
+        sign = (1 - 2 * (number % 2)) * (abs(place - half / 2) < half * _PULSE / 2)
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._still)))
 
     @property

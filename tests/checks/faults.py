@@ -172,10 +172,17 @@ CASES = (
     Fault("clock drifts by 0.5 %", A, faults=at("period=1.005")),
     Fault("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
     Fault("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
-    Fault("encoder jumps by 2 mm", A, faults=at("jump=2")),
+    Fault("encoder jumps by 0.05 mm", A, faults=at("jump=0.05")),
     *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
-    *_signed("shaking by {} mm, encoder {}", "shake", 2, "encoder {axis} shakes", _STOP + 2 * _T_MS),
-    *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} shakes", _STOP + 12 * _T_MS),
+    *_signed("jump of {} mm, encoder {}", "jump", 0.15, "encoder {axis} jumped by", _STOP + _T_MS),
+    *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} jumped by", _STOP + 2 * _T_MS),
+    *(
+        Fault(
+            f"encoder {axis} {what}", G.STOPPED, f"encoder {axis} jumped by", (f"axis{axis}:{fault}@0.48",), lasts=2.2
+        )
+        for axis in (1, 2)
+        for what, fault in (("wraps every 2 mm", "wrap=2"), ("has a stuck bit of 0.26 mm", "bit=8"))
+    ),
     *_signed(
         "{} m/s, below the limit, handle {}", "drift", 0.69, "axis {axis} moves at 0.7|encoder {axis} is at", None
     ),

@@ -159,6 +159,22 @@ def hand_driven(scenario, rungs):
     return session, send
 
 
+def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
+    """At 0.2 m/s a freeze of 2.4 ms adds 0.48 mm to a displacement; a tick allows a pulse of 0.12 mm."""
+    session, send = hand_driven(scenario, rungs)
+    session.drive._commands = None  # this device applies no forces
+    x = 0
+    for k in range(10):
+        lasts = T_US * (3 if k == 6 else 1)
+        x += lasts // 5
+        send(Phase.ARMED, lasts=lasts, counts=(x, 0))
+    assert session.stage == Stage.ARMING
+    for jumped in (x + 540, x + 780):
+        send(Phase.ARMED, counts=(jumped, 0))
+    assert session.stage == Stage.STOPPED
+    assert session.cause.startswith("encoder 1 jumped by 0.3 mm: no force can move it by 0.1")
+
+
 def test_tick_leaps_skip_no_check(scenario, rungs):
     session, send = hand_driven(scenario, rungs)
     for _ in range(6):

@@ -385,7 +385,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--rehearse", "--T", "0.05"], "T is 0.05 s"),
         (["--rehearse", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
         (["--rehearse", "--fault", "nonsense"], "--fault is 'nonsense'"),
-        (["--rehearse", "--fault", "late=1.5"], "--fault late=1.5: VALUE is 1.5, expected a whole number of ticks"),
+        (["--rehearse", "--fault", "late=1.5"], "--fault late=1.5: VALUE is 1.5, expected a whole number"),
         (["--rehearse", "--continuous-force", "-1"], "--continuous-force) is -1, allowed are 0.001 to 1.3 N"),
         (["--port", "/dev/a,", "--arm", "--no-dead-man"], "--port is '/dev/a,': path 2 of 2 is empty"),
         (["--rehearse", "--fault", "freeze@0.5+1"], "freeze does not end, so it takes no DURATION"),
