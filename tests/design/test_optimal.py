@@ -659,7 +659,7 @@ def test_a_filter_stands_behind_the_environment():
     z = on_circle(np.array([0.1, 1.0]))
     # the series has defective poles: a chain of eleven delays costs eight of sixteen digits
     np.testing.assert_allclose(R.around(E).at(z), R.filter(E.T).at(z) @ E.at(z), rtol=1e-6)
-    with pytest.raises(ValueError, match="cannot include walls"):
+    with pytest.raises(ValueError, match="cannot include the walls"):
         R.around(E, further=1)
     with pytest.raises(ValueError, match="the coupling is 3 x 3"):
         filter_with_sum().around(E)
