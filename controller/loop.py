@@ -42,9 +42,10 @@ class DelayRange(Strict, frozen=True):
     hi: _Steps  # (m,) [samples]
 
     def __post_init__(self) -> None:
-        ends = [*zip(self.lo, self.hi, strict=True)] if len(self.lo) == len(self.hi) else [(1, 0)]
-        if any(not 0 <= a <= b <= MOST_SAMPLES for a, b in ends):
-            shown = f"delays from {list(self.lo)} to {list(self.hi)} samples"
+        shown = f"delays from {list(self.lo)} to {list(self.hi)} samples"
+        if len(self.lo) != len(self.hi):
+            raise ValueError(f"{shown}, expected as many largest delays as least ones")
+        if any(not 0 <= a <= b <= MOST_SAMPLES for a, b in zip(self.lo, self.hi, strict=True)):
             raise ValueError(f"{shown}, expected 0 <= lo <= hi <= {MOST_SAMPLES} on every channel")
 
     def __str__(self) -> str:

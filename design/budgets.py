@@ -21,7 +21,8 @@ SWEEPS = 60.0
 #: The search over larger bases of an optimal coupling. The slowest of the 23 loops take 19 (o11), 17 (o08) and 15 (n6,
 #: n7).
 GROWTH = 60.0
-#: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of contacts.
+#: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of
+#: springs that are present.
 RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
@@ -36,7 +37,7 @@ BASIS_UNKNOWNS = 1600
 #: In all other cases, the largest product of the number of unknowns and the number of channels. A program of this size
 #: takes ten seconds.
 BASIS_BESIDE = 3500
-#: Number of successive bases without a certified coupling after which no larger basis is tried.
+#: Number of successive bases without a certified coupling after which no larger basis is tried; ranges have no limit.
 UNPROVED_BASES = 2
 #: Largest number of bases, the best first, whose couplings are tried at every vertex of ranges until one is proved.
 RANGED_BASES = 3
@@ -60,16 +61,18 @@ SEQUENCE_STEPS = 60
 LESS_DAMPING_ROUNDS = 6
 #: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6
-#: Rounds that add frequencies to the bound on linear couplings, sums of coefficients in it, and intervals of its
-#: integral. Cases I and II take 2 rounds and 568 intervals. Each sample of a row's delay gives one sum for each column.
+#: Rounds that add frequencies to the bound on linear couplings, number of its vanishing sums of coefficients s_k
+#: (docs/theory.md), and intervals of its integral. Cases I and II take 2 rounds and 568 intervals. With psi = 0 a delay
+#: of theta_i samples makes theta_i sums vanish for each channel.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Convex problems for a coupling of fixed order. Case I takes 32.
 FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
-#: and multipliers. The pair of omega.3 with known transmissions takes 4 and 11; with walls and limited forces, 20.
+#: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Numbers of points between the vertices of ranges: on all edges; least and most on one edge; on faces and inside; and
-#: starts of compass searches. Together they take the 500 sweeps of RANGES.
+#: Numbers of points between the vertices of ranges: on all edges, unless the least number on each edge gives more, as
+#: for six parameters; least and most on one edge; on faces and inside; and starts of compass searches. Up to five
+#: parameters they take about the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the

@@ -35,7 +35,8 @@ from haptic_loop.design.worst_member import Searched, search_ranges
 
 _SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
-_LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
+#: A basis of more than 26 taps is skipped if the basis before it was certified and gained less than 0.1 dB.
+_LARGE, _PROMISING_DB = 26, 0.1
 _FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
 _KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below this share of an accepted solution's.
 _FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's is dropped.
@@ -183,7 +184,7 @@ def _over_bases(
     return improving, results, False
 
 
-# Tried betas, as shares of the largest one. All channels have the same share, on which the mismatch hardly depends.
+#: tried betas, as shares of the largest one; all channels have the same share, because others gain hardly anything
 _ETAS = 0.15, 0.3, 0.5
 _SCALINGS = 6  # most scalings of the forces; each reduces them by at least MARGIN
 
@@ -261,7 +262,7 @@ class _Search:
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
         if loop.varying_delay and loop.latency:
-            raise ValueError("an optimal coupling for delays that switch is designed without a latency")
+            raise ValueError("an optimal coupling covers delays that switch or a latency, not both: remove one")
         cases: list[program.Case] = []
         for member in loop.members():
             there = at(loop, member.network)
@@ -448,7 +449,8 @@ class _Search:
     ) -> tuple[ForceFilter, list[float]]:
         """Return (the coupling that serves all environments, share of the damping that each environment needs).
 
-        The optimum for the nominal environment is found first, and again with environments that need too much damping.
+        The program is first solved for the nominal environment. Environments that need too much damping are added, and
+        it is solved again.
         `need` returns required over available damping in an environment.
         """
         active = [0]

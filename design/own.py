@@ -27,20 +27,22 @@ def named(option: str, text: str) -> Any:
     to sys.path, so that the file and worker processes can import modules from it.
 
     Raises:
-        InputError: The text is not FILE.py:NAME, the file or the object in it does not exist, the file is not valid
-            Python or exits, or its name is that of a loaded module that is not a user's file.
+        InputError: The text is not FILE.py:NAME, or one of its names has other characters than letters, digits and _;
+            the file or the object in it does not exist; the file is not valid Python or exits; or its name is that of
+            a loaded module that is not a user's file.
     """
     place, _, name = text.rpartition(":")
     file = Path(place)
     if file.suffix != ".py" or not (file.stem.isidentifier() and name.isidentifier()):
-        raise InputError(f"{option} is {text!r}, expected FILE.py:NAME")
+        raise InputError(f"{option} is {text!r}, expected FILE.py:NAME; both names have only letters, digits and _")
     if not file.is_file():
         raise InputError(f"{option} is {text!r}: there is no file {place}")
     with redirect_stdout(sys.stderr):
         module = _loaded(option, text, file.resolve())
     if not hasattr(module, name):
-        there = ", ".join(n for n, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__)
-        raise InputError(f"{option} is {text!r}: {place} has no {name}, but {there or 'no class and no function'}")
+        own = [n for n, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+        there = ", ".join(own) or "no class and no function"
+        raise InputError(f"{option} is {text!r}: {place} has no {name}; it defines {there}")
     return getattr(module, name)
 
 
@@ -83,8 +85,8 @@ def reach(folder: str) -> None:
 def called(what: str, make: Callable[..., _Made], *args: Any, **options: Any) -> _Made:
     """Call a user's own class or function.
 
-    Raises InputError, beginning with `what`, for an error whose traceback has no line of the user's code (such as wrong
-    arguments). Other errors pass.
+    An InputError, and an error whose traceback has a line of the user's code, pass unchanged. Any other error, such as
+    that of wrong arguments, becomes an InputError that begins with `what`.
     """
     try:
         return make(*args, **options)

@@ -28,7 +28,6 @@ class Operator:
     auto_arm: bool
     seconds: float  # time of forces at full gain in each arming
     deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
-    _asked: bool = False  # whether the operator or a key has already asked the session to arm
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] time of the user's last sign
     _free_at: int = 0  # [us] earliest time of arming without a key
@@ -57,7 +56,6 @@ class Operator:
         self._seen_at = now
         match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:
-                self._asked = True
                 return session.arm(now)
             case "stop":
                 return session.stop(f"key {key}", now)
@@ -66,10 +64,9 @@ class Operator:
         return ()
 
     def _arm_once(self, session: Session, now: int) -> Said:
-        if self._asked:  # the session has disarmed to take a softer coupling
+        if session.armings:  # An earlier arming has ended; the session waits for a person to arm a softer coupling.
             softer = session.program.name if session.program else "none"
             return session.end(Stage.REFUSED, f"nobody is there to arm the softer coupling, {softer}", now)
-        self._asked = True
         return session.arm(now)
 
 

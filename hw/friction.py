@@ -7,16 +7,17 @@ Both sides of the balance are filtered by a Gaussian window h (modulating functi
 with the displacement x, the motor's force f and D = d/dt. The fit estimates the mass m and the viscous damping b. The
 term k x stands for a cable, a spring or gravity that changes with position, f0 + f1 t for a constant force and its
 drift. A motor (m1) that drives the handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12,
-p = a b + l m, r = a m1. Both sides were multiplied by 1 + l D + a D^2, so there are no fractions. An amplifier's
+p = a b + l m, r = a m1. The motor's balance was multiplied by 1 + l D + a D^2, so there are no fractions; small terms
+such as l D g and derivatives of k x are left out. An amplifier's
 lag tau changes l to l - tau and a to about a + tau^2 - l tau, so the fit does not mistake it for negative damping.
 The fit differentiates h, never the counts, and integrates a force held for a tick exactly. The balance is linear in all
 parameters except the a before g, so a fit takes milliseconds. A fit needs no initial state.
 
 Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
-vanishes at high speed (Stribeck). The law is not known, so all of _SLIPS and _BRISTLES are tried. Each law that fits
-almost as well as the best counts in the bound. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The
-periodic term holds forces and encoder errors that repeat with position (a motor's poles, an encoder's eccentricity).
-Their periods are searched in the residual.
+vanishes at high speed (Stribeck). The law is not known, so all _SLIPS are tried, and all _BRISTLES longer than an
+encoder step. Each law that fits almost as well as the best counts in the bound. Each fit includes a drag q >= 0; of b
+and q, only b is guaranteed. The periodic term holds forces and encoder errors that repeat with position (a motor's
+poles, an encoder's eccentricity). Their periods are searched in the residual.
 
 For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
 the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit,
@@ -137,7 +138,8 @@ def _bristle(x: Array, reach: float) -> Array:
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
     """Return the ticks at which the force is weak, or h passes enough of it.
 
-    Elsewhere, motion that h removes changes friction.
+    At the other ticks most of the force is faster than h passes. The fast motion that it causes changes the mean
+    friction, but is missing in the filtered balance.
     """
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
@@ -187,7 +189,7 @@ class _Balance:
         return [one[self.rows + self._reach] for one in each]
 
     def laws(self, step: float) -> list[tuple[float, float, Array]]:
-        """Return slip [m/s], reach [m] and dry friction (N,) within +-1 of every law; either slip or reach is 0."""
+        """Return slip [m/s], reach [m] and dry friction (N,) within +-1 of every law tried; slip or reach is 0."""
         bristles = [(0.0, reach, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
         return [(slip, 0.0, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 

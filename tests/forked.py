@@ -119,7 +119,7 @@ def _remembering(folder: Path, make):
 
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
-    """Return the arguments of a call, with defaults but without loop and functions, in words that equal calls share."""
+    """Return (name, text) of each argument but loop and functions, defaults included; equal calls give equal texts."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT
@@ -162,7 +162,7 @@ def _warm() -> subprocess.Popen[str]:
 
 
 def run(command: str | list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run `python -m MODULE ...` or `python FILE ...` in a terminal of 100 columns."""
+    """Run `python -m MODULE ...` or `python FILE ...` with files as its output, for a width of 100 columns."""
     words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
     with tempfile.TemporaryDirectory() as place:
         files = [Path(place, name) for name in ("out", "err")]

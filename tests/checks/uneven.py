@@ -3,8 +3,10 @@
 Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what
 this-environment requires for periods up to T_max, for forces that latch late, or for both. 40 sets of lossless hands
 start with random speeds, everything else at rest. The adversary chooses the tick that leaves hands and devices most
-mechanical energy. With 1.02 times the required damping this energy may never exceed that at the start, and sum f'dx +
-dx'D dx/T may never be negative; with half of it some hand of some loop should grow.
+mechanical energy. With 1.02 times the required damping this energy may never exceed that at the start. The work of the
+forces plus the least dissipation delta a^2/tau_max + delta b^2/(T_max - tau_min), with the motions a and b before and
+after the latch of each tick, may never be negative. With half of the damping the energy of at least one set of hands
+should exceed 100 times that at the start.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from haptic_loop.sim.stability import close
 T, _LONG = 1e-3, 1.6e-3  # [s]
 HANDS, _TICKS = 40, 4000
 ENOUGH, _SHORT = 1.02, 0.5  # times the required damping
-_GROWN = 100.0  # times the energy at the start: the hand grows
+_GROWN = 100.0  # energy over that at the start above which a set of hands counts as unstable
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class _UnevenTicks:
     required: float  # [N s/m] of the first device
     energy: float  # largest mechanical energy over that at the start, with ENOUGH
     balance: float  # least sum f'dx + dissipation over the sum of its magnitudes, with ENOUGH
-    grow: int  # hands that grow, with _SHORT
+    grow: int  # number of unstable sets of hands, with _SHORT
     hands: int
 
     @property

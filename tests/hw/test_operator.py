@@ -31,6 +31,19 @@ def test_a_session_arms_by_itself_once(scenario, rungs, start):
     assert stages(session).count(Stage.ARMING) == 1
 
 
+def test_a_key_during_a_hindrance_arms_nothing(scenario, rungs, monkeypatch):
+    """A key that could not arm the session does not count as an arming: the session arms by itself later."""
+    held = [False]
+    monkeypatch.setattr(Session, "held", property(lambda session: held[0]))
+    operator = Operator(True, 5.0)
+    rehearsal = rehearsal_of(scenario, rungs, operator)
+    session = rehearsal.run(0.5)
+    operator.press("a", session, session.now)
+    assert session.stage == Stage.DISARMED
+    held[0] = True
+    assert rehearsal.run_until_armed(1.5).stage == Stage.ARMED
+
+
 def test_late_answers_never_reach_full_gain(scenario, rungs):
     """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
     session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)

@@ -127,7 +127,7 @@ def test_an_own_environment_is_proved_and_stored(name, covered, place):
         ("mine.py:soft", "stiffness between left"),
         ("mine.py:negative", "stiffness between left"),
         ("mine.py:broken", "which is your own: ZeroDivisionError: division by zero"),
-        ("mine.py:nobody", "mine.py has no nobody, but Weighted, Duck, "),
+        ("mine.py:nobody", "mine.py has no nobody; it defines Weighted, Duck, "),
         ("yours.py:X", "there is no file yours.py"),
         ("mine:Gel", "expected FILE.py:NAME"),
         ("ends.py:X", "SystemExit: 7"),

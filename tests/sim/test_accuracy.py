@@ -46,7 +46,7 @@ def test_figures(report):
 
 
 def test_a_limit_cycle_has_its_forces_deviation():
-    """A cycle's deviation is that of the last 4000 ticks of the most varying channel; the exact engine has no error."""
+    """The deviation is the largest standard deviation of a channel's force in the last 4000 ticks of the cycle."""
     scenario = load().replace(duration=5.0)
     loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
     row = measure(reference(*loops), "exact", None, None)
@@ -67,7 +67,7 @@ def test_bad_duration():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """The run of Figure 5 leaves the credible limits at 7.35 s; positions give transmission forces and speeds."""
+    """The run of Figure 5 leaves the credible limits at 7.35 s; forces and speeds follow from its positions."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
