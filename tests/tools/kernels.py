@@ -5,7 +5,7 @@ tests must pass with all of them. Two more settings round differently: NumPy wit
 chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
-    python tests/tools/kernels.py --one           one foreign kernel; the next commit takes the next (for CI)
+    python tests/tools/kernels.py --one           one foreign kernel, chosen by the commit (for CI)
     python tests/tools/kernels.py --only HASWELL  only this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
@@ -78,13 +78,14 @@ def settings() -> dict[str, dict[str, str]]:
 
 
 def foreign(every: dict[str, dict[str, str]]) -> str:
-    """Return a kernel other than the native one, in turn for consecutive commits; "native" if there is no other.
+    """Return a kernel other than the native one, chosen by the commit's hash; "native" if there is no other.
 
+    A count of the commits would always be 1 in a shallow clone.
     PRESCOTT, the kernel of processors before 2008, takes a fifth longer and is left to the run of every setting.
     """
     others = [name for name in every if name in NEEDS and name != "PRESCOTT"]
-    count = subprocess.run(["git", "rev-list", "--count", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout
-    return others[int(count or 0) % len(others)] if others else "native"
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    return others[int(commit or "0", 16) % len(others)] if others else "native"
 
 
 def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int, int, float]:
