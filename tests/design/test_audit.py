@@ -1,4 +1,4 @@
-"""python -m design.audit: closed forms, the paper's gains, edges that are edges, strict JSON, bad calls."""
+"""Tests of `python -m design.audit`: closed forms, the paper's gains, edges, strict JSON and bad calls."""
 
 import json
 import re
@@ -32,13 +32,13 @@ SAFE = SpringDamper([870.0, 545.0], [0.38, 0.52])
 
 
 def pair(coupling, **changes) -> tuple[Loop, Coupling]:
-    """A coupling in the default scenario's loop."""
+    """Return the default scenario's loop with `changes`, and the coupling."""
     loop = {"T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37), "environment": FIGURE_4} | changes
     return Loop(lam=loop["theta"], **loop), coupling
 
 
 def report(*subject):
-    """As its JSON."""
+    """Return the audit as plain JSON values."""
     return plain(audit(*subject))
 
 
@@ -61,7 +61,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 
 def strict(text: str) -> dict:
-    """JSON without the NaN and Infinity that Python would accept."""
+    """Parse JSON, and refuse the NaN and Infinity that Python would accept."""
 
     def refuse(constant: str):
         raise AssertionError(f"{constant} is not JSON")
@@ -74,7 +74,7 @@ def strict(text: str) -> dict:
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
-    """K T/2 + B without delay, 3 K T/2 with one sample; Theorem 4 asks (theta + 1)^2 K T/2 of a spring."""
+    """A wall needs K T/2 + B without delay. A spring with one sample needs 3 K T/2, and 2 K T by Theorem 4."""
     subject = wall(K, B, theta)
     assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
     assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
@@ -82,7 +82,7 @@ def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environ
 
 @pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
 def test_rigid_wall_couplings_are_proved_and_stored(theta, proved, tmp_path):
-    """It needs 500 and 1500 N/m times T; a wall that is never left, so that nothing else is promised."""
+    """A wall of 1000 N/m needs (theta + 1/2) 1000 N/m times T. With delay the guarantee covers a rigid wall only."""
     loop, coupling = wall(1000, 0, theta, delta=1.51 if proved else 1.49)
     needs = certify(loop, coupling)
     assert needs["this-environment"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
@@ -116,7 +116,7 @@ def test_a_rigid_wall_is_the_stiff_limit():
 
 @pytest.mark.parametrize(("condition", "theta", "K"), [("this-environment", 0, 2340), ("any-environment", 0, 2340)])
 def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
-    """2 (delta - B)/T."""
+    """The stiffest spring without delay has K = 2 (delta - B)/T."""
     assert stiffest(*wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
 
 
@@ -178,7 +178,7 @@ def test_the_papers_gains_and_their_figures():
 
 
 def test_rounded_any_environment_gains_of_the_literature():
-    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the this-environment condition."""
+    """Theorem 4 needs 0.02 % more damping than is available; the this-environment condition needs far less."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
     assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
@@ -287,7 +287,7 @@ def test_edge_takes_the_certified_side():
     ],
 )
 def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside):
-    """The edge is exact to 1e-7. Bisection would take 24 values, and brentq on the way to 1e-12 about ten."""
+    """The edge is exact to 1e-7 after at most 8 values. Bisection would take 24."""
     values = []
 
     def swept(x):
@@ -345,7 +345,7 @@ def test_gains_of_a_device_name_their_source(run):
 
 @pytest.fixture
 def files(tmp_path):
-    """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
+    """Write a spring-damper, the same as a state space, an unstable coupling and a malformed file."""
     loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
     coupling_file.save(coupling_file.Stored.of(loop, SAFE), tmp_path / "gains.json")
     coupling_file.save(coupling_file.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
@@ -469,12 +469,12 @@ def test_help_has_an_example(run):
 
 def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
     argv = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
-    needless = {"cvxpy", "scipy.linalg", "scipy.sparse"}  # SciPy's Python code takes a tenth of an audit
+    needless = {"cvxpy", "scipy.linalg", "scipy.sparse"}  # SciPy's imports take a tenth of an audit
     code = f"import sys, cli.audit as a; r = a.main({argv!r}); sys.exit(r or bool({needless} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
-# time
+# Budgets of time
 
 
 def test_long_computations_are_refused_or_ended(monkeypatch):

@@ -1,4 +1,4 @@
-"""A certificate is a proof, agrees with the sweep, survives the file, and does not survive tampering."""
+"""Certificates are proofs, agree with the sweep, survive saving and loading, and are refused after tampering."""
 
 import os
 from fractions import Fraction
@@ -39,14 +39,14 @@ change = msgspec.structs.replace
 
 
 def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loop:
-    """One device against a spring and a damper to the ground, without delay."""
+    """Return the loop of one device that a spring and a damper join to the ground, without delay."""
     network = Network(contacts=("tip",), springs=(Spring(("tip", "ground"), stiffness, damping),))
     return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
 def test_environment_delay_is_proved_with_its_multiplier(psi):
-    """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
+    """With psi >= 1 a proof of Theorem 4 needs a large enough Phi and guarantees this environment only."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(loop)
     stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "any-environment", found.phi))
@@ -93,7 +93,7 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
 def test_safe_gains_are_proved_again_from_files(tmp_path, coupling, condition, ratio):
     stored = certified(DEFAULT, coupling, condition)
     assert stored.certificate.proof == "rational"
-    if ratio:  # the figures of the design notes, to the digits that they have
+    if ratio:  # the design notes give these ratios
         assert stored.certificate.required[0] / 1.37 == pytest.approx(ratio, abs=1e-3)
     save(stored, tmp_path / "coupling.json")
     assert load(tmp_path / "coupling.json") == stored
@@ -140,7 +140,7 @@ def test_three_channels_with_unequal_delays_and_dampings():
 
 def test_a_general_compliance_is_proved_under_both_conditions():
     V = controller_coupling.SpringDamper([800.0, 500.0], [0.39, 0.52]).compliance(1.2e-3)
-    crossed = Lti(V.A, V.B, V.C, V.D + 1e-5, V.T)  # full, and symmetric at z = 1
+    crossed = Lti(V.A, V.B, V.C, V.D + 1e-5, V.T)  # V has entries off the diagonal, and V(1) is symmetric
     rounded = Compliance(Lti(*(np.round(getattr(crossed, n), 12) for n in "ABCD"), V.T))
     for condition in ("this-environment", "any-environment"):
         assert verify(certified(DEFAULT, rounded, condition)).proved
@@ -164,7 +164,7 @@ def test_only_this_environment_proves_environment_delay():
 
 @pytest.mark.parametrize("count", [12, pytest.param(60, marks=pytest.mark.validate)])
 def test_proof_and_sweep_agree_on_both_sides(count):
-    """Random loops; between 1 - 1e-4 and 1 either outcome is fair."""
+    """A random loop is proved exactly if the ratio is below 1; from 1 - 1e-4 to 1 either outcome is accepted."""
     rng = np.random.default_rng(7)
     outcomes = []
     for _ in range(count):
@@ -180,7 +180,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """A star of one to three contacts whose devices have 0.5 to 2 times the damping that is needed."""
+    """Return a star of one to three contacts with 0.5 to 1.5 times the needed damping, of at most 100."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]
@@ -288,17 +288,17 @@ def test_proof_entries_beyond_floating_point_are_rejected():
     assert "beyond the range of floating point" in verify(change(good, certificate=forged)).reason
 
 
-# what would not be the same system, and what would take minutes
+# Rounding that changes the system, and proofs that would take minutes
 
 
 def cancelling(size: float) -> Compliance:
-    """2 mm/N, and three equal modes whose coefficients cancel as decimals: size + 0.1, -size and -0.1."""
+    """Return 2 mm/N plus three equal modes whose coefficients size + 0.1, -size and -0.1 cancel as decimals."""
     return Compliance(Lti(0.5 * np.eye(3), np.ones((3, 1)), [[size + 0.1, -size, -0.1]], [[2e-3]], 1e-3))
 
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 def test_realisations_changed_by_rounding_are_refused(condition):
-    """Over the rationals the modes are not there. The tick in floating point keeps some of them."""
+    """The modes cancel in exact arithmetic, but rounding in floating point leaves a part of them."""
     loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
     assert verify(certified(loop, cancelling(1.0), condition)).proved
     with pytest.raises(NotProved, match=r"rounding may change the forces by 1\.\de-04 of the largest one"):
@@ -311,7 +311,7 @@ def test_realisations_changed_by_rounding_are_refused(condition):
 
 
 def test_the_bound_on_rounding_holds_for_a_tick():
-    """Forces of 1000 ticks against the same ticks over the rationals."""
+    """The forces of 200 ticks differ from those of exact ticks by at most 3 sqrt(200) times `rounding`."""
     loop, rng = change(wall(1000.0, 2.0, 5.0), theta=(1,), lam=(1,)), np.random.default_rng(8)
     for size in (1.0, 1e3):
         running, exact = loop.F(cancelling(size)), loop.F(cancelling(size), exact=True)
@@ -327,9 +327,10 @@ def test_the_bound_on_rounding_holds_for_a_tick():
 
 
 def test_near_sharp_resonances_proof_and_run_agree():
-    """A gram beside 50 kg: both exactly, at a rational point of the circle beside the peak.
+    """The float and the rational loop are compared exactly at a point of the circle near a sharp peak.
 
-    The Schur form of either misses it by more than the two are apart; the bound holds, and the filter is proved.
+    The Schur form of the rational loop errs by more than their difference. `rounding` still bounds that difference,
+    and the filter is proved.
     """
     springs = (("a", "m", 1000.0, 0.01), ("m", "n", 100.0, 0.0), ("n", "k", 1000.0, 0.0), ("k", "b", 3000.0, 0.01))
     parts = tuple(Spring((one, other), stiffness, damping) for one, other, stiffness, damping in springs)
@@ -414,7 +415,7 @@ def test_irregular_or_huge_files_are_one_line(tmp_path):
         load(tmp_path / "large.json")
 
 
-# what is asked, and of what
+# The any-environment condition
 
 
 def test_any_environment_ignores_the_realisation_and_walls():
@@ -428,7 +429,7 @@ def test_any_environment_ignores_the_realisation_and_walls():
     assert behind.required == pytest.approx(required_damping(PAIR, SOFT, "any-environment").required, rel=1e-9)
 
 
-# time
+# Budgets of time
 
 
 def test_too_long_exact_arithmetic_ends_in_one_line(monkeypatch):
@@ -445,7 +446,7 @@ def test_too_long_exact_arithmetic_ends_in_one_line(monkeypatch):
         prove(PAIR.switching(DelayRange((1, 2), (1, 3))), SOFT, "this-environment")
 
 
-# bodies that drift
+# Bodies that can drift
 
 
 DRAGGED = Network(("a",), (Spring(("a", "m1"), 0.0, 3.0), Spring(("m1", "m2"), 200.0, 0.1)), {"m1": 0.5, "m2": 0.3})
@@ -467,14 +468,14 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
 
 
 def test_proof_and_sweep_agree_on_any_network():
-    """`make validate` does so for 500."""
+    """Proof and sweep agree on 20 random networks."""
     found = list(proofs(11, 20))
     assert [row for row in found if not row.holds] == []
     assert 6 < sum(row.proved for row in found) < 14
 
 
 def test_every_block_is_measured_before_it_is_proved(monkeypatch):
-    """The states that each exact block will have: so many are one too many, and that is said."""
+    """A block with one state more than the limit is refused, and the message names the limit."""
     loop, coupling = scenario("omega-pair").loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
     wall, one = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
     limited = loop.sent(coupling).order + loop.channels + sum(loop.theta)
@@ -502,7 +503,7 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
 
 
 def test_a_long_delay_is_proved_from_its_file(tmp_path):
-    """Scenarios take up to a thousand samples of delay: so do files."""
+    """The coupling of a loop with a delay of 101 samples is proved, saved and loaded."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
     kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
     save(kept, tmp_path / "late.json")
@@ -518,14 +519,14 @@ def test_a_delay_beyond_all_files_is_refused(psi):
 
 
 def test_a_loop_that_no_file_holds_names_its_field(tmp_path):
-    """`replace` makes a loop whose damping is negative, which files refuse."""
+    """`replace` accepts a negative damping. Saving that loop is refused."""
     stored = Stored(msgspec.structs.replace(PAIR, delta=(1.0, -1.0)), SOFT.form())
     with pytest.raises(InputError, match=r"bad.json: .* > 0.0 - at `\$.loop.delta"):
         save(stored, tmp_path / "bad.json")
     assert not (tmp_path / "bad.json").exists()
 
 
-# the edge
+# Damping equal to the requirement
 
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])

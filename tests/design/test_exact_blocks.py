@@ -1,8 +1,8 @@
-"""The exact blocks and the search for their proofs, without the sweep that usually speaks first.
+"""Tests of the exact blocks and of the search for their proofs, without the sweep that usually runs first.
 
-Each family of blocks is built over Fractions at a damping just above and just below a limit that is computed here, by
-a closed form or by a dense sweep of formulas written out here: above it a proof is found, below it the same proof is
-refused and none is found. Then `prove` and `verify` with their sweep disarmed, and forgeries.
+Each family of blocks is built over Fractions at a damping just above and just below a limit. A closed form or a dense
+sweep of formulas in this file gives the limit. Above the limit a proof is found. Below it the same proof is refused
+and no other is found. Later tests replace the sweep of `prove` and `verify`, and forge certificates.
 """
 
 from collections.abc import Callable
@@ -36,12 +36,12 @@ from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.exact import _prove_positive_real, find_storage
 from haptic_loop.design.result import NotProved, from_ratio
 
-CLOSE = 1e-6  # relative, on either side of a limit
+CLOSE = 1e-6  # relative distance from a limit, on either side
 change = msgspec.structs.replace
 
 
 def assert_limit(block: Callable[[float], Lti], limit: float) -> None:
-    """The block is proved strictly positive real just above the limit and not just below."""
+    """Assert that the block is proved strictly positive real just above the limit, but not just below it."""
     above, below = block(limit * (1 + CLOSE)), block(limit * (1 - CLOSE))
     P, reason = find_storage(above)
     assert P is not None, reason
@@ -51,7 +51,7 @@ def assert_limit(block: Callable[[float], Lti], limit: float) -> None:
 
 
 def highest(value: Callable[[np.ndarray], np.ndarray]) -> float:
-    """The supremum over the circle of value(w), (k,) -> (k,), by a dense grid and a search around its best points."""
+    """Return the supremum of value(w), (k,) -> (k,), over the circle: search around the best points of a grid."""
     grid = np.unique(np.concatenate([np.geomspace(1e-4, np.pi, 20_000), np.linspace(1e-4, np.pi, 20_000)]))
     values = value(grid)
     best = float(values.max())
@@ -67,7 +67,7 @@ def he(G):
 
 
 def figure_4(z):
-    """E(z) of Figure 4 by hand: 800 N/m and 700 N/m with 1 N s/m each, and 1 kg between."""
+    """Return E(z) of Figure 4: springs of 800 and 700 N/m with 1 N s/m each hold a mass of 1 kg."""
     s = (1 - 1 / z) / T
     p, q = 800 + s, 700 + s
     return np.moveaxis(
@@ -80,7 +80,7 @@ def late(z, steps):
 
 
 def sent(z, coupling, psi=(0, 0)):
-    """(I + Psi E V)^-1 Psi E by hand."""
+    """Return (I + Psi E V)^-1 Psi E from its formula."""
     s = (1 - 1 / z) / T
     V = np.array([1 / (k + b * s) for k, b in zip(coupling.K, coupling.B, strict=True)]).T[:, :, None] * np.eye(2)
     X = late(z, psi) @ figure_4(z)
@@ -111,19 +111,19 @@ def test_the_exact_block_holds_the_damping_exactly():
 
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_this_environment_against_a_spring(theta):
-    """(theta + 1/2) K T."""
+    """The limit is (theta + 1/2) K T."""
     F = loop(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
 
 
 def test_this_environment_against_a_spring_and_a_damper():
-    """K T/2 + B."""
+    """The limit is K T/2 + B."""
     F = loop(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
 
 
 def test_this_environment_over_two_channels_that_are_joined():
-    """(theta + 1/2) T times the largest eigenvalue of K relatively to the dampings."""
+    """The limit is (theta + 1/2) T times the largest eigenvalue of K relative to the dampings."""
     K, ratio = np.array([[900.0, -300.0], [-300.0, 400.0]]), np.array([1.0, 0.37])
     springs = (Spring(("a", "b"), 300.0), Spring(("a", "ground"), 600.0), Spring(("b", "ground"), 100.0))
     F = loop(Network(("a", "b"), springs), (2, 2)).F(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
@@ -146,8 +146,10 @@ def test_this_environment_against_a_dense_sweep(theta, psi):
 
 
 def any_environment_limit(K: float, B: float, theta: int) -> float:
-    """sup |K T (1 + .. + z^-theta) + B (1 - z^-n)|^2 / (4 (K T/2 + B)): He[1/c] = Re c/|c|^2 with
-    c = K T/(1 - 1/z) + B."""
+    """Return sup |K T (1 + .. + z^-theta) + B (1 - z^-n)|^2 / (4 (K T/2 + B)) with n = theta + 1.
+
+    The formula follows from He[1/c] = Re c/|c|^2 with c = K T/(1 - 1/z) + B.
+    """
 
     def needed(w):
         z = np.exp(1j * w)
@@ -170,7 +172,7 @@ def test_any_environment_of_one_spring_damper(K, B, theta):
 
 
 def test_any_environment_of_a_full_compliance():
-    """Spring-dampers along rotated axes: the needier of the two decides."""
+    """With spring-dampers along rotated axes, the one that needs more damping sets the limit."""
     turn = np.array([[Fraction(3, 5), Fraction(-4, 5)], [Fraction(4, 5), Fraction(3, 5)]])
     V = turn @ SpringDamper([900.0, 700.0], [0.4, 0.3]).compliance(rational(T)) @ turn.T
     limit = max(any_environment_limit(900.0, 0.4, 1), any_environment_limit(700.0, 0.3, 1))
@@ -182,14 +184,14 @@ def test_any_environment_of_a_full_compliance():
 
 @pytest.mark.parametrize("psi", [1, 2, 5])
 def test_the_multiplier_that_a_delayed_spring_asks(psi):
-    """Phi > (psi - 1/2) K T: He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
+    """Phi must exceed (psi - 1/2) K T, as He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
     E = loop(to_ground(1000.0), (0,), (psi,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), (psi - 0.5) * 1000 * T)
 
 
 def test_the_multiplier_of_a_delayed_spring_damper():
-    """K T/2 + B, at w = 0 no, at w = pi yes."""
+    """The limit is K T/2 + B, from w = pi; w = 0 alone would need less."""
     E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), 700 * T / 2 + 0.9)
@@ -206,7 +208,7 @@ def test_figure_4s_multiplier_matches_a_dense_sweep():
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.45])
 def test_a_spring_behind_delay_with_its_multiplier(share):
-    """theta = 1: T/(2 delta) < (T/phi - 2/K)/(K (4 T/phi - 6/K)) at w = 0, and < (T/phi - 2/K)/2 at w = pi."""
+    """T/(2 delta) must be below (T/phi - 2/K)/(K (4 T/phi - 6/K)) at w = 0 and (T/phi - 2/K)/2 at w = pi."""
     K, a = 900.0, 1 / 900.0
     phi = share * K * T / 2
     least = min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2)
@@ -238,7 +240,7 @@ def test_a_spring_damper_behind_delay_with_its_multiplier():
 @pytest.mark.parametrize(("lo", "hi"), [(0, 1), (1, 3)])
 @pytest.mark.parametrize("weight", [0.5, 1.0, 3.0])
 def test_switching_against_a_spring(lo, hi, weight):
-    """alpha/2 + h^2 K^2/(2 alpha) + K ((lo + hi)/2 + 1/2), times T: with alpha = h K it is (hi + 1/2) K T."""
+    """The limit is T (alpha/2 + h^2 K^2/(2 alpha) + K ((lo + hi)/2 + 1/2)), or (hi + 1/2) K T if alpha = h K."""
     K, h = 1000.0, (hi - lo) / 2
     alpha = weight * h * K
     G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
@@ -270,7 +272,7 @@ def test_switching_against_a_dense_sweep(lo, hi):
 
 @pytest.mark.parametrize("longest", [T, 1.7 * T])
 def test_the_longest_period_scales_each_block(longest):
-    """T_max/T times what the even period asks; of a spring behind two samples 2.5 K T_max."""
+    """A longest period T_max needs T_max/T times the damping for the even period T."""
     rigid = Compliance(Lti.constant([[0.0]], T))
     F, V = loop(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
     assert_limit(lambda d: both(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
@@ -282,7 +284,7 @@ def test_the_longest_period_scales_each_block(longest):
 
 @pytest.mark.parametrize(("first", "last", "longest"), [(1.3e-4, 1.3e-4, T), (0.0, 5e-4, T), (2e-4, 6e-4, 1.5e-3)])
 def test_a_wall_that_latches_late(first, last, longest):
-    """(d/t2 - 3 K/2)(d/(T_max - t1) - K/2) = K^2, its larger root."""
+    """For latencies t1 to t2 the limit is the larger root d of (d/t2 - 3 K/2)(d/(T_max - t1) - K/2) = K^2."""
     K, a, b = 1000.0, 1 / last, 1 / (longest - first)
     limit = max(np.roots([a * b, -K * (a + 3 * b) / 2, -(K**2) / 4]))
     F = loop(to_ground(K), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
@@ -291,7 +293,7 @@ def test_a_wall_that_latches_late(first, last, longest):
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
 def test_a_limited_spring(theta, c):
-    """The block by hand: its part with d is [1, 1; 1, 1] d/T, nothing on (1, -1), so a Schur complement is left."""
+    """The damping d enters the block as [1, 1; 1, 1] d/T, 0 on (1, -1), so a Schur complement gives the limit."""
     K, rho = 1000.0, 20.0
 
     def needed(w):
@@ -308,7 +310,7 @@ def test_a_limited_spring(theta, c):
 
 @pytest.mark.parametrize(("theta", "g"), [(0, 1.0), (1, 2.0), (2, 0.7)])
 def test_a_wall_on_the_device_itself(theta, g):
-    """(theta + 1 + g)^2 K T/(4 g + 2), a = g K: no force but the wall's, so only what is late varies on the circle."""
+    """The limit is (theta + 1 + g)^2 K T/(4 g + 2) with the multiplier g K; only the wall exerts a force."""
     wall = Wall(("tip", "ground"), 3000.0)
     network = Network(("tip",), (), walls=(wall,))
     G = loop(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
@@ -316,12 +318,12 @@ def test_a_wall_on_the_device_itself(theta, g):
     assert_limit(lambda d: both(walls_demand(G, [d], [3000.0], [g * 3000.0])), limit)
 
 
-# prove and verify, with the sweep saying yes to everything
+# `prove` and `verify` with a sweep that certifies every loop
 
 
 @pytest.fixture
 def disarmed(monkeypatch):
-    """The sweeps find half of the damping enough, whatever the loop."""
+    """Replace the sweep by one that requires half of the available damping in every loop."""
 
     def content(asked: Loop, coupling, condition, multiplier=None):
         usual = ALPHA if asked.varying_delay else None
@@ -358,7 +360,7 @@ def test_each_condition_is_proved_by_its_own_block():
 
 @pytest.mark.usefixtures("disarmed")
 def test_every_vertex_of_a_range_is_proved():
-    """The stiffest spring decides, and is named."""
+    """The vertex with the stiffest spring sets the limit, and the refusal names it."""
     asked = change(
         loop(to_ground(1000.0), (1,)), ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),))
     )
@@ -385,15 +387,15 @@ def test_delay_ranges_are_proved_by_their_block():
     asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
     assert limits[1] > 1.01 * limits[0]
-    assert limits[0] == pytest.approx(1.5 * K * T)  # where the sharper multiplier asks no more than theta = 1 does
+    assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2 needs no more than theta = 1
     assert_loop_limit(asked, NoCoupling(), "this-environment", limits[1])
 
 
-# forgeries: everything that a forger can repair is repaired
+# Forged certificates with renewed digests and seals
 
 
 def forged(asked: Loop, coupling, made, **changes) -> str | None:
-    """Why the certificate with these fields is refused, its digests made good."""
+    """Return why `verify` refuses the certificate with these fields and renewed digests, or None."""
     fields = {"scenario": digest(asked, coupling.form())} | changes
     return verify(Stored.of(asked, coupling, sealed(change(made, **fields)))).reason
 
@@ -404,11 +406,11 @@ NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of f
 def test_proofs_serve_only_their_own_condition():
     asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
     here, anywhere = (prove(asked, coupling, condition) for condition in ("this-environment", "any-environment"))
-    assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # it is not the size that gives it away
+    assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # so the size does not reveal the exchange
     assert forged(asked, coupling, anywhere) is None
     assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
     assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
-    soft = change(asked, environment=to_ground(100.0))  # any-environment's proof is far from this environment's need
+    soft = change(asked, environment=to_ground(100.0))  # another block of the same size
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 
@@ -416,7 +418,7 @@ def test_the_nominal_proof_does_not_serve_vertices():
     asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
     asked = change(asked, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
     made = prove(asked, NoCoupling(), "this-environment")
-    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # of the neediest vertex
+    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # by the vertex that needs most
     nominal = made.matrices["P"]
     assert forged(asked, NoCoupling(), made) is None
     reason = forged(asked, NoCoupling(), made, matrices={"P": nominal, "P1": nominal, "P2": nominal})
@@ -456,7 +458,7 @@ def test_slight_asymmetry_is_refused_behind_delay_and_switching():
 
 
 def test_a_slightly_indefinite_static_stiffness_is_refused():
-    """1000 N/m less 1000^2 (0.001 + 1e-18): nothing of it is left in floating point."""
+    """The second diagonal entry of F(1) is 1000 - 1000^2 (0.001 + 1e-18) = -1e-12 N/m."""
     asked = loop(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
 
     def model(tap):
@@ -477,7 +479,7 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     made = prove(asked, coupling, "any-environment", [phi])
     assert forged(asked, coupling, made) is None
     claimed = from_ratio("any-environment", made.required[0] / 4.0, (4.0,), 1.0)
-    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # the figures on file, for any Phi
+    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # as stored, for any Phi
 
     def with_phi(value: float) -> str | None:
         return forged(asked, coupling, made, multipliers={"Phi": (value,)})
