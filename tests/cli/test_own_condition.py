@@ -120,7 +120,7 @@ def test_designs_that_do_not_take_it_are_refused(words, message, folder, monkeyp
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        ("joined_devices.py:Nothing", "has no Nothing, but JoinedDevices"),
+        ("joined_devices.py:Nothing", "has no Nothing; it defines JoinedDevices"),
         ("joined_devices.py:np", "has no np"),
         ("nowhere/mine.py:Mine", "there is no file nowhere/mine.py"),
         ("pathlib:Path", "expected FILE.py:NAME"),

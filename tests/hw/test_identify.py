@@ -364,6 +364,14 @@ def test_a_device_of_three_axes_is_one_table():
         assert read.credible_speed == pytest.approx(0.6 - 0.1 * (len(axes) - 1), abs=1e-3)
 
 
+def test_fast_swings_of_unknown_masses_are_no_jumps(tmp_path):
+    """A compliant device swings at 84 Hz by 1 mm, more than the forces would move the declared mass."""
+    options = "--rehearse --measure 60 --seconds 0.5 --travel 10 --sittings 1"
+    identify_command([*options.split(), "--out", str(tmp_path)])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["session"]["log"][-1]["stage"] == "finished"
+
+
 @pytest.mark.parametrize(("axis", "sign"), checkered([0, 1], [1, -1]))
 def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     """Each handle must move by 5 mm. A person then has 5 s (here 0.2 s) to let go, anew after each move back."""
