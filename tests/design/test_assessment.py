@@ -1,4 +1,4 @@
-"""The guarantee of an assessment: it is there for exactly what was proved, and gone where anything else runs."""
+"""Tests of the guarantee of an assessment: another loop, coupling or law of the forces loses it."""
 
 import json
 from functools import cache
@@ -29,7 +29,7 @@ from tests.asked import needs, safe_with
 
 LOOP = load("omega-pair").loop("I")
 SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified for any environment
-HERE_ONLY = SpringDamper([7000.0, 2900.0], [0.42, 1.69])  # 98 % of the damping, in this environment
+HERE_ONLY = SpringDamper([7000.0, 2900.0], [0.42, 1.69])  # needs 98 % of the damping in this environment
 change = msgspec.structs.replace
 
 
@@ -114,7 +114,7 @@ def test_a_sweep_of_limited_forces_is_no_proof():
 
 
 def test_a_proof_without_the_limiter_is_partial(monkeypatch):
-    """The linear loop is proved, its limiter only swept: the guarantee, also at the limits, rests on a sweep."""
+    """The linear loop is proved, but its limiter is only swept, so the guarantee rests on a sweep."""
 
     def refuse(*args, **kwargs):
         raise NotProved("a proof takes long")
@@ -147,7 +147,7 @@ def test_lost_packets_end_the_guarantee():
     assert assessed(lossy, "I", chosen).guarantee is None
 
 
-# The shell behind which a user's own environment runs.
+# The shell around a user's own environment.
 
 
 def spring(u):
@@ -178,7 +178,7 @@ def test_the_shell_needs_a_coupling_for_any_environment(changes, coupling, holds
 
 
 def test_the_energy_budget_is_what_its_run_guarantees():
-    """Forces that the budget scales are no longer those of the certified law: the account is what holds."""
+    """The certificate does not cover forces that the budget scales, so the guarantee is that of the budget."""
     scenario = load("omega-pair").replace(duration=0.1)
     meta = simulate(scenario, HERE_ONLY, "exact", energy_budget=0.02).meta
     guarantee = meta["assessment"]["guarantee"]
@@ -219,7 +219,7 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
         assert there["assessment"]["reason"]
 
 
-# One wall: every command says what the condition for walls requires, none what a contact that is never left does.
+# One wall: every command reports the damping for making and breaking contact, not that for permanent contact.
 
 
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.validate)])
@@ -247,7 +247,7 @@ def test_one_wall_has_one_requirement(tmp_path, monkeypatch, every):
 
 
 def test_switching_before_walls_needs_more_damping():
-    """What is certified for a constant delay is not certified for delays that switch around it."""
+    """A coupling that is certified for a constant delay is not certified for delays of 0 to 2 samples."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert assess(loop, coupling).holds
     switching = assess(change(loop, varying_delay=DelayRange((0,), (2,))), coupling)

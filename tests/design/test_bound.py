@@ -1,4 +1,4 @@
-"""The bound on linear couplings: its dual matrix is nonnegative on the whole circle, and not only at samples."""
+"""Tests of the bound on linear couplings: its dual matrix is nonnegative on the whole circle, also between samples."""
 
 from functools import cache
 from pathlib import Path
@@ -16,7 +16,7 @@ from haptic_loop.design.frequency import hermitian
 from haptic_loop.sim.scenario import load
 
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
-POINTS = 2**20  # of the transform
+POINTS = 2**20  # points of the Fourier transform
 
 
 def loop_of(name):
@@ -25,7 +25,7 @@ def loop_of(name):
 
 @cache
 def judged(name):
-    """The bound, and (dual, point, uncharged value, charged value) of the point behind it."""
+    """Return the bound, and (dual, point, uncharged value, charged value) for the largest charged value."""
     calls, charged = [], module._Dual.charged
 
     def recorded(self, x, value, swept):
@@ -40,7 +40,7 @@ def judged(name):
 
 
 def transformed(dual, x):
-    """D on the upper half of the circle, from the coefficients of H by a transform, and from the C_k."""
+    """Return D on the upper half of the circle, from a Fourier transform of H and from the matrices C_k."""
     m, root = dual.loop.channels, np.sqrt(dual.loop.delta)
     w = np.linspace(0, np.pi, POINTS // 2 + 1)
     inner = dual.heights.shape[1]
@@ -69,7 +69,7 @@ def transformed(dual, x):
     [*(pytest.param(name, marks=pytest.mark.validate) for name in ("I", "II", "n2")), "n3"],
 )
 def test_the_charged_matrix_is_nowhere_negative(name):
-    """A transform of 2^20 points knows nothing of dilogarithms; it agrees with the bound to 2 % of the charge."""
+    """A Fourier transform of 2^20 points finds D plus the charge nonnegative, to 2 % of the charge."""
     found, (dual, x, value, charged) = judged(name)
     m = dual.loop.channels
     charge = (value - charged) / m
@@ -77,7 +77,7 @@ def test_the_charged_matrix_is_nowhere_negative(name):
     assert found.proved
     assert charge > 0
     assert least + charge > -0.02 * charge
-    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # and little more is charged than is missing
+    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # the charge is not much too large
 
 
 @pytest.mark.validate  # tests/design/test_limits.py computes the bound of case I in the suite
@@ -103,7 +103,7 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
 
 @pytest.mark.parametrize("name", ["n1-omega-II", "o12-free-mass-late"])
 def test_the_integral_errs_by_less_than_its_bound(name):
-    """-tr C_0 - 2 <H, Lambda E> - <H, H/w> by Simpson's rule with 400 steps in each interval, E from its states."""
+    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/w>."""
     loop = loop_of(name)
     dual = module._Dual.of(loop, (1.0, 100.0), 16)
     x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)
@@ -138,7 +138,7 @@ def test_what_is_negative_only_between_samples_is_found():
 
 
 def test_a_bound_holds_between_sharp_bends():
-    """Bends 1e-5 apart: D turns within them, where no sample lies."""
+    """D turns sharply between bends of H that are 1e-5 apart, where no sample lies."""
     random = np.random.default_rng(0)
     grid = np.sort(np.concatenate([np.linspace(0.2, 1.0, 12), 0.6 + 1e-5 * np.arange(1, 5)]))
     heights = random.normal(size=(grid.size, 2, 2)) + 1j * random.normal(size=(grid.size, 2, 2))
@@ -152,7 +152,7 @@ def test_a_bound_holds_between_sharp_bends():
 
 
 def test_a_bound_names_its_condition():
-    """Without a coupling, which known devices allow here, the mismatch is zero."""
+    """The bound is for this-environment only: known devices are certified here without any coupling."""
     loop = load("omega-pair-known").loop("I")
     known = haptic_loop.assess(loop, NoCoupling(), limiter=False)
     assert known.guarantee is not None
@@ -168,7 +168,7 @@ def test_only_a_proved_bound_is_called_one(monkeypatch):
     assert BoundBeside(-3.0, proved=True).words.startswith(limit)
     assert "no linear coupling" not in BoundBeside(-3.0).words
     assert BoundBeside(-3.0).words.startswith("estimate")
-    unequal, _ = judged("n4")  # psi = 1, 0: what the delays forbid is known up to rounding
+    unequal, _ = judged("n4")  # psi = 1, 0: the forbidden directions are known only up to rounding
     assert not unequal.proved
     monkeypatch.setattr(DualMatrix, "lower", lambda self, swept, wanted: (-10.0, swept, np.ones(swept.size)))
     nothing = bound(loop_of("n3"), knots=8)

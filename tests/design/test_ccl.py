@@ -1,4 +1,4 @@
-"""State-space couplings: the realisation, what the descent reaches, and that every result stands on its own."""
+"""Tests of state-space couplings: their realisation, the descent, and certificates of the results."""
 
 import warnings
 
@@ -34,7 +34,7 @@ LONE = Loop(T, (1,), (0,), (1,), (1.37,), HELD)
 
 @pytest.fixture(scope="module", params=[LONE, pytest.param(asked(), marks=pytest.mark.validate)], ids=["one", "pair"])
 def inner(request):
-    """Return a loop and its design, of one device in the suite."""
+    """Return a loop and its design: one device, and with `make validate` also a pair."""
     return request.param, ccl.design(request.param)
 
 
@@ -59,7 +59,7 @@ def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case
     expected = (left @ family.coupling(p).at(Z) + late) @ right
     np.testing.assert_allclose(family.weighted_loop(p).at(Z), expected, atol=1e-9 * np.abs(expected).max())
     V = family.coupling(p)
-    demand = any_environment_demand(Lti(V.A, V.B, V.C, V.D, T), loop)  # by the quotient that is solved for, in SI units
+    demand = any_environment_demand(Lti(V.A, V.B, V.C, V.D, T), loop)  # from V itself, in SI units
     root = np.sqrt((1 - RESERVE) * np.array(loop.delta) / T)
     wanted = demand.gain.at(Z) + demand.free.at(Z) / (1 - RESERVE)
     np.testing.assert_allclose(family.block(p).at(Z), root[:, None] * wanted * root, atol=1e-9)
@@ -110,7 +110,7 @@ def test_every_descent_step_is_feasible_and_better():
         assert norm < before
 
 
-@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # to 1e-4, which is enough
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # an accuracy of 1e-4 is enough
 def test_the_zeros_are_optimal_for_the_poles(inner):
     """With the poles of the design fixed, condition and norm are convex at each frequency: cvxpy finds the optimum."""
     loop, found = inner
@@ -141,7 +141,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
 
 @pytest.mark.parametrize(("loop", "order", "diagonal"), [(asked(), 1, False), (LONE, 3, True)], ids=["pair", "one"])
 def test_three_steps_beat_the_structured_design(loop, order, diagonal):
-    """The start is designed for a thousandth less damping, so it is a thousandth worse; each step gains 1 to 3 %."""
+    """The start leaves a share `_START_ROOM` of the damping unused; three steps gain over ten times that share."""
     structured, design = spring_damper.design(loop), ccl.design(loop, order, diagonal, most_sdps=3)
     assert design.sdps == structured.sdps + 3  # no step ended in the solver's rounding
     assert design.objective < structured.objective * (1 - 10 * _START_ROOM)
@@ -154,7 +154,7 @@ def test_delay_in_the_environment_is_paid_for():
     found = ccl.design(loop, most_sdps=3)
     assert found.requirement.certified
     assert found.phi is not None
-    # never worse than the gains that it starts from, which have room; one kernel's rounding may end it there
+    # The design is never worse than its starting gains, which leave room. Rounding may end the descent there.
     room = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
     assert found.objective <= spring_damper.design(room).objective * (1 + 1e-9)
 
@@ -171,7 +171,7 @@ def test_a_bad_request_gets_one_line(options, message):
 
 
 def test_a_free_mass_is_called_useless(tmp_path, capsys):
-    """It has no static stiffness to render, and its weighted loop is too stiff for SciPy's Lyapunov equation."""
+    """A free mass has no static stiffness, and its weighted loop is too stiff for SciPy's Lyapunov solver."""
     scenario = tmp_path / "free.toml"
     text = 'name = "free"\nT = 1e-3\nduration = 1.0\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\n'
     scenario.write_text(text + 'damping = 1.37\n[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')
@@ -197,7 +197,7 @@ def test_only_searched_springs_are_called_the_softest(condition, searched, tmp_p
 
 
 def test_a_stiff_loop_has_its_reachability_gramian(monkeypatch):
-    """The Gramian by doubling is SciPy's where both are accurate."""
+    """The Gramian by doubling equals SciPy's in a loop where both are accurate."""
     rng = np.random.default_rng(0)
     A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
     G = Lti(0.99 * A / np.abs(np.linalg.eigvals(A)).max(), B, np.eye(4), np.zeros((4, 2)), 1.0)

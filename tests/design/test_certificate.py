@@ -180,7 +180,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of one to three contacts with 0.5 to 1.5 times the needed damping, of at most 100."""
+    """Return a star of one to three contacts with 0.5 to 1.5 times the needed damping, counted as at most 100."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]

@@ -1,6 +1,6 @@
-"""What docs/theory.md and docs/reproducibility.md claim, computed by other means than the code that uses it.
+"""Tests of what docs/theory.md and docs/reproducibility.md claim, by other means than the code that uses it.
 
-Dense sweeps, closed forms and simulated energies. Where a module of the project appears, it is the one on trial.
+The means are dense sweeps, closed forms and simulated energies.
 """
 
 import itertools
@@ -44,18 +44,21 @@ def window(theta):
 
 
 def line(K, B, theta):
-    """(1 - cos n w) / (2 Re 1/W): the damping that Theorem 4 asks of one channel, by frequency."""
-    passivity = (K * T / 2 + B) / np.abs(K / RATE + B) ** 2  # Re 1/W
+    """Return the damping that Theorem 4 needs of one channel, by frequency: (1 - cos n w) / (2 Re V (z-1)/(T z))."""
+    passivity = (K * T / 2 + B) / np.abs(K / RATE + B) ** 2  # Re V (z-1)/(T z)
     return np.sin((theta + 1) * W / 2) ** 2 / passivity
 
 
 def needed(e_hat_inverse, K, B, theta):
-    """sup over frequency of -T Re[F/(z-1)], F = z^-theta (1/E + V)^-1: the damping asked in one environment."""
+    """Return the damping that one environment needs: sup of -T Re[F/(z-1)] with F = z^-theta (1/E + V)^-1."""
     return (-(Z ** -(theta + 1) / (e_hat_inverse + 1 / (K / RATE + B))).real).max()
 
 
 def test_theorem_1_telescopes():
-    """g y - delta y^2 summed, y = G-hat g, is the device's own balance plus (g[k]^2 - g[k-n]^2)/(4 delta)."""
+    """With y = G-hat g, g y - delta y^2 is the device's balance plus (g[k]^2 - g[k-n]^2)/(4 delta).
+
+    Its sums over time are not negative.
+    """
     rng = np.random.default_rng(0)
     for theta in range(4):
         n, N, mass = theta + 1, 400, 0.3
@@ -65,7 +68,7 @@ def test_theorem_1_telescopes():
         balance = np.empty(N)
         passed = np.empty(N)
         for k in range(N):
-            decay = np.exp(-DELTA / mass * T)  # a mass on a damper under a held force, exactly
+            decay = np.exp(-DELTA / mass * T)  # exact for a mass on a damper under a held force
             steady = late[k] / DELTA
             dx = steady * T + (v - steady) * (1 - decay) * mass / DELTA
             v = steady + (v - steady) * decay
@@ -77,9 +80,9 @@ def test_theorem_1_telescopes():
 
 
 def test_sampled_energy_balance_of_devices_and_hands():
-    """Default scenario, exact engine, random forces on the handles: stored energy never exceeds what the ports gave.
+    """In the default scenario the stored energy never exceeds its start plus what the ports supply.
 
-    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, hence (a) of docs/theory.md where w = 0.
+    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx; with w = 0 (a) of docs/theory.md follows.
     """
     rng = np.random.default_rng(1)
     simulation = assemble(load(), PUBLISHED["I"])
@@ -100,7 +103,7 @@ def test_sampled_energy_balance_of_devices_and_hands():
 
 
 def supplied(F, dx):
-    """sum over k < N of f'dx + (1/T) dx' Delta dx, for every N; from rest at x = 0."""
+    """Return the sum over k < N of f'dx + (1/T) dx' Delta dx for every N, from rest at x = 0."""
     x = np.cumsum(np.vstack([np.zeros(2), dx]), axis=0)[:-1]
     _, f, _ = dlsim((F.A, F.B, F.C, F.D, T), x)
     return np.cumsum((f * dx + DELTA / T * dx**2).sum(axis=1))
@@ -116,7 +119,7 @@ def test_certified_forces_give_less_than_devices_dissipate():
             slow = lfilter([1.0], [1.0, -colour], rng.normal(size=(1500, 1)), axis=0)
             dx = 1e-4 * (slow @ rng.normal(size=(1, 2)) + rng.normal(size=(1500, 2)))
             assert supplied(F, dx).min() >= -1e-12
-    # a map that is not certified: the worst direction at the frequency where the condition binds takes energy out
+    # An uncertified map loses energy to motion in the worst direction at the frequency where the condition binds.
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = this_environment(F, (DELTA, DELTA)).frequency_hz
     z = np.exp(2j * np.pi * hz * T)
@@ -136,20 +139,20 @@ def random_pairs(links, count):
 def test_certified_loops_rest_with_random_humans(coupling, links):
     base = load()
     for devices in (base.device, (RigidDevice(), RigidDevice())):
-        for pair in random_pairs(links, 20):  # tests/sim/test_validate.py has hundreds
+        for pair in random_pairs(links, 20):  # tests/sim/test_validate.py has more
             simulation = assemble(base.replace(human=pair, device=devices), coupling)
             assert dominant_mode(close(simulation.plant, simulation.F)).spectral_radius < 1
 
 
 @pytest.mark.slow
 def test_without_coupling_only_the_compliant_device_oscillates():
-    """Figure 5 needs what a first-order device model leaves out."""
+    """A model of rigid devices does not reproduce the oscillations of Figure 5."""
     base, unstable = load(), {}
     for name, devices in (("compliant", base.device), ("rigid", (RigidDevice(), RigidDevice()))):
         loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 60)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 36 < unstable["compliant"] < 56  # 0.78 of many pairs; binomial, within three standard deviations
+    assert 36 < unstable["compliant"] < 56  # 0.78 of many pairs oscillate; three binomial standard deviations
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():
@@ -166,7 +169,7 @@ def test_the_printed_gains_fail_the_papers_condition(coupling, expected):
     found = [line(K, B, n).max() for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True)]
     assert found == pytest.approx(expected, abs=0.005)
     assert min(found) > 2.8 * DELTA
-    # the same without a limit in frequency: |K T vt + B (1 - z^-n)|^2 <= 4 delta (K T/2 + B)
+    # The equivalent |K T window + B (1 - z^-n)|^2 <= 4 delta (K T/2 + B) gives the same figures.
     for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True):
         size = np.abs(K * T * window(n) + B * (1 - Z ** -(n + 1))) ** 2
         assert (size / (4 * (K * T / 2 + B))).max() == pytest.approx(line(K, B, n).max(), rel=1e-6)
@@ -189,7 +192,7 @@ def mismatch_at(z, E, coupling, lam):
 
 @pytest.mark.parametrize("case", ["I", "II"])
 def test_index_25_of_the_default_environment_is_infinite(case):
-    """The least singular value falls as the square of the frequency while the mismatch does not."""
+    """The least singular value falls as the square of the frequency while the mismatch stays above 50."""
     z = np.exp(2j * np.pi * np.array([1e-1, 1e-2, 1e-3]) * T)
     E = figure_4_at(z)
     least = np.linalg.svd(E, compute_uv=False)[:, -1]
@@ -198,9 +201,9 @@ def test_index_25_of_the_default_environment_is_infinite(case):
 
 
 def test_no_reading_of_figure_4_reproduces_tau():
-    """Both springs between any two of {contacts, mass, ground}, the mass free or held by a contact: 66 readings.
+    """In 66 readings each spring joins two of {contacts, mass, ground}, and the mass is free or at a contact.
 
-    On a grid (25) comes out too small, never too large, and already that is far above the printed figures.
+    A grid makes (25) too small, never too large, and even that is more than 60 dB above the printed figures.
     """
     hz = np.unique(np.concatenate([np.geomspace(1e-4, 80, 300), np.linspace(0.1, 80, 300)]))
     z = np.exp(2j * np.pi * hz * T)
@@ -208,7 +211,7 @@ def test_no_reading_of_figure_4_reproduces_tau():
     for first, second, held in itertools.product(*[list(itertools.combinations(nodes, 2))] * 2, ("a", "b", "m")):
         used = set(first) | set(second)
         if not {"a", "b"} <= used | {held} or (held == "m" and "m" not in used):
-            continue  # a contact that nothing reaches, or a mass that nothing joins
+            continue  # A contact or the mass is not connected.
         readings += 1
         E = environment(Network(("a", "b"), (Spring(first, 800.0, 1.0), Spring(second, 700.0, 1.0)), {held: 1.0}), T)
         response = E.at(z)
@@ -223,14 +226,14 @@ def test_no_reading_of_figure_4_reproduces_tau():
 
 
 def test_a_rigid_wall_is_not_the_worst_environment():
-    """theta = 2, K = 610, B = 0.545: 1.3659 for a wall, 1.3769 for 36 g, 1.5160 for any passive environment."""
+    """A wall needs 1.3659 N s/m, a mass of 36 g 1.3769, and any passive environment 1.5160."""
     K, B, theta = 610.0, 0.545, 2
     assert needed(0 * RATE, K, B, theta) == pytest.approx(1.3659, abs=5e-5)
     masses = [needed(1 / (M * RATE), K, B, theta) for M in np.geomspace(0.01, 1, 200)]
     assert max(masses) == pytest.approx(1.3769, abs=5e-5)
     assert np.geomspace(0.01, 1, 200)[np.argmax(masses)] == pytest.approx(0.0357, rel=0.03)
     assert line(K, B, theta).max() == pytest.approx(1.5160, abs=5e-5)
-    # the project's own figure for the mass, and for a spring alone, whose closed form is (theta + 1/2) K T
+    # The project's condition gives the same for the mass. A spring alone needs (theta + 1/2) K T.
     E = environment(Network(("a",), masses={"a": 0.0357}), T)
     found = this_environment(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
     assert found == pytest.approx(1.3769, abs=5e-5)
@@ -239,14 +242,14 @@ def test_a_rigid_wall_is_not_the_worst_environment():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_theorem_4_is_the_worst_lossless_environment(seed):
-    """1/(q + 1/W) with Re q >= 0 fills a disk, so a reactance q reaches the line; and it is a passive environment."""
+    """A lossless environment q = 1/E-hat attains the damping of Theorem 4 at one frequency and exceeds it at none."""
     rng = np.random.default_rng(seed)
     K, B, theta = np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2)), int(rng.integers(0, 4))
     asked = line(K, B, theta)
     k = int(rng.integers(W.size // 10, 9 * W.size // 10))
     inner, angle = 1 / (K / RATE[k] + B), (theta + 1) * W[k]
     reactance = inner.real / np.tan(angle / 2) - inner.imag
-    # q = 1/E-hat, a mass or a spring under the trapezoidal rule: lossless at every frequency
+    # q is a mass or a spring under the trapezoidal rule, which is lossless at every frequency.
     tangent = (Z - 1) / (Z + 1)
     q = reactance * tangent / tangent[k].imag if reactance > 0 else -reactance * tangent[k].imag / tangent
     assert q[k] == pytest.approx(1j * reactance, rel=1e-6)
@@ -258,13 +261,13 @@ def test_theorem_4_is_the_worst_lossless_environment(seed):
 
 @pytest.mark.parametrize("theta", range(5))
 def test_the_moving_average_attains_the_stiffness_limit(theta):
-    """2 delta/((theta+1) T): V = (T/2 delta)(1 + ... + z^-theta) has it, and needs exactly delta."""
+    """V = (T/2 delta)(1 + ... + z^-theta) has the stiffness 2 delta/((theta+1) T) and needs exactly delta."""
     V = moving_average(theta, DELTA)
     assert 1 / V.dc()[0, 0] == pytest.approx(2 * DELTA / ((theta + 1) * T))
-    # it spends exactly delta at every frequency: Re[(z-1) V/(Tz)] = (1 - cos n w)/(2 delta)
+    # V needs exactly delta at every frequency: Re[(z-1) V/(Tz)] = (1 - cos n w)/(2 delta)
     spent = (RATE * V.at(Z)[:, 0, 0]).real
     np.testing.assert_allclose(spent, np.sin((theta + 1) * W / 2) ** 2 / DELTA, atol=1e-9)
-    softer = V + Lti.constant([[1e-4 * V.dc()[0, 0]]], T)  # strictly inside
+    softer = V + Lti.constant([[1e-4 * V.dc()[0, 0]]], T)  # strictly within the condition
     assert any_environment(softer, [theta], [DELTA]).certified
 
 
@@ -275,7 +278,7 @@ def moving_average(theta, delta):
 
 
 def test_no_linear_coupling_is_stiffer():
-    """Random stable V: required damping >= (theta+1) T / (2 V(1)), the mean over the circle; matrices likewise."""
+    """A random stable V of one channel needs a damping of at least (theta+1) T / (2 V(1))."""
     rng = np.random.default_rng(4)
     w = np.linspace(0, np.pi, 2001)[1:]
     z = np.exp(1j * w)
@@ -300,7 +303,7 @@ def test_no_linear_coupling_is_stiffer():
 
 
 def test_theorem_4_excludes_the_loop_shaping_premise():
-    """sigma_max(L(1)) >= k (V_1(1) + V_2(1)) >= 0.8175 for any V that Theorem 4 admits; 1.13 for the designed one."""
+    """sigma_max(E(1) V(1)) >= 0.8175 for any V that Theorem 4 admits; SOFT has at least 1.13 at each frequency."""
     E1 = 800 * 700 / 1500 * np.array([[1, -1], [-1, 1]])
     floor = np.array(THETA) + 1.0
     rng = np.random.default_rng(5)
@@ -319,7 +322,7 @@ def test_theorem_4_excludes_the_loop_shaping_premise():
 
 
 def test_no_storage_excludes_the_static_pole():
-    """v'(A'PA - P)v = 0 for the eigenvector of the pole at z = 1, whatever P."""
+    """The eigenvector v of the pole at z = 1 has v'(A'PA - P)v = 0 for every P."""
     E = environment(FIGURE_4, T)
     one = np.eye(2)
     hat = Lti(one, T * one, one, T * one, T) @ E
@@ -331,12 +334,12 @@ def test_no_storage_excludes_the_static_pole():
         root = np.random.default_rng(seed).normal(size=hat.A.shape)
         P = root @ root.T
         assert abs(v.conj() @ (hat.A.T @ P @ hat.A - P) @ v) < 1e-8 * abs(v.conj() @ P @ v)
-    # and the Hermitian part of T E(1) z/(z-1) on the circle is the constant T E(1)/2
+    # The Hermitian part of T E(1) z/(z-1) on the circle is the constant T E(1)/2
     np.testing.assert_allclose((1 / (T * RATE)).real, 0.5, atol=1e-9)
 
 
 def test_unilateral_springs_are_passive_under_backward_euler():
-    """sum f[k] (x[k] - x[k-1]) >= potential at the end less potential at the start, for contact that comes and goes."""
+    """f[k] (x[k] - x[k-1]) is at least the increase in potential, also where contact begins or ends."""
     rng, touching = np.random.default_rng(6), 0
     for _ in range(50):
         stiffness, power, wall = np.exp(rng.uniform(0, 8)), rng.uniform(1, 3), rng.normal() * 1e-3
@@ -349,7 +352,7 @@ def test_unilateral_springs_are_passive_under_backward_euler():
 
 
 def test_the_frozen_guarantee_ends_with_another_stiffness():
-    """Contact springs 20 % stiffer: 1.516 in place of 1.363; a mass changed tenfold does not matter."""
+    """Springs 20 % stiffer need 1.516 N s/m instead of 1.363. With a tenfold or tenth mass, DELTA still suffices."""
 
     def required(factor, mass):
         springs = tuple(Spring(s.between, factor * s.stiffness, s.damping) for s in FIGURE_4.springs)
@@ -364,7 +367,7 @@ def test_the_frozen_guarantee_ends_with_another_stiffness():
 
 @pytest.mark.slow
 def test_saturation_is_outside_every_certificate():
-    """A certified loop with two lossless hands: at rest if linear, swinging on at 1.2 Hz between the force limits."""
+    """A certified loop with lossless hands comes to rest if linear, but may swing at 1.2 Hz if forces are clipped."""
     hands = (Human((Link(1.2326, 0.0, 34.923),)), Human((Link(0.01999, 0.0, 266.28),)))
     base = load()
     devices = tuple(
@@ -393,7 +396,7 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(calmer)).max() < 0.01
     unlimited = replace(simulation, process=replace(simulation.process, force_limit=np.full(2, np.inf)))
     assert np.abs(late(unlimited)).max() < 0.01
-    for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
+    for beta in (0.0, 0.01):  # With the limiter instead of clipping, every start comes to rest.
         rho = LimitedForces(beta).rho(base.loop("I"))
         law = base.loop("I").law(STIFF, (12.0, 5.657), rho)
         limiting = replace(simulation, process=replace(simulation.process, law=law))
@@ -401,7 +404,7 @@ def test_saturation_is_outside_every_certificate():
 
 
 def test_what_the_multiplier_costs():
-    """(14) by hand: Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1."""
+    """The block is positive definite exactly if Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1, as in (14)."""
     rng = np.random.default_rng(7)
     seen = set()
     for _ in range(300):
@@ -421,7 +424,7 @@ def test_what_the_multiplier_costs():
 
 
 def test_one_environment_sample_exceeds_the_devices_damping():
-    """sup over frequency of the largest eigenvalue of -He E-hat, psi = 1: 1.479 N s/m, at every Phi <= s I."""
+    """With psi = 1 the largest eigenvalue of -He E-hat reaches 1.479 N s/m, so no Phi below DELTA exists."""
     hat = figure_4_at(Z) * (Z**-1 / RATE)[:, None, None]
     least = -np.linalg.eigvalsh((hat + np.conj(np.swapaxes(hat, 1, 2))) / 2)[:, 0]
     assert least.max() == pytest.approx(1.479, abs=5e-4)
@@ -439,7 +442,7 @@ def test_delayed_spring_that_uses_all_damping_is_refused(unused):
 
 
 def test_every_step_of_the_convex_sequence_improves():
-    """The tangent lies below g*g, so a step keeps what the one before achieved; on fixed frequencies."""
+    """The tangent lies below g*g, so on fixed frequencies no step is worse than the one before."""
     shaping = Shaping(Loop(T, THETA, (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4))
     w = np.concatenate([np.geomspace(1e-3, 3, 20), [0.0465]])
     gains = np.array([0.1, 0.1, 0.4, 0.4])
@@ -454,7 +457,7 @@ def test_every_step_of_the_convex_sequence_improves():
 
 
 class Resonant(Environment):
-    """H (1 - 1/z) with H = 500 + 2 Re r/(1 - p/z): it feeds power in within a millionth of one frequency."""
+    """H (1 - 1/z), where H is 500 plus a pair of poles: it may supply power within a millionth of one frequency."""
 
     contacts = ("tip",)
 
@@ -471,7 +474,7 @@ class Resonant(Environment):
 
 
 def test_an_own_active_object_gets_no_guarantee():
-    """Behind a coupling of K = 900 N/m and B = 0.6 N s/m; a passive resonance as narrow keeps the guarantee."""
+    """A narrow active resonance is not certified for any environment; a passive one as narrow is."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):
         loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), Resonant(size, angle))
@@ -486,7 +489,7 @@ def test_an_own_active_object_gets_no_guarantee():
 
 
 def test_a_multiplier_covers_narrow_resonances():
-    """A mass between springs that hardly decays, a sample late: the peak by a dense sweep around its own pole."""
+    """A sufficient Phi exceeds the narrow peak that a dense sweep finds around the pole of a mass between springs."""
     network = Network(("tip",), (Spring(("tip", "m"), 300.0, 0.0), Spring(("m", GROUND), 50.0, 1e-4)), {"m": 0.2})
     E = environment(network, 1e-3)
     pole = max(E.poles(), key=lambda p: abs(p.imag))
@@ -500,7 +503,7 @@ def test_a_multiplier_covers_narrow_resonances():
 
 
 def test_a_guarantee_over_ranges_names_its_vertices():
-    """Between them a search supports it, and no proof."""
+    """Between the vertices a search supports the guarantee, not a proof."""
     scenario = load("omega-pair-ranges")
     delays = scenario.loop("I").delays
     given = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3)

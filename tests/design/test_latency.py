@@ -1,4 +1,4 @@
-"""Forces that latch a fraction of a sample late: closed forms, limits of whole samples, exact proofs, simulations."""
+"""Tests of forces that latch a fraction of a sample late: closed forms, whole samples, proofs and simulations."""
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ change = msgspec.structs.replace
 
 
 def spring(theta=0) -> Lti:
-    """K z^-theta."""
+    """Return K z^-theta."""
     return delay((theta,), T) @ Lti.constant([[K]], T)
 
 
@@ -42,7 +42,7 @@ def spring(theta=0) -> Lti:
 def test_a_wall_that_latches_late(theta, range, needs):
     found = this_environment(spring(theta), [1.0], latency=[range])
     assert found.required[0] == pytest.approx(needs, abs=2e-6)
-    if theta == 0:  # it binds as w -> 0: (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2
+    if theta == 0:  # the condition binds as w -> 0: (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2
         t1, t2 = range
         closed = np.roots([1 / (t2 * (T - t1)), -K / (2 * t2) - 3 * K / (2 * (T - t1)), 3 * K**2 / 4 - K**2]).max()
         assert found.required[0] == pytest.approx(closed, rel=1e-9)
@@ -64,7 +64,7 @@ def test_the_block_at_a_frequency():
     [((1e-10, 1e-10), 0.584731), ((TAU, TAU), 0.574622), ((0.0, TAU), 0.611902), ((T - 1e-12, T - 1e-12), 0.714344)],
 )
 def test_a_pair_of_devices_between_two_whole_samples(range, needs):
-    """From the (0, 1) of no latency to the (1, 2) of a whole sample's."""
+    """No latency needs the damping of theta = (0, 1), a latency of a whole sample that of theta = (1, 2)."""
     found = required_damping(change(PAIR, latency=(range, range)), SOFT, "this-environment")
     assert max(found.required) == pytest.approx(needs, abs=2e-6)
     assert this_environment(PAIR.F(SOFT), PAIR.delta).required[0] == pytest.approx(0.584731, abs=1e-6)
@@ -73,13 +73,16 @@ def test_a_pair_of_devices_between_two_whole_samples(range, needs):
     )
 
 
-# a latency in a range: Q weighs both parts of a period together
+# Ranges of latency: a matrix Q weights both parts of a period together
 
 
 @pytest.mark.parametrize("theta", [0, 1])
 @pytest.mark.parametrize("range", [(0.0, 0.4 * T), (0.1 * T, 0.6 * T)])
 def test_a_range_costs_a_wall_its_latest_latency(theta, range):
-    """(delta/t2 - (theta + 3/2) K)(delta/(T - t2) - (theta + 1/2) K) = (theta + 1)^2 K^2."""
+    """The needed delta is the larger root of a quadratic equation for the latest latency t2.
+
+    The equation is (delta/t2 - (theta + 3/2) K)(delta/(T - t2) - (theta + 1/2) K) = (theta + 1)^2 K^2.
+    """
     late, soon = range[1], T - range[1]
     slope = (theta + 1.5) / soon + (theta + 0.5) / late
     closed = np.roots([1 / (late * soon), -slope * K, ((theta + 1.5) * (theta + 0.5) - (theta + 1) ** 2) * K**2]).max()
@@ -91,7 +94,7 @@ def test_a_range_costs_a_wall_its_latest_latency(theta, range):
 
 
 def by_a_dense_program(loop, coupling, latencies):
-    """The least delta (equal devices) over all Q, by one semidefinite program at many frequencies and latencies."""
+    """Return the least delta of equal devices over all Q: a semidefinite program at many frequencies and latencies."""
     import cvxpy as cp
 
     w = np.concatenate([np.linspace(1e-4, np.pi, 60), np.geomspace(1e-3, 0.5, 30)])
@@ -122,7 +125,7 @@ def test_a_pair_needs_what_a_dense_program_finds(coupling, range, needs):
     loop = change(PAIR, latency=(range, range))
     found = required_damping(loop, coupling, "this-environment")
     assert found.required[0] == pytest.approx(needs, rel=2e-6)
-    assert by_a_dense_program(loop, coupling, 25) == pytest.approx(needs, rel=5e-4)  # between its frequencies
+    assert by_a_dense_program(loop, coupling, 25) == pytest.approx(needs, rel=5e-4)  # its grid has few frequencies
     apart = least_scale_of(this_environment_demand(loop.F(coupling), PAIR.delta, latency=loop.latency))
     assert 0.8 < found.ratio / apart < 0.87
     assert (
@@ -131,12 +134,12 @@ def test_a_pair_needs_what_a_dense_program_finds(coupling, range, needs):
 
 
 def least_scale_of(demand):
-    """What the charge of both parts apart asks."""
+    """Return the ratio for a demand that weights both parts of a period separately."""
     return least_scale(demand, frequencies(PAIR.F(SOFT), points=4000)).max()
 
 
 def test_weights_are_admitted_where_every_latency_admits_them():
-    """The quadratic in tau over the rationals against eigenvalues at many latencies, positive definite Q or not."""
+    """Q is admitted exactly where eigenvalues at many latencies admit it, also if Q is indefinite."""
     rng, agreed = np.random.default_rng(0), np.zeros(2, dtype=int)
     for _ in [None] * 200:
         first, last = np.sort(np.round(rng.uniform(0, T, 2), 6))
@@ -144,7 +147,7 @@ def test_weights_are_admitted_where_every_latency_admits_them():
         tau = np.linspace(first, last, 2000)[:, None, None]
         D = np.where(np.eye(2) > 0, np.sqrt(np.concatenate([tau, loop.T_max - tau], axis=1)), 0)
         Q = rng.standard_normal((2, 2)) * rng.uniform(0, 3e3)
-        Q = (Q + Q.T) * np.sign(np.trace(Q))  # so that it is positive somewhere
+        Q = (Q + Q.T) * np.sign(np.trace(Q))  # so that Q is positive in some direction
         most = np.linalg.eigvalsh(D @ Q @ D).max()
         for share in (0.999, 1.001):
             entries = {
@@ -202,7 +205,7 @@ def test_where_it_is_not_derived_it_is_refused():
         change(loop, latency=((0.0, TAU), (0.0, T)))
 
 
-# Loops whose latency switches, simulated exactly: the force before acts until kT + tau_k, the new one after it.
+# Loops whose latency switches, simulated exactly: the previous force acts until kT + tau_k, then the new one.
 
 
 HANDS, TICKS = 60, 6000
@@ -234,7 +237,7 @@ def test_hands_grow_only_below_the_requirement(mean):
     need = required_damping(
         change(WALL, latency=((0.0, TAU),)), SpringDamper([1e9], [0.0]), "this-environment"
     ).required[0]
-    assert need == pytest.approx(0.774878, rel=1e-4)  # what the constant latency TAU costs
+    assert need == pytest.approx(0.774878, rel=1e-4)  # as for the constant latency TAU
     assert grown(1.02 * need, latencies, mean) == 0
     assert grown(0.6 * need, latencies, mean) > 0
 
@@ -251,11 +254,11 @@ def test_latency_designs_beat_a_whole_sample():
     assert 0.99 < anywhere.requirement.ratio < 1
 
 
-# a condition of one's own: one class in one file
+# Conditions that a user writes
 
 
 class LatchesLate(Condition):
-    """The block of a latency written out again: forces of the tick before act for TAU on every channel."""
+    """The block of a latency, written again: forces of the previous tick act for TAU on every channel."""
 
     name = "latches-late"
 
@@ -270,7 +273,7 @@ class LatchesLate(Condition):
 
 
 class OneSampleMore(ThisEnvironment):
-    """this-environment, stricter: forces arrive a sample later."""
+    """The condition this-environment for forces that arrive a sample later."""
 
     name = "one-sample-more"
 

@@ -1,4 +1,4 @@
-"""The limiter's condition: the stated block, closed forms, the figures of the default loop, the best multiplier."""
+"""Tests of the limiter's condition: its block, closed forms, figures of the default loop, the best multiplier."""
 
 from itertools import product
 
@@ -34,7 +34,7 @@ def required(coupling, c=None, lag=LAG) -> float:
 
 
 def test_the_block_of_one_channel():
-    """G = 1000, theta = 1, c = 0.5, D = 2000, rho = 20 at w = 1, by hand; sampled responses give the same."""
+    """The block at w = 1 equals figures that were computed by hand; sampled responses give the same."""
     G, z = Lti.constant([[1000.0]], 1.0), on_circle(np.array([1.0]))
     upper = 984.010315 - 411.642518j
     expected = [[959.697694, upper], [np.conj(upper), 2032.919914]]
@@ -45,8 +45,10 @@ def test_the_block_of_one_channel():
 
 
 def test_the_block_is_a_limited_loops_energy():
-    """Motions that begin and end at rest in the same place: sum of f'dx + dx'D dx - (M f_e)'de, in time, against the
-    mean of the block's form over the circle; M = z + sum_j c_j sum_{i<j} (z - z^-i)."""
+    """The sum of f'dx + dx'D dx - (M f_e)'de over time is the mean of the block's form over the circle.
+
+    The motions begin and end at rest in the same place; M = z + sum_j c_j sum_{i<j} (z - z^-i).
+    """
     rng = np.random.default_rng(3)
     theta, c, delta, rho = (1, 2), ((0.7, 0.2), (0.4, 0.1)), (1.3, 0.8), (30.0, 50.0)
     weights = rng.normal(size=(4, 2, 2)) * 300
@@ -79,7 +81,7 @@ def test_the_block_is_a_limited_loops_energy():
 
 @pytest.mark.parametrize("theta", [0, 1, 2, 4])
 def test_closed_forms_of_a_spring(theta):
-    """(theta + 1)^2 K T/2 at c = 0, and what the loop without limiter needs, (theta + 1/2) K T, at c_1 = theta."""
+    """A spring needs (theta + 1)^2 K T/2 at c = 0 and (theta + 1/2) K T, as without limiter, at c_1 = theta."""
     K = 800.0
     G = Lti.constant([[K]], T)
 
@@ -98,7 +100,7 @@ def test_a_delayed_spring_by_its_multiplier(c, factor):
 
 
 def test_the_coupling_designed_with_the_block():
-    """K = (5832, 2545), B = (0.187, 1.386): 1.30132 linear, more with the limiter by its multiplier."""
+    """BUILT needs 1.30132 N s/m in the linear loop and more with the limiter, depending on the multiplier."""
     assert this_environment(PAIR.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
     for c, expected in (((0, 0), 1.42465), ((0.3, 0.3), 1.34059), ((0.278, 0.632), 1.32327)):
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
@@ -135,7 +137,7 @@ def test_no_multiplier_on_a_grid_is_better():
 
 
 def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
-    """The search grows with the fourth power of their number; at c = 0 one sweep is left, which asks for more."""
+    """Above `MULTIPLIER_ROWS` one sweep at c = 0 replaces the search, and may need more damping."""
     best = required_damping(PAIR, BUILT, LIMITER)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 3)
     monkeypatch.setattr(environments._Search, "best", None)
@@ -147,7 +149,7 @@ def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
 
 
 def test_unequal_weights_need_enough_lag():
-    """F(1) couples the channels: c = (0.2, 0.4) is infeasible at beta = 1e-4 and fine at 0.01."""
+    """F(1) couples the channels, so c = (0.2, 0.4) is infeasible at beta = 1e-4, but feasible at 0.01."""
     unequal = ((0.2,), (0.4,))
     assert np.isinf(required(BUILT, unequal, LimitedForces(1e-4).rho(PAIR)))
     assert required(BUILT, unequal) < 1.36
@@ -167,7 +169,7 @@ def test_bad_requests_are_named():
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
 def test_the_least_multiple_of_a_singular_gain(rank):
-    """Against bisection on the least eigenvalue of free + s gain."""
+    """The least eigenvalue of free + s gain is 0 at the least s, positive just above it and not positive below."""
     rng = np.random.default_rng(rank)
     for _ in range(20):
         half = rng.normal(size=(3, rank)) + 1j * rng.normal(size=(3, rank))
@@ -183,7 +185,7 @@ def test_the_least_multiple_of_a_singular_gain(rank):
             assert np.linalg.eigvalsh(free + s * gain)[0] == pytest.approx(0, abs=1e-8 * max(1, abs(s)))
 
 
-# the proof
+# Exact proofs
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +208,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 
 
 def test_files_without_it_stay_as_they_were(tmp_path):
-    """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
+    """STIFF needs 1.385 with the limiter: its linear proof stays, the limiter's is refused and names the figure."""
     stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert plain.facts == ()
@@ -264,11 +266,11 @@ def test_any_environment_does_not_cover_delayed_limits():
     assert lag(loop, some) is None
 
 
-# the design
+# Designs
 
 
 def test_a_spring_damper_designed_with_the_block():
-    """All of the damping is spent on the limited loop: 1.4 dB better than K = (5832, 2545), B = (0.187, 1.386)."""
+    """The limited loop needs over 99.9 % of the damping, and the design is over 1.3 dB better than BUILT."""
 
     def rms_db(coupling) -> float:
         return 20 * np.log10(transparency(PAIR.F(coupling), PAIR.E(), PAIR.lam).rms_mismatch)
@@ -276,7 +278,7 @@ def test_a_spring_damper_designed_with_the_block():
     made = design(PAIR, "this-environment", limiter=True)
     assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
-    assert rms_db(made.coupling) < -10.5  # found; the linear design has -11.19 and is not proved with limited forces
+    assert rms_db(made.coupling) < -10.5  # the linear design has -11.19, but no proof for limited forces
     with pytest.raises(ValueError, match="constant delays"):
         design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 
@@ -292,7 +294,7 @@ def test_the_command_stores_proofs_of_limited_forces(tmp_path):
 
 
 def test_the_best_multiplier_attains_its_bound():
-    """Delays of 0 and 3 samples, where lines through the worst directions never settled: 1.263, not 31."""
+    """For delays of 0 and 3 samples the best multiplier attains its bound, and no random one is better by 0.1 %."""
     loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
     G, rho = loop.sent(BUILT), LIMITER.rho(loop)
     found = limiter(G, loop.theta, loop.delta, rho)
