@@ -48,7 +48,7 @@ def wall(K: float, B: float, theta: int = 0, delta: float = 1.37, T: float = 1e-
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """Run the command as a shell would: (exit code, stdout, stderr)."""
+    """Return a function that runs the command as a shell would and returns (exit code, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
 
     def command(*argv: str) -> tuple[int, str, str]:

@@ -53,7 +53,7 @@ def test_environment_delay_is_proved_with_its_multiplier(psi):
     assert stored.certificate.guarantee == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E"}
     assert verify(stored) == Verdict(True)
-    least = prove(loop, found.coupling, "any-environment")  # which finds the least Phi itself
+    least = prove(loop, found.coupling, "any-environment")  # `prove` finds the least Phi
     assert verify(Stored.of(loop, found.coupling, least)) == Verdict(True)
     with pytest.raises(NotProved, match="needs a multiplier Phi, one entry per channel"):
         prove(loop, found.coupling, "any-environment", [0.1])

@@ -44,7 +44,7 @@ def window(theta):
 
 
 def line(K, B, theta):
-    """Return the damping that Theorem 4 needs of one channel, by frequency: (1 - cos n w) / (2 Re V (z-1)/(T z))."""
+    """Return the damping that Theorem 4 needs at each w: (1 - cos (theta+1) w) / (2 Re V (z-1)/(T z))."""
     passivity = (K * T / 2 + B) / np.abs(K / RATE + B) ** 2  # Re V (z-1)/(T z)
     return np.sin((theta + 1) * W / 2) ** 2 / passivity
 

@@ -272,7 +272,7 @@ def test_switching_against_a_dense_sweep(lo, hi):
 
 @pytest.mark.parametrize("longest", [T, 1.7 * T])
 def test_the_longest_period_scales_each_block(longest):
-    """A longest period T_max needs T_max/T times the damping for the even period T."""
+    """A longest period T_max needs T_max/T times the damping for the constant period T."""
     rigid = Compliance(Lti.constant([[0.0]], T))
     F, V = loop(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
     assert_limit(lambda d: both(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
@@ -410,7 +410,7 @@ def test_proofs_serve_only_their_own_condition():
     assert forged(asked, coupling, anywhere) is None
     assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
     assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
-    soft = change(asked, environment=to_ground(100.0))  # another block of the same size
+    soft = change(asked, environment=to_ground(100.0))  # this changes the block of this-environment
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 
