@@ -1,4 +1,4 @@
-"""Conditions of one's own whose code is wrong, or whose multiplier is empty: never counted as what they are not."""
+"""User-written conditions with wrong code or an empty multiplier, and files with wrong multipliers."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ change = msgspec.structs.replace
 
 
 class PerWall(Multiplied):
-    """this-environment, with a multiplier of as many entries as there are walls."""
+    """this-environment, with a multiplier that has one entry per wall."""
 
     name, covers = "per-wall", ("walls",)
 
@@ -38,7 +38,7 @@ class PerWall(Multiplied):
 
 
 class Scaled(Condition):
-    """this-environment for forces `times` as large: asks as many times the damping."""
+    """this-environment for forces multiplied by `times`, which require `times` the damping."""
 
     name, times = "scaled", 2
 

@@ -1,4 +1,4 @@
-"""A period that varies: what it costs in every condition, and loops of drawn periods simulated exactly."""
+"""Varying periods: the required damping of each condition, and exact simulations with random periods."""
 
 import json
 from fractions import Fraction
@@ -30,7 +30,7 @@ change = msgspec.structs.replace
 
 @pytest.mark.slow
 def test_switching_reports_use_the_longest_period(tmp_path):
-    """Also of the buffer that makes the delay the largest one."""
+    """The damping reported for a buffer, which makes every delay the largest one, counts T_max."""
     file, more = tmp_path / "r.json", ["--condition", "this-environment", "--T-max", "1.8e-3"]
     cli_design(["--varying-delay", "1,2", *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
     stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
@@ -51,7 +51,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
 def test_longest_period_scales_switching_and_multipliers():
     switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
     even, uneven = (required_damping(change(switching, T_max=longest), SOFT, SWITCHING) for longest in (None, LONG))
-    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
+    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # error of the search for alpha
     soft = msgspec.structs.replace(
         FIGURE_4, springs=tuple(change(s, stiffness=s.stiffness / 8, damping=0.2) for s in FIGURE_4.springs)
     )
@@ -64,7 +64,7 @@ def test_longest_period_scales_switching_and_multipliers():
 
 
 def test_so_it_does_while_forces_are_limited():
-    """The lag of the limiter is a number of the controller, which no period changes; proved exactly, too."""
+    """The limiter's rho belongs to the controller, so no period changes it. The exact certificate agrees."""
     loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
     longer = change(loop, T_max=LONG)
     even, uneven = (required_damping(one, SOFT, LIMITER, (0.3, 0.3)) for one in (loop, longer))
@@ -73,12 +73,12 @@ def test_so_it_does_while_forces_are_limited():
 
 
 def test_the_any_environment_line_by_hand():
-    """He[(1 - 1/z) V] >= T_max |1 - z^-n|^2 / (4 delta): one spring behind one sample of delay."""
+    """He[(1 - 1/z) V] >= T_max |1 - z^-n|^2 / (4 delta) holds for one spring at theta = 1, so n = 2."""
     V, n = SpringDamper([500.0], [0.0]).compliance(T), 2
     w = np.linspace(0.01, np.pi, 4000)
     have = ((1 - np.exp(-1j * w)) / 500).real
     need = LONG * (np.abs(1 - np.exp(-1j * n * w)) ** 2 / (4 * have)).max()
-    assert any_environment(V, [1], [1.0], LONG).required[0] == pytest.approx(need, rel=1e-4)  # of the samples
+    assert any_environment(V, [1], [1.0], LONG).required[0] == pytest.approx(need, rel=1e-4)  # error of the grid
 
 
 def test_damping_per_tick_is_exact():
@@ -109,7 +109,7 @@ def test_uneven_period_designs_are_certified():
     requirement = requirements_of(loop, found.coupling)["this-environment"]
     assert requirement.certified
     assert requirement.proof == "rational"
-    assert requirement.ratio == pytest.approx(1, rel=1e-3)  # it uses the damping that there is
+    assert requirement.ratio == pytest.approx(1, rel=1e-3)  # the design uses all available damping
 
 
 def test_a_longest_period_below_the_period_is_refused():
@@ -117,7 +117,7 @@ def test_a_longest_period_below_the_period_is_refused():
         change(LOOP, T_max=0.9e-3)
 
 
-# Loops of drawn periods, simulated exactly: devices of exactly the damping that is asked, hands without any.
+# Loops with random periods, simulated exactly: devices have the given damping, hands have none.
 
 
 PERIODS = (0.2e-3, 0.7e-3, 1.1e-3, 1.6e-3)
@@ -127,7 +127,7 @@ ONE, COUPLING = Loop(T, (1,), (0,), (1,), (1.0,), HELD), SpringDamper([1000.0], 
 
 
 def plants(damping, rng):
-    """A, B of a device in lossless hands, (hands, 2, 2) and (hands, 2, 1): masses of 1 g to 1 kg on springs."""
+    """Return A (hands, 2, 2) and B (hands, 2, 1) of devices in lossless hands: 1 g to 1 kg on springs."""
     mass, spring = (10 ** rng.uniform(*limits, HANDS) for limits in ((-3, 0), (0, 3)))
     A, B = np.zeros((HANDS, 2, 2)), np.zeros((HANDS, 2, 1))
     A[:, 0, 1] = 1
@@ -136,7 +136,7 @@ def plants(damping, rng):
 
 
 def tick(F, A, B, period):
-    """The transition of plants and computer over one period, exactly, (hands, 2 + states, 2 + states)."""
+    """Return the exact transition of plants and computer over one period, (hands, 2 + states, 2 + states)."""
     n, m = B.shape[1:]
     whole = np.zeros((HANDS, n + m, n + m))
     whole[:, :n, :n], whole[:, :n, n:] = A, B
@@ -157,7 +157,7 @@ def grown(damping, mean, seed=7):
     A, B = plants(damping, rng)
     F = ONE.F(COUPLING)
     steps = np.stack([tick(F, A, B, period) for period in PERIODS])
-    energy = np.stack([-A[:, 1, 0] / -B[:, 1, 0], -1 / B[:, 1, 0]], axis=1)  # twice: spring and mass
+    energy = np.stack([-A[:, 1, 0] / -B[:, 1, 0], -1 / B[:, 1, 0]], axis=1)  # twice the energy: stiffness and mass
     return growing(steps, energy, mean, rng, 20_000 if mean else 6000)
 
 

@@ -1,4 +1,4 @@
-"""Spring-dampers designed for delays that vary: swept again, proved, and met by the worst switching."""
+"""Couplings designed for varying delays: their sweeps, their proofs, and lossless hands under adversarial switching."""
 
 import json
 
@@ -28,7 +28,7 @@ HANDS, SECONDS = 20, 0.7
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """(report, coupling) of the design command, once."""
+    """Return (report, coupling) of one run of the design command."""
     out = tmp_path_factory.mktemp("design")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", str(out / "c.json")]
     assert main([*options, "--json", str(out / "r.json")]) == 0
@@ -36,7 +36,7 @@ def made(tmp_path_factory):
 
 
 def growing(loop, hands=HANDS, seconds=SECONDS):
-    """Return how many lossless hands grow under the worst switching."""
+    """Return how many lossless hands grow under the loop's adversarial switching."""
     rng = np.random.default_rng(0)
     low, high = np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0])
     links = np.exp(rng.uniform(low, high, size=(hands, loop.scenario.channels, 1, 3)))
@@ -50,16 +50,16 @@ def test_the_designed_gains_are_proved_for_any_switching(made):
     loop = load().loop("I")
     swept = switching_sweep(loop.sent(coupling), *RANGE, loop.delta)
     assert swept.certified
-    assert swept.ratio > 0.999  # all of the damping is spent
+    assert swept.ratio > 0.999  # the design uses all available damping
     assert report["switching"]["proof"] == "rational"
     assert report["switching"]["required_damping"] == pytest.approx(swept.required, rel=1e-9)
-    # a local optimum: what it was found to be, between the constants' -11.2 dB and doing nothing at 0 dB
+    # The measured value of a local optimum. Constant delays allow -11.2 dB; zero force gives 0 dB.
     assert report["assessment"]["transparency"]["rms_mismatch_db"] == pytest.approx(-3.37, abs=0.05)
 
 
 @pytest.mark.slow
 def test_no_lossless_human_grows_under_the_worst_switching(made):
-    """The hardest that we have: lossless hands, greedy switching. With 20 % less damping some do grow."""
+    """No lossless hand grows under greedy adversarial switching. With 20 % less damping some do."""
     _, coupling = made
     scenario = load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial"))
     placed = [scenario.replace(delta=tuple(share * d for d in scenario.delta)) for share in (1.0, 0.8)]
@@ -77,7 +77,7 @@ def test_a_range_that_is_too_wide_says_so():
 @pytest.mark.parametrize(
     "options",
     [
-        ["--condition", "any-environment", "--varying-delay", "1,2"],  # without it the design is for this environment
+        ["--condition", "any-environment", "--varying-delay", "1,2"],  # refuses varying delays
         ["--condition", "this-environment", "--varying-delay", "2,1"],
         ["--condition", "this-environment", "--varying-delay", "1"],
     ],
@@ -94,20 +94,20 @@ def test_any_environment_designs_refuse_varying_delays():
 
 @pytest.mark.slow
 def test_an_optimal_coupling_for_switching_delays():
-    """Swept, proved, and met by lossless hands under the worst switching."""
+    """The design is proved, a sweep confirms it, and no lossless hand grows under adversarial switching."""
     asked = load().loop("I")
     made = design_with(asked.switching(DelayRange(*RANGE)), bases=((14, 10),))
     assert made.proved
     swept = switching_sweep(asked.sent(made.coupling), *RANGE, asked.delta)
-    assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # the margin, nearly all else is spent
-    # found: -13.4 dB over this basis, against -3.4 dB of the best spring-damper
+    assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # a margin of 0.2 %; all other damping is used
+    # Measured with this basis: -13.4 dB. The designed spring-damper has -3.4 dB.
     assert 20 * np.log10(made.objective) < -13.3
     loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
     assert growing(loop) == 0
 
 
 def one_known_device():
-    """One Omega with known bounds that holds a spring; case I without ranges."""
+    """Return one-wall with one Omega of known bounds and a spring instead of the wall."""
     spring = Spring(between=("tip", "ground"), stiffness=500.0, damping=1.0)
     object_ = msgspec.structs.replace(load("one-wall").environment, walls=(), springs=(spring,))
     return load("one-wall").replace(device=load("omega-pair-known").device[:1], environment=object_)
@@ -118,11 +118,11 @@ def one_known_device():
     ("scenario", "basis", "most_db"),
     [
         (one_known_device(), (3, 2), -70.0),
-        (load("omega-pair-known"), (4, 3), -29.0),  # found: -29.3 dB over this basis
+        (load("omega-pair-known"), (4, 3), -29.0),  # measured with this basis: -29.3 dB
     ],
 )
 def test_optimal_couplings_of_known_devices_take_switching(scenario, basis, most_db):
-    """Proved with known motors; lossless hands under the worst switching do not grow."""
+    """The guarantee is proved for known motors, and no lossless hand grows under adversarial switching."""
     m = scenario.channels
     lo, hi = (tuple(each[:m]) for each in RANGE)
     loop = scenario.loop("I").switching(DelayRange(lo, hi))

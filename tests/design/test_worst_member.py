@@ -27,11 +27,11 @@ T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 RANGED = scenario.load(SCENARIOS / "omega-pair-ranges.toml").loop("I")
 _first, _second = FIGURE_4.springs
 STIFF = (msgspec.structs.replace(_first, stiffness=840.0), msgspec.structs.replace(_second, stiffness=735.0))
-#: that edge of the ranges on which it is violated, as ranges of its own
+#: The edge of RANGED on which VERTICES_ONLY violates the condition: both springs at their upper ends, any mass.
 EDGE = msgspec.structs.replace(
     RANGED, environment=Network(FIGURE_4.contacts, STIFF, {"mass": 2.0}), ranges=Ranges(masses={"mass": (0.5, 2.0)})
 )
-#: the mass alone, over four octaves
+#: RANGED with a range of the mass only, over four octaves.
 MASS = msgspec.structs.replace(RANGED, ranges=Ranges(masses={"mass": (0.25, 4.0)}))
 
 
@@ -41,7 +41,7 @@ def known(request):
 
 
 def needed(network: Network, coupling: _InternalModel) -> float:
-    """The share of the damping that is needed, from the raw matrices on a dense grid: no code of the project."""
+    """Return required over available damping, computed on a dense grid without the project's frequency responses."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, 2000), np.linspace(1e-3, np.pi, 2000)])
     z = np.exp(1j * w)
     E = environment_by_hand(network, z)
@@ -55,7 +55,7 @@ def needed(network: Network, coupling: _InternalModel) -> float:
 
 
 def cube(n: int) -> Region:
-    """Ranges [0, 10], [1, 11], .. whose members carry the point in their springs' stiffness."""
+    """Return a region with the ranges [0, 10], [1, 11], ..; the point is the stiffness of its members' springs."""
     low = np.arange(n, dtype=float)
 
     def at(name: str, point) -> Member:
@@ -108,16 +108,16 @@ def test_region_corners_are_the_vertices():
     ids=["edge", "face", "inside", "end"],
 )
 def test_a_peak_is_found_wherever_it_lies(top):
-    """A peak of a quarter of the range's width, on an edge, on a face, inside, at a vertex."""
+    """The peak is a Gaussian whose width is a quarter of the range: on an edge, on a face, inside, at a vertex."""
     region = cube(3)
     found = search([region], lambda m: float(np.exp(-np.sum(((point_of(m) - region.low) / 10 - top) ** 2) / 0.0625)))
-    # the last steps of the compass are 1/128 of the width, so half of that is left in each of three directions
+    # The last step of the compass search is 1/128 of the width, so the error per parameter is about half of that.
     np.testing.assert_allclose((point_of(found.worst[0].member) - region.low) / 10, top, atol=1 / 128)
     assert found.worst[0].ratio > 0.99
 
 
 def test_many_parameters_find_the_worst_vertex():
-    """A need that is most where odd parameters are at their upper ends, the others at their lower."""
+    """The ratio is largest with parameters 1, 3, .. 9 at their upper ends and the others at their lower ends."""
     region = cube(10)
     signs = np.array([1, -1] * 5)
 
@@ -153,17 +153,17 @@ def test_progress_ends_at_its_total():
     assert all(done <= total for done, total in told)
 
 
-# a coupling that is certified at every vertex and at 64 random points, and violated on an edge
+# In RANGED, VERTICES_ONLY is certified at every vertex and at 64 random points, and violated on an edge.
 
 
 def test_edge_violations_match_a_dense_sweep(known):
-    """The springs at their upper ends: between 0.5 and 2 kg the resonance moves from one vertex to the other."""
+    """The worst member has its springs at their upper ends and a mass between 0.5 and 2 kg."""
     found = known.searched.worst[0]
     near = found.member.network.masses["mass"] + np.linspace(-0.05, 0.05, 7)
     masses = np.concatenate([np.linspace(0.5, 2.0, 13), near])
     edge = [needed(Network(FIGURE_4.contacts, STIFF, {"mass": m}), VERTICES_ONLY) for m in masses]
     assert found.member.network.springs == STIFF
-    # the grid of frequencies may miss the very peak of the resonance; the top over the mass is flat
+    # The frequency grid may miss the resonance's peak. Near the worst mass the ratio hardly changes.
     assert found.ratio == pytest.approx(max(edge), abs=1e-3)
     assert found.ratio == pytest.approx(1.0428, abs=1e-3)
     assert found.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
@@ -173,7 +173,7 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
     assert known.certificate is not None
     assert len(known.at_samples) == 64
     assert all(r.certified for r in known.at_members)
-    if len(known.at_members) > 3:  # Samples of the ranges are rarely near the violated edge.
+    if len(known.at_members) > 3:  # The 64 samples of RANGED miss the violated edge.
         assert all(r.certified for r in known.at_samples)
     assert not known.proved
     part = known.part()
@@ -182,7 +182,7 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():
-    requirement = certify(EDGE, VERTICES_ONLY)["this-environment"]  # draws none
+    requirement = certify(EDGE, VERTICES_ONLY)["this-environment"]  # certify draws no samples
     assert not requirement.certified
     assert requirement.ratio == pytest.approx(1.0428, abs=1e-3)
     assert requirement.proof == "sampled"
@@ -200,7 +200,7 @@ def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
 def test_design_check_repeats_the_search(tmp_path, capsys):
     file = tmp_path / "c.json"
     save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "this-environment")), file)
-    assert verify(load(file)).proved  # of the vertices it is a proof
+    assert verify(load(file)).proved  # the proof covers the vertices only
     assert check_main([str(file), "--json", "-"]) == 1
     result = json.loads(capsys.readouterr().out)
     assert (result["proved"], result["guarantee"]) == (False, None)
@@ -217,11 +217,11 @@ def test_range_designs_hold_between_their_ends():
     assert found.proved
     E = np.array([needed_by_filter(with_mass(mass), found.coupling) for mass in np.geomspace(0.25, 4.0, 60)])
     assert E.max() < 1
-    assert E.max() > 0.9  # and what there is of damping is used
+    assert E.max() > 0.9  # the design uses over 90 % of the damping
 
 
 def needed_by_filter(network: Network, coupling: ForceFilter) -> float:
-    """`needed` for F = Theta R Psi E, R by its own functions."""
+    """Return required over available damping, as `needed` does, for the force map F = Theta R E of a filter R."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, 2000), np.linspace(1e-3, np.pi, 2000)])
     z = np.exp(1j * w)
     E, R = environment_by_hand(network, z), filter_by_hand(coupling, z)
