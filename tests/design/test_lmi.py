@@ -1,4 +1,4 @@
-"""Laws of the matrix inequalities: realisations, agreement with the frequency domain, and what is empty as printed."""
+"""Tests of the matrix inequalities: realisations, agreement with the frequency domain, infeasible printed forms."""
 
 import cvxpy as cp
 import numpy as np
@@ -26,14 +26,14 @@ Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 
 
 def e_hat_printed(E, psi):
-    """E-hat = z/(z-1) Psi E (11), as printed: its pole at z = 1 makes (15) empty."""
+    """Return E-hat = z/(z-1) Psi E as printed in (11). Its pole at z = 1 makes (15) infeasible."""
     m = E.inputs
     one = np.eye(m)
     return Lti(one, one, one, one, E.T) @ (delay(psi, E.T) @ E)
 
 
 def v_hat_printed(V, theta):
-    """V-hat = (1 - 1/z)(V - Theta-hat) in the realisation (16)."""
+    """Return V-hat = (1 - 1/z)(V - Theta-hat) in the realisation (16)."""
     m = V.inputs
     one, zero = np.eye(m), np.zeros((m, m))
     return Lti(zero, one, -one, one, V.T) @ (V - theta_hat(theta))
@@ -46,7 +46,7 @@ def random_stable(rng, order, m=2):
 
 
 def near_the_boundary(rng, V, theta, delta):
-    """V scaled so that the damping it needs is within a factor of 2 of what there is, on either side."""
+    """Return V, scaled in up to 60 trials until its required damping is within a factor of 2 of `delta`."""
     for _ in range(60):
         ratio = any_environment(V, theta, delta).ratio
         if not np.isfinite(ratio):
@@ -59,7 +59,7 @@ def near_the_boundary(rng, V, theta, delta):
 
 
 def strength(matrix, *storages):
-    """The largest s for which `matrix` >= s I with the storages > 0 and of bounded size."""
+    """Return the largest s <= 1 for which `matrix` >= s I with the storages >= 0 and of bounded trace."""
     s = cp.Variable()
     bounds = [P >> 0 for P in storages] + [cp.trace(P) <= 1e3 for P in storages]
     solve(cp.Problem(cp.Maximize(s), [matrix >> s * np.eye(matrix.shape[0]), s <= 1, *bounds]))
@@ -89,7 +89,7 @@ def test_the_realisation_16_and_its_quotient():
     ports = v_hat_ports(V, theta)
     y2 = Lti(ports.A, ports.B, ports.C2, ports.D2, 1.0).at(Z)
     np.testing.assert_allclose(hermitian(y2), hermitian(hat) / np.abs(1 - 1 / Z)[:, None, None] ** 2, atol=1e-9)
-    np.testing.assert_allclose(y2, _v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the home of the formula
+    np.testing.assert_allclose(y2, _v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the design's formula
 
 
 def test_e_hats_regular_part_keeps_the_hermitian_part():
@@ -134,7 +134,7 @@ def test_lemma_3_is_the_norm(seed):
     G = random_stable(np.random.default_rng(seed), 3)
     norm = np.linalg.norm(G.at(on_circle(frequencies(G, points=3000))), 2, axis=(1, 2)).max()
     for factor in (0.99, 1.01):
-        # with X = U^-1 the Schur complement over U and I is the bounded-real inequality, linear in X
+        # With X = U^-1 the Schur complement over U and I is the bounded-real inequality, linear in X.
         X = cp.Variable((3, 3), symmetric=True)
         A, B, C, D = G.A, G.B, G.C, G.D
         bounded = cp.bmat(
@@ -157,7 +157,7 @@ def test_15_as_printed_is_strictly_infeasible():
     P = cp.Variable((n, n), symmetric=True)
     Phi = cp.Variable((2, 2), symmetric=True)
     assert strength(lemma1(Ports.same(printed), P, np.zeros((2, 2)), -Phi), P) < 1e-6
-    # the reason, for every P: v'(A'PA - P)v = 0 where A v = v
+    # (15) is infeasible because v'(A'PA - P)v = 0 for every P where A v = v.
     regular = balanced(e_hat_regular(E, (0, 0)))
     P = cp.Variable((regular.order,) * 2, symmetric=True)
     assert strength(lemma1(Ports.same(regular), P, np.zeros((2, 2)), -np.eye(2)), P) > 1e-3
@@ -175,7 +175,7 @@ def test_2_as_printed_is_infeasible_for_v_hat():
 
 @pytest.mark.parametrize("count", [9, pytest.param(48, marks=pytest.mark.validate)])
 def test_analysis_agrees_with_the_frequency_condition(count):
-    """Couplings near the boundary, of both signs, from one to three channels, diagonal and coupled."""
+    """The couplings are on either side of the boundary, with one to three channels, diagonal and coupled."""
     rng = np.random.default_rng(7)
     verdicts = []
     for trial in range(count):
@@ -200,7 +200,7 @@ def test_analysis_agrees_with_the_frequency_condition(count):
 
 
 def scalar_any_environment(V, E, theta, psi, delta):
-    """Lemma 4 for one channel, by hand: inf Re V-hat/|V-hat|^2 against phi/(1 - phi/delta), phi = sup -Re E-hat."""
+    """Return phi = sup -Re E-hat (0 at least) and inf Re V-hat/|V-hat|^2 - phi/(1 - phi/delta) of Lemma 4."""
     systems = (V, E)
     z = on_circle(frequencies(*systems, points=4000))
     e_hat = T * z / (z - 1) * z**-psi * E.at(z)[:, 0, 0]
@@ -261,7 +261,7 @@ def test_an_active_environment_is_refused_by_name():
 
 
 def test_the_matrices_take_parameters():
-    """Lemmas 2 and 3 are affine in (A, B, C, D): a problem is compiled once and solved for many systems."""
+    """Lemmas 2 and 3 are affine in (A, B, C, D): a problem can be compiled once for many systems."""
     rng = np.random.default_rng(3)
     data = {name: cp.Parameter((2, 2)) for name in "ABCD"}
     X, U, mu2 = cp.Variable((2, 2), symmetric=True), cp.Variable((2, 2), symmetric=True), cp.Parameter(nonneg=True)

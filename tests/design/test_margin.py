@@ -1,4 +1,4 @@
-"""Required damping: the agreed figures, closed forms, and a pencil that needs no frequency grid."""
+"""Tests of the required damping: known figures, closed forms, and a pencil that needs no frequency grid."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_any_environment_figures():
 
 @pytest.mark.parametrize("seed", range(10))
 def test_any_environment_is_the_trigonometric_maximum(seed):
-    """max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), on a grid of a million points."""
+    """It is max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), n = theta + 1 and vt = 1 + z^-1 + .. + z^-theta."""
     rng = np.random.default_rng(seed)
     theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))
     z = np.exp(1j * np.linspace(0, np.pi, 1_000_001))
@@ -62,14 +62,14 @@ def test_any_environment_is_the_trigonometric_maximum(seed):
 
 @pytest.mark.parametrize(("K", "B", "theta", "factor"), [(5000, 0, 0, 0.5), (5000, 30, 0, 0.5), (2000, 0, 1, 1.5)])
 def test_rigid_wall_closed_forms(K, B, theta, factor):
-    """Colgate's K T/2 + B without delay, and 3 K T/2 for a spring with one sample of it."""
+    """The requirement is Colgate's K T/2 + B without delay, and 3 K T/2 for a spring with one sample of delay."""
     wall = environment(Network(("a",), (Spring(("a", GROUND), float(K), float(B)),)), 1e-3)
     F = force_map(wall, NoCoupling(), [theta], [0])
     assert this_environment(F, [1.0]).required[0] == pytest.approx(factor * K * 1e-3 + B, rel=1e-9)
 
 
 def crossings(F: Lti, level: float) -> np.ndarray:
-    """Frequencies where det(level/T I - F(1)/2 + He R) = 0 on the circle: an extended symplectic pencil."""
+    """Return angles where det(level/T I - F(1)/2 + He R) = 0 on the circle, by an extended symplectic pencil."""
     R, n, m = F.split_at_one()[1], F.order, F.inputs
     direct = 2 * (level / F.T * np.eye(m) - F.dc() / 2)
     zero = np.zeros
@@ -93,7 +93,7 @@ def random_loop(seed) -> Lti:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_sweep_misses_no_peak(seed):
-    """Just above the required damping no frequency violates the condition, just below some does: good to 1e-4."""
+    """1e-4 above the required damping no frequency violates the condition, and 1e-4 below some frequency does."""
     F = random_loop(seed)
     if not F.is_stable():
         assert this_environment(F, (1.0, 1.0)).required == (np.inf, np.inf)
@@ -104,7 +104,7 @@ def test_the_sweep_misses_no_peak(seed):
 
 
 def test_unequal_devices_need_a_common_factor():
-    """Scaling delta scales the ratio: required damping is along the direction of what is available."""
+    """Required damping is the available damping times a common ratio, so doubling delta only halves the ratio."""
     F = default(PUBLISHED["I"])
     one, two = this_environment(F, (1.0, 2.0)), this_environment(F, (2.0, 4.0))
     assert one.required == pytest.approx(two.required, rel=1e-9)
@@ -112,7 +112,7 @@ def test_unequal_devices_need_a_common_factor():
 
 
 def test_the_needier_channel_decides():
-    """Without damping any-environment asks K T n^2/2 of a channel: 1.08 of 2 N s/m and 0.96 of 0.9 N s/m."""
+    """With B = 0 any-environment needs K T (theta + 1)^2/2 per channel: 1.08 of 2 N s/m and 0.96 of 0.9 N s/m."""
     coupling = SpringDamper([1800.0, 400.0], [0.0, 0.0])
     for order in (slice(None), slice(None, None, -1)):
         channels, theta, delta = coupling.channels(T)[order], (0, 1)[order], (2.0, 0.9)[order]
@@ -128,7 +128,7 @@ def test_the_needier_channel_decides():
 
 @pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
 def test_a_free_mass_is_not_refused_by_rounding(mass):
-    """Its F(1) is exactly 0; a heavy one asks what a rigid wall asks."""
+    """F(1) of a free mass is exactly 0, and the mass needs the same damping as a rigid wall."""
     free = environment(Network(("a",), masses={"a": mass}), T)
     F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
     assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
@@ -162,7 +162,7 @@ def test_refusals_say_why():
 
 
 def test_the_frequency_at_which_a_condition_binds():
-    """Against a dense grid of the definition, -He[F/(z-1)] T/delta."""
+    """Ratio and frequency equal those of the definition, -He[F/(z-1)] T/delta, on a dense grid."""
     F, w = default(PUBLISHED["I"]), np.linspace(1e-3, np.pi, 200_001)
     z = np.exp(1j * w)
     G = F.at(z) / (z - 1)[:, None, None]
@@ -181,14 +181,14 @@ def test_the_least_multiple_is_a_generalised_eigenvalue(n):
 
 
 def test_the_regular_part_keeps_the_hermitian_part():
-    """E z/(z-1) less its pole, on the circle."""
+    """E z/(z-1) without its pole at 1 has the same Hermitian part on the circle."""
     z = np.exp(1j * np.array([0.1, 0.7, 2.9]))
     whole = E.at(z) * (z / (z - 1))[:, None, None]
     np.testing.assert_allclose(hermitian(_regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
 
 
 def test_supremum_finds_a_needle():
-    """A peak of width 1e-7 that an even grid would miss, known to the grid through its pole."""
+    """An even grid would miss a peak of width 1e-7. This grid contains the frequency of its pole."""
     pole = (1 - 1e-7) * np.exp(1j * 1.2345)
     A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
     needle = Lti(A, [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]], T)
@@ -198,7 +198,7 @@ def test_supremum_finds_a_needle():
 
 
 def test_rounding_elsewhere_hides_no_peak():
-    """Fifty maxima by rounding are higher than the grid points beside the peak, which lies between two of them."""
+    """Fifty maxima, like those of rounding, are higher than the grid points on both sides of the peak."""
 
     def response(w):
         return np.where(w < 0.5, 1 + 1e-9 * np.cos(200 * np.pi * w), 1.001 - 200 * (w - 0.7525) ** 2)
@@ -209,7 +209,7 @@ def test_rounding_elsewhere_hides_no_peak():
 
 
 def test_the_factor_with_multiplier_is_least():
-    """He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s, (11) to (14): met at s, kept above, missed below."""
+    """He[H/(1-z)] >= H* Delta_V H, with H = V - Theta-hat/s, (11) to (14), is tight at s, true above, false below."""
     V, theta, delta, phi = SpringDamper([300.0, 200.0], [0.2, 0.3]).compliance(T), (1, 2), np.array(DELTA), (0.37, 0.1)
     w = np.linspace(0.05, 3.1, 23)
     z, star = on_circle(w), lambda M: np.conj(np.swapaxes(M, 1, 2))
@@ -228,7 +228,7 @@ def test_the_factor_with_multiplier_is_least():
 
 
 def test_weights_gain_nothing_in_reciprocal_loops():
-    """Each human's energy weighed by d > 0 turns F/delta into sqrt(d) F/delta sqrt(d)^-1: never a smaller need."""
+    """A weight d > 0 on each human's energy turns F into sqrt(d) F sqrt(d)^-1, which never needs less damping."""
     F = force_map(environment(FIGURE_4, 1.2e-3), SpringDamper([900.0, 600.0], [0.4, 0.6]), (1, 2), (0, 0))
     rng, z = np.random.default_rng(8), np.exp(1j * np.geomspace(1e-2, 3.1, 60))
     X = -F.at(z) / (z - 1)[:, None, None]
@@ -239,7 +239,7 @@ def test_weights_gain_nothing_in_reciprocal_loops():
 
 
 def test_a_map_of_rounding_needs_no_damping():
-    """Two equal states that cancel, seen from other coordinates: F = 0, and in floating point 1e-13 of no symmetry."""
+    """Two states cancel, so F = 0. In other coordinates rounding leaves F(1) slightly asymmetric."""
     turn = np.random.default_rng(3).normal(size=(2, 2))
     B, back = np.array([[1e3, 70.0], [-1e3, -70.0]]), np.linalg.inv(turn)
     F = Lti(turn @ (0.5 * np.eye(2)) @ back, turn @ B, np.ones((2, 2)) @ back, np.zeros((2, 2)), 1e-3)

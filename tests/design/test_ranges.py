@@ -1,4 +1,4 @@
-"""Ranges of the environment: their vertices, one Q for all of them, the proof at each, and what is guaranteed."""
+"""Tests for ranges of the environment: vertices, one coupling for all, the proof at each vertex, and the guarantee."""
 
 import json
 from dataclasses import replace
@@ -31,7 +31,7 @@ from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
 from tests.asked import decisive, safe_with
 
 T, THETA = 1.2e-3, (1, 2)
-#: the first spring softer or stiffer or lost: three vertices beside the environment
+#: The spring at contact 1 may be softer, stiffer or absent: three vertices beside the environment.
 SMALL = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
 LOOP = Loop(T, THETA, (0, 0), THETA, (1.37, 1.37), FIGURE_4, SMALL)
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
@@ -91,7 +91,7 @@ def test_vertices_are_range_ends_and_absences():
 
 
 def test_a_contact_that_is_made():
-    """The environment has no spring to the ground, the vertices have one: that it may be absent is the environment."""
+    """The environment has no spring to the ground, the vertices have one. Its absence gives the environment again."""
     ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
     nominal, *vertices = members(FIGURE_4, ranges)
     assert len(nominal.network.springs) == 2
@@ -114,13 +114,13 @@ def test_samples_lie_inside_whatever_their_number():
     assert [m.network for m in inside(FIGURE_4, SMALL, 7, seed=3)] == [m.network for m in drawn[:7]]
     stiffness = np.array([m.network.springs[0].stiffness for m in drawn])
     present = stiffness > 0
-    assert 5 < present.sum() < 35  # a fair coin leaves this with a probability of 1e-6
+    assert 5 < present.sum() < 35  # A fair coin leaves these bounds with a probability of 1e-6.
     assert ((stiffness[present] > 640) & (stiffness[present] < 840)).all()
     assert all(m.network.springs[1] == FIGURE_4.springs[1] for m in drawn)
 
 
 def chain(links: int) -> tuple[Network, Ranges]:
-    """Springs in a row, each of 50 to 200 N/m."""
+    """Build springs in a row with ranges of 50 to 200 N/m."""
     nodes = [f"n{i}" for i in range(links + 1)]
     springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
     ranges = Ranges(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs))
@@ -140,14 +140,14 @@ def test_any_three_parameters_meet_in_all_ends(links):
 
 
 def absences(links: int) -> tuple[Network, Ranges]:
-    """Springs in a row, each of 50 to 200 N/m or absent."""
+    """Build springs in a row with ranges of 50 to 200 N/m, each of which may be absent."""
     network, ranges = chain(links)
     return network, Ranges(tuple(msgspec.structs.replace(spring, absent=True) for spring in ranges.springs))
 
 
 @pytest.mark.parametrize("links", [5, 6, 8])
 def test_absent_springs_leave_128_different_vertices(links):
-    """Words of the code alone gave 41, 41 and 81 of 243, 729 and 6561 vertices."""
+    """The orthogonal array alone gave only 41, 41 and 81 different vertices of 243, 729 and 6561."""
     chosen = members(*absences(links))[1:]
     ends = {tuple(spring.stiffness for spring in member.network.springs) for member in chosen}
     assert len(chosen) == len(ends) == 128
@@ -217,11 +217,11 @@ def test_a_vertex_that_cannot_be_simulated_is_refused():
         Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), springs), ranges)
 
 
-# one R for all
+# one filter R for all vertices
 
 
 def by_hand(network: Network, coupling, w):
-    """F = Theta R E from the network's own matrices and the definition of the basis, shape (k, 2, 2)."""
+    """Return F = Theta R E at w (k,), shape (k, 2, 2), from the network's matrices and the definition of the basis."""
     z = np.exp(1j * w)
     E, R = environment_by_hand(network, z), filter_by_hand(coupling, z)
     late = np.stack([z ** -THETA[0], z ** -THETA[1]], axis=1)[:, :, None]
@@ -229,7 +229,7 @@ def by_hand(network: Network, coupling, w):
 
 
 def least_room(network: Network, coupling, points: int = 2000) -> float:
-    """min over frequency of the least eigenvalue of T/delta He[F/(z-1)] + I: positive where the condition holds."""
+    """Return the least eigenvalue of T/delta He[F/(z-1)] + I at all frequencies: positive if the condition holds."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, points), np.linspace(1e-3, np.pi, points)])
     H = by_hand(network, coupling, w) / (np.exp(1j * w) - 1)[:, None, None]
     return float(np.linalg.eigvalsh(T / 1.37 * (H + np.conj(np.swapaxes(H, 1, 2))) / 2 + np.eye(2)).min())
@@ -240,7 +240,7 @@ def test_vertex_force_maps_match_raw_matrices(robust):
     for member in LOOP.members():
         F = force_map(environment(member.network, T), robust.coupling, THETA, (0, 0)).at(np.exp(1j * w))
         expected = by_hand(member.network, robust.coupling, w)
-        # near z = 1 both routes lose digits to z - 1 = 1e-3, squared, and to the resonance
+        # Near z = 1, where |z - 1| is 1e-3, both computations lose digits to its square and to the resonance.
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
@@ -256,12 +256,12 @@ def test_one_filter_holds_at_every_vertex(robust, nominal_only):
 def test_the_sweep_agrees_with_the_condition_by_hand(robust):
     check = check_ranges(LOOP, robust.coupling, samples=0)
     for member, requirement in zip(check.members, check.at_members, strict=True):
-        # a dense grid may miss the very peak of the 6 Hz resonance
+        # A dense grid may miss the peak of the 6 Hz resonance.
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
 
 
 def test_an_environment_that_no_device_feels_asks_nothing():
-    """Both springs lost: the forces are zero, and so is their mismatch."""
+    """At the vertex where both springs are absent, the forces are zero and no damping is required."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
     loop = change(LOOP, ranges=both)
     found = optimal.design(loop, SMALLEST)
@@ -317,7 +317,7 @@ def test_nominal_couplings_are_not_proved_for_ranges(nominal_only):
 
 
 def test_nothing_is_promised_where_a_sample_inside_violates(robust):
-    """The vertices alone would be proved: what is found inside is not passed over."""
+    """Every vertex is proved, but one sample inside that violates the condition leaves the ranges unproved."""
     check = check_ranges(LOOP, robust.coupling, samples=6)
     assert check.proved
     broken = replace(check, at_samples=(*check.at_samples[:-1], replace(check.at_samples[-1], required=(1.4, 1.4))))
@@ -334,7 +334,7 @@ def test_fixed_couplings_may_cover_ranges():
 
 
 def test_files_without_ranges_keep_their_digest():
-    """Made before there were ranges, for this loop and coupling."""
+    """The expected digest was made before ranges existed, for this loop and coupling."""
     plain = LOOP.at(FIGURE_4)
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
     assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
@@ -364,7 +364,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
-    # of nearly equal couplings the one right in every direction is taken: .014 dB where a slow machine has one basis
+    # The design also weighs each motion's relative error, which cost 0.014 dB with the one basis of a slow machine.
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == "these ranges"
 
@@ -386,7 +386,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     code, run = told(run_main, *at_vertex, *out)
     assert (code, safe_with(run)) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
-    assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered
+    assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # Little of the other force passes.
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
     assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, "these ranges", True)
@@ -399,7 +399,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
 
 
 def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, capsys):
-    """The gains of least mismatch in the nominal environment alone."""
+    """These gains have the least mismatch in the nominal environment and are certified there only."""
     stiff = ["--K", "7806,3137", "--B", "0.105,1.68"]
     assert audit_main(["--scenario", str(scenario_file), *stiff, "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
@@ -443,7 +443,7 @@ def test_missing_ranges_cannot_be_sampled(tmp_path):
 
 
 def test_scenarios_may_have_ranges_and_walls():
-    """One set of multipliers serves every vertex, so none may need more when it is judged alone."""
+    """One set of multipliers serves every member, so no member may need more damping when it is judged alone."""
     walls = '\n[[environment.walls]]\nbetween = ["mass", "ground"]\nstiffness = 3000.0\ndamping = 2.0\ngap = 5e-3\n'
     both, coupling = parse(TEXT + walls + RANGES_TEXT).loop("I"), SpringDamper([800.0, 600.0], [0.5, 0.5])
     together = check_ranges(both, coupling, samples=0)

@@ -1,4 +1,4 @@
-"""The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
+"""Tests of the spring-damper designs: known optima, independence of the start, the exact gain set, and refusals."""
 
 import re
 
@@ -45,7 +45,7 @@ def random_starts(count, seed=0):
 @pytest.mark.parametrize("start", [None, *random_starts(2)])
 def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
     found = design(asked(CASES[case]), starts=() if start is None else [start])
-    # all damping in use would give (878.86, 551.94) N/m; the reserve costs 0.01 %
+    # Without the reserve K would be (878.86, 551.94) N/m; the reserve costs 0.01 %.
     np.testing.assert_allclose(found.coupling.K, np.array([878.86, 551.94]) * (1 - RESERVE), rtol=2e-5)
     np.testing.assert_allclose(found.coupling.B, [0.3865, 0.5220], rtol=1e-3)
     assert found.objective == pytest.approx(norm, rel=2e-4)
@@ -55,7 +55,7 @@ def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
 
 @pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
 def test_a_damper_of_nothing_is_zero(condition):
-    """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness: before a stiff wall none is best."""
+    """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness, so B = 0 is best at a stiff wall."""
     wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
     found = design(asked((0,), wall, (0,), (0,), (0.5,)), condition)
     assert found.coupling.B[0] == 0.0
@@ -93,18 +93,18 @@ def test_no_certified_gains_do_better(case, draws):
 
 
 def test_a_handful_of_convex_problems_suffices():
-    """What the design costs, counted: tests/benchmarks/test_design_cost.py has the seconds."""
+    """The design solves at most four problems. tests/benchmarks/test_design_cost.py measures the seconds."""
     assert design(asked()).sdps <= 4
 
 
 def stiffest(loop):
-    """The gains of largest total stiffness, each channel's own largest."""
+    """Return the gains of largest total stiffness, which is the largest stiffness of each channel."""
     gains = _GainSet(loop).solve(np.repeat([-1.0, 0.0], loop.channels), "a test")
     return spring_damper._coupling(loop, gains)
 
 
 def stiffest_at(B, theta, delta, T):
-    """The largest K that any_environment's own sweep accepts beside B, by bisection, with the reserve of a design."""
+    """Return the largest K that the sweep of any_environment accepts for B, less the reserve of a design."""
     usable = (1 - RESERVE) * delta
     return brentq(
         lambda K: any_environment(SpringDamper([K], [B]).compliance(T), [theta], [usable]).ratio - 1, 1.0, 1e5
@@ -115,7 +115,7 @@ def stiffest_at(B, theta, delta, T):
 def test_the_largest_stiffness_by_delay(theta, K):
     found = stiffest(asked((0,), WALL, (theta,), (0,), (1.37,)))
     assert pytest.approx(K * (1 - RESERVE), rel=2e-4) == found.K
-    # and beside the same B a bisection of the condition itself
+    # A root search on the condition gives the same K for this B.
     assert stiffest_at(float(found.B[0]), theta, 1.37, T) == pytest.approx(found.K[0], rel=1e-5)
 
 
@@ -125,7 +125,7 @@ def test_the_stiffness_scales_with_damping_and_rate():
 
 
 def gains_of_least(cost, theta, sigma):
-    """(k, b) of least cost by cvxpy, with the inequality as second-order cones at 2001 frequencies."""
+    """Return (k, b) of least cost by cvxpy, with the inequality as second-order cones at 2001 frequencies."""
     k, b = cp.Variable(), cp.Variable()
     w = np.linspace(0, np.pi, 2001)
     of_k = sum(np.exp(-1j * w * j) for j in range(theta + 1))
@@ -134,7 +134,7 @@ def gains_of_least(cost, theta, sigma):
     if np.isfinite(sigma):
         rows += [(2 * (i == 0) - row) / np.sqrt(sigma) for i, row in enumerate(rows)]
     room = (k / 2 + b) * np.ones(w.size)
-    cones = cp.SOC(room + 1, cp.vstack([*rows, room - 1]), axis=0)  # |(2c, r - 1)| <= r + 1 says |c|^2 <= r
+    cones = cp.SOC(room + 1, cp.vstack([*rows, room - 1]), axis=0)  # |(2c, r - 1)| <= r + 1 is |c|^2 <= r
     return solve(cp.Problem(cp.Minimize(cost[0] * k + cost[1] * b), [cones, k >= 0, b >= 0]))
 
 
@@ -143,7 +143,7 @@ def gains_of_least(cost, theta, sigma):
     [(0, np.inf, 1000), (12, np.inf, 1000), (7, 3.0, 1000), (12, np.inf, 0), (7, 3.0, 0)],
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
-    """Its furthest points, by one matrix inequality and by many, against cvxpy: 5e-6, since the many miss 2e-6."""
+    """Its furthest points, by one matrix inequality and by many, equal those of cvxpy to 1e-5; the many miss 2e-6."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
     certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in (np.array([-1.0, -0.2]), np.array([-0.2, -1.0]), np.array([-1.0, 1.0])):
@@ -154,7 +154,7 @@ def test_the_gain_set_is_exact(theta, sigma, most_stored):
 @pytest.mark.parametrize("phi", [0.0, 0.3])
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_the_gain_set_equals_its_block(theta, phi):
-    """k/2 + b - |c|^2 is |W|^2 times the block of any-environment for V = 1/W, less its row of the multiplier."""
+    """k/2 + b - |c|^2 is |W|^2 times the block of any-environment for V = 1/W without its multiplier's row (Schur)."""
     loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
     unit = msgspec.structs.replace(unit, delta=(1.0,))
@@ -180,7 +180,7 @@ def test_three_channels_with_different_devices():
 
 
 def test_weights_shift_the_optimum():
-    """A weight of one on the damping-ruled high frequencies asks for another point than the default low-pass."""
+    """By a flat weight the design for this weight is at least as good as the design for the default low-pass."""
     flat = Lti.constant(np.eye(2), T)
     loop = asked((0, 0))
     found, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
@@ -195,7 +195,7 @@ def test_delay_in_the_environment(psi):
     V = found.coupling.compliance(T)
     assert found.requirement.certified
     assert found.phi.max() < 1.37
-    # two judges that did not take part: the LMI over every multiplier, and the loop itself
+    # Two checks that the design does not use: the LMI over every multiplier, and this-environment.
     assert analysis(V, loop.E(), loop.theta, psi, DELTA).feasible
     assert this_environment(force_map(loop.E(), found.coupling, loop.theta, psi), DELTA).certified
 
@@ -235,7 +235,7 @@ def test_failed_searches_claim_no_impossibility():
 
 @pytest.mark.validate
 def test_proposed_changes_hold_when_made():
-    """Each proposal, designed with more bases, passes the sweep; best first, and never what was asked for."""
+    """Each proposal passes the sweep when designed. The best comes first, and none repeats the request."""
     loop = asked((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
     proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)
@@ -288,14 +288,14 @@ def test_an_unknown_condition_is_refused():
 
 
 def test_long_delay_designs_pass_a_dense_sweep():
-    """50 samples; |y|^2 <= 4 delta (K T/2 + B) at 200001 frequencies, 1/125 of a ripple apart in phase."""
+    """With 50 samples of delay |y|^2 <= 4 delta (K T/2 + B) holds at 200001 frequencies, about 7800 per ripple of y."""
     made = stiffest(asked(theta=(50, 50)))
     z, n = np.exp(1j * np.linspace(0, np.pi, 200_001)), 51
     for K, B in zip(made.K, made.B, strict=True):
         y = K * T * np.polyval(np.ones(n), 1 / z) + B * (1 - z**-n)
         needed = (np.abs(y) ** 2).max() / (4 * (K * T / 2 + B))
         assert 0.9997 * 1.37 < needed < 1.37
-        # no linear law is stiffer than 2 delta/(n T), and a spring alone reaches half of that
+        # No linear law is stiffer than 2 delta/(n T), and these designs exceed half of that.
         assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
 
 
@@ -306,7 +306,7 @@ def switching_loop(loop):
 @pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop, switching_loop])
 @pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
 def test_slopes_match_finite_differences(sampled, psi):
-    """Derivatives by hand against central differences, whose own error is 1e-8 of rounding."""
+    """The derivatives by hand equal central differences, whose rounding error is 1e-8."""
     at = sampled(load().replace(psi=psi).loop("I"))
     x = np.array([6.5, 6.1, 0.3, 0.45, *(-0.7, 0.6)[: at.active.size]])
     x[4:] = np.abs(x[4:]) if sampled is LimiterLoop else x[4:]
@@ -330,7 +330,7 @@ def test_what_would_take_minutes_is_refused_at_once():
 
 
 def test_many_device_searches_match_exhaustive_starts(monkeypatch):
-    """It goes on from the likeliest start only, with the limiter at once: within a twentieth of the rms."""
+    """Above FEW channels the search uses the likeliest start only. Its objective is within 5 % of the usual one."""
     usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)
     monkeypatch.setattr(gain_search, "FEW", 1)
@@ -353,7 +353,7 @@ def test_limits_help_no_loop_that_fails_without() -> None:
 @pytest.mark.parametrize("steps", [7, 100])
 @pytest.mark.parametrize("release", [scipy.__version__, "1.15.0"])
 def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
-    """The optimum of Rosenbrock's function inside a disc is equal bit for bit, by the public function, too."""
+    """Both find the same point of Rosenbrock's function inside a disc bit for bit, also when 7 steps are too few."""
     disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
     bounds, options = [(-1.5, 0.9)] * 2, {"maxiter": steps, "ftol": 1e-7}
     start = [-1.6, 1.0]  # outside the bounds
@@ -366,7 +366,7 @@ def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 15])
 def test_the_least_eigenpair_solves_its_equation(rows):
-    """Each pair solves H v = lambda v, and lambda is the least eigenvalue, also of a multiple of the identity."""
+    """Each pair solves H v = lambda v, and lambda is the least eigenvalue, also for a multiple of the identity."""
     rng = np.random.default_rng(rows)
     parts = rng.normal(size=(40, rows, rows)) + 1j * rng.normal(size=(40, rows, rows))
     H = hermitian(parts)
@@ -376,5 +376,5 @@ def test_the_least_eigenpair_solves_its_equation(rows):
     np.testing.assert_allclose(values, np.linalg.eigvalsh(H)[:, 0], atol=1e-13)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-13)
     residual = np.einsum("kij,kj->ki", H, vectors) - values[:, None] * vectors
-    # A step of inverse iteration, for 15 rows, leaves 1e-13 of the largest entry over the start's share of the vector.
+    # For 15 rows a step of inverse iteration leaves 1e-13 of the largest entry over the vector's share in the start.
     assert np.abs(residual).max() < (1e-12 if rows < 15 else 1e-10)

@@ -1,4 +1,4 @@
-"""A coupling's file that proves any switching of its delays: made, proved again, tampered with, used elsewhere."""
+"""Tests for coupling files that prove any switching of the delays: stored, verified, tampered with, used elsewhere."""
 
 import json
 from itertools import product
@@ -78,8 +78,7 @@ def test_the_proof_survives_the_file(stored, file):
 
 
 def test_stored_multipliers_pass_a_dense_sweep(stored):
-    """From the numbers of the file alone, without the code that proves: the condition at 20000 frequencies, and
-    the KYP inequality in floating point."""
+    """The stored alpha and P satisfy the condition at 20000 frequencies and the KYP inequality in floating point."""
     proof = stored.certificate
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     demand = switching_demand(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.multipliers["alpha"])
@@ -103,7 +102,7 @@ def test_other_ranges_are_proved_too(lo, hi):
 
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
 def test_constant_delays_in_range_need_no_more(coupling):
-    """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
+    """Constant delays need no more damping than switching, so a file that is proved for switching covers them."""
     switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
         F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
@@ -117,7 +116,7 @@ def test_unsafe_switching_is_not_certified():
 
 
 def test_files_without_a_range_keep_their_digests():
-    """Made before there were ranges."""
+    """The expected digest was made before ranges of delays existed."""
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
     assert digest(PAIR, STIFF.form()) == expected
     assert digest(LOOP, STIFF.form()) != expected
@@ -139,7 +138,7 @@ def exact_block(loop, coupling, alpha) -> Lti:
 
 
 def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
-    """Why a file is refused whose forger repairs digests and seals."""
+    """Return why a changed file with repaired digest and seal is refused."""
     certificate = change(stored.certificate, scenario=digest(loop, SOFT.form()), **fields)
     verdict = verify(Stored.of(loop, SOFT, sealed(certificate)))
     assert not verdict.proved
@@ -171,7 +170,7 @@ def test_a_proof_goes_with_its_range(stored):
 
 
 def test_a_multiplier_below_zero_lends_no_damping():
-    """On a channel whose delay is constant alpha stands in no second row: a negative one would add damping for free."""
+    """A channel of constant delay has no second row with alpha, so a negative alpha would add damping for free."""
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
     found = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
@@ -208,7 +207,7 @@ def ranged() -> Certificate:
 
 
 def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
-    """The condition by hand at 4000 frequencies: positive with the damping on file, and zero for the worst vertex."""
+    """With the stored damping the condition by hand, at 4000 frequencies, is zero at the worst member only."""
     assert (ranged.facts, ranged.guarantee, len(ranged.matrices)) == (("switching", "ranges"), "these ranges", 4)
     save(Stored.of(RANGED, SOFT, ranged), tmp_path / "ranges.json")
     assert verify(load(tmp_path / "ranges.json")).proved
@@ -222,7 +221,7 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
         E = environment_by_hand(member.network, z)
         G = np.linalg.solve(one + E @ V, E)
         nominal = ((1 / z + 1 / z**2) / 2 / (z - 1))[:, None, None] * G
-        error = np.conj(G).swapaxes(1, 2) @ np.linalg.inv(8 * alpha) @ G  # half a tick squared over 2 alpha
+        error = np.conj(G).swapaxes(1, 2) @ np.linalg.inv(8 * alpha) @ G  # (half a tick)^2 / (2 alpha)
         free = (nominal + np.conj(nominal).swapaxes(1, 2)) / 2 - alpha / 2 - error
         least.append(np.linalg.eigvalsh(free + np.diag(ranged.required) / T)[:, 0].min())
     assert min(least) == pytest.approx(0, abs=1e-4 * 1.37 / T)
@@ -241,7 +240,7 @@ def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
 
 @pytest.mark.validate
 def test_random_members_switch_without_growing_hands(ranged):
-    """Lossless hands, members drawn from the ranges, greedy switching. With half of the damping some grow."""
+    """In a random member with adversarial switching no lossless hand grows. With half of the damping some grow."""
     rng = np.random.default_rng(1)
     links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(12, 2, 1, 3)))
     links[..., 1] = 0.0
@@ -331,7 +330,7 @@ def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     line = "the file proves constant delays: delays switching within [1, 2] samples are judged anew here"
     assert line in plain["remarks"]
     assert not plain["varying_delay"]["covered"]
-    # the buffer's constant (2, 2) needs 1.70 of 1.37 N s/m: it is no way out for these gains
+    # A playout buffer makes the delay (2, 2), which needs 1.70 of 1.37 N s/m: it does not help these gains.
     assert "the constant [2, 2], for which it is not certified either" in plain["varying_delay"]["covers"]
     lossy = run(file, "--varying-delay", "1,2", "--loss", "0.1")["varying_delay"]
     assert not lossy["covered"]
@@ -343,7 +342,7 @@ def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
     outcome = run(str(tmp_path / "broken.json"), "--varying-delay", "1,2")
     assert any("does not hold: delays switching within" in remark for remark in outcome["remarks"])
     assert outcome["varying_delay"]["on_file"] is None
-    assert outcome["varying_delay"]["covered"]  # by the proof that the run finds itself
+    assert outcome["varying_delay"]["covered"]  # The run finds its own proof.
     assert "proved exactly" in outcome["varying_delay"]["covers"]
 
 
@@ -360,7 +359,7 @@ def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
 
 
 def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch):
-    """A limit on states between the two models: said in the report, and the file claims no switching."""
+    """The limit on states is below the switching model's order. The report says so; the file claims no switching."""
     monkeypatch.setattr(budgets, "PROOF_STATES", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", out]
@@ -407,7 +406,7 @@ def test_certify_judges_any_switching():
 
 @pytest.mark.parametrize(("K", "certified"), [((2000.0, 1500.0), True), ((7806.0, 3137.0), False)])
 def test_certify_judges_every_vertex_of_the_ranges(K, certified):
-    """The nominal environment alone would certify both."""
+    """The nominal environment alone would certify both couplings."""
     loop = change(PAIR, ranges=Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
     found, nominal = certify(loop, coupling)["this-environment"], certify(PAIR, coupling)["this-environment"]
@@ -423,11 +422,11 @@ def test_certify_judges_every_vertex_of_the_ranges(K, certified):
 
 
 def test_the_bridge_reports_the_longest_hold(tmp_path):
-    """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
+    """The ages that the delay line computes for isolated missed answers lie within the range on file."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve of itself
+    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve is made
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST

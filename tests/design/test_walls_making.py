@@ -1,4 +1,4 @@
-"""this-environment with walls that make and break contact: the block, each step of its proof, certificates, hands."""
+"""Tests of this-environment with walls that make and break contact: block, proof step by step, certificates, hands."""
 
 import itertools
 
@@ -24,7 +24,7 @@ change = msgspec.structs.replace
 
 
 def held(stiffness, delta=1.3, gap=0.0, theta=1):
-    """A mass of 50 g on 20 N/m and 0.3 N s/m at the tip, with a wall."""
+    """Build a loop with a mass of 50 g on 20 N/m and 0.3 N s/m at the tip, and a wall."""
     wall = Wall(("tip", GROUND), stiffness, gap=gap)
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, (wall,))
     return Loop(1e-3, (theta,), (0,), (theta,), (delta,), network)
@@ -32,7 +32,7 @@ def held(stiffness, delta=1.3, gap=0.0, theta=1):
 
 COUPLING = SpringDamper([1000.0], [0.5])
 
-#: Two devices, a mass between them, a wall on either side of it and one at the first contact.
+#: Two devices, a mass between them, a wall on either side of the mass and one at the first contact.
 NETWORK = Network(
     ("a", "b"),
     (Spring(("a", "mass"), 200.0, 0.3), Spring(("mass", "b"), 150.0, 0.2)),
@@ -44,7 +44,7 @@ NETWORK = Network(
     ),
 )
 PAIR = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), NETWORK)
-#: The same with dampers in two of the walls: b/T is 1667 and 417 N/m.
+#: PAIR with dampers in two of its walls: b/T is 1667 and 417 N/m.
 DAMPED = change(
     PAIR,
     environment=change(
@@ -58,7 +58,7 @@ T = 1e-3
 
 
 def bare(stiffness, damping, theta, delta=1.0):
-    """A wall on the device itself."""
+    """Build a loop with a wall on the device itself."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), stiffness, damping),))
     return Loop(T, (theta,), (0,), (theta,), (delta,), network)
 
@@ -74,11 +74,11 @@ def bare(stiffness, damping, theta, delta=1.0):
     ],
 )
 def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
-    """Between what the frozen contact alone needs and the figures of a separate computation."""
+    """The requirement equals the figures of a separate computation, and the frozen contact needs no more."""
     for theta, need in enumerate(needs):
         loop = bare(stiffness, damping, theta)
         found = required_damping(loop, NoCoupling(), "this-environment")
-        assert found.required[0] == pytest.approx(need, rel=5e-5)  # the search ends within this
+        assert found.required[0] == pytest.approx(need, rel=5e-5)  # The search stops within this.
         assert found.bound == pytest.approx(found.ratio, rel=5e-5)
         touching = this_environment(loop.at(loop.environment.frozen()[-1]).F(NoCoupling()), loop.delta)
         assert touching.required[0] <= found.required[0] * (1 + 1e-9)
@@ -88,25 +88,25 @@ def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
     ("damping", "needs"), [(0.0, (1.0, 1.6764, 2.4319)), (2.0, (1.6154, 1.8630, 2.3639))], ids=["spring", "damped"]
 )
 def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
-    """A wall of 3000 N/m is behind 2000 N/m and 2 N s/m; forces are delayed by 0, 1 and 2 samples."""
+    """A wall of 3000 N/m is behind a coupling of 2000 N/m and 2 N s/m. Forces are delayed by 0, 1 and 2 samples."""
     for theta, need in enumerate(needs):
         found = required_damping(bare(3000.0, damping, theta), SpringDamper([2000.0], [2.0]), "this-environment")
         assert found.required[0] == pytest.approx(need, abs=6e-5)
 
 
 def test_without_m_closed_forms_hold():
-    """(k/2 + b) T without delay, and (k/2 + b + k^2/(4 b)) T one sample late where b >= k/2."""
+    """Multipliers with m = 0 need at least (k/2 + b) T without delay, and (k/2 + b + k^2/(4 b)) T one sample late."""
     k, damping = 3000.0, 2.0
     b = damping / T
     for theta, need in ((0, (k / 2 + b) * T), (1, (k / 2 + b + k**2 / (4 * b)) * T), (2, 7.5)):
         loop = bare(k, damping, theta)
         values = {0: (b, 2 * b, b, 0.0), 1: (b, k + 2 * k**2 / k, b, 0.0), 2: (2 * k - 1207.44, 2 * k, b, 0.0)}[theta]
         found = required_damping(loop, NoCoupling(), "this-environment", values)
-        assert found.required[0] >= need * (1 - 1e-6)  # no multiplier does better without m
+        assert found.required[0] >= need * (1 - 1e-6)
 
 
 def test_the_block_is_the_definition():
-    """Against the inequality written out at a few frequencies, for two channels and three walls, two with dampers."""
+    """The block equals the inequality written out at four frequencies, for two channels and three walls."""
     G, s = DAMPED.walled(BOTH), 0.9
     k, b, _, _ = walls_by_hand(DAMPED)
     a, both, d, m = np.array([900.0, 500.0, 200.0]), np.array([700.0, 0, 900.0]), np.array([50.0, 0, 80]), [0.3, 0, 0.7]
@@ -124,7 +124,7 @@ def test_the_block_is_the_definition():
             np.diag(k / (z - 1) - a) @ D - np.hstack([np.zeros((3, 5)), pull]),
             np.diag(c) @ D + np.hstack([np.zeros((3, 2)), np.diag(d), np.diag(d + m * b * (1 - 1 / z))]),
         ]
-        order = [0, 1, 2, 5, 3, 4, 7]  # the inputs as the block has them: per wall u, then s where it has a damper
+        order = [0, 1, 2, 5, 3, 4, 7]  # The block orders its inputs by wall: u, then s if it has a damper.
         whole = np.vstack(rows)[np.ix_(order, order)]
         ours = demand.free.at(z) + s * demand.gain.at(z)
         assert damped == [0, 2]
@@ -138,7 +138,7 @@ def test_vanishing_walls_give_the_plain_condition():
 
 
 def walls_by_hand(loop):
-    """Stiffness, damping over T, gap and steepest slope of each wall, (w,) each."""
+    """Return stiffness, damping over T, gap and steepest slope of the walls, shape (w,) each."""
     walls = loop.environment.walls
     stiff, gap = (np.array([getattr(w, name) for w in walls]) for name in ("stiffness", "gap"))
     b = np.array([w.damping for w in walls]) / loop.T
@@ -146,20 +146,20 @@ def walls_by_hand(loop):
 
 
 def test_six_facts_hold_at_every_transition():
-    """Random ways into random walls that are touched, left faster than they relax, and made again."""
+    """The facts hold on random paths into random walls: touched, left faster than they relax, and touched again."""
     rng = np.random.default_rng(0)
     n = 50_000
     k, b = 10 ** rng.uniform(1, 4, n), 10 ** rng.uniform(1, 4, n) * (rng.random(n) < 0.8)
     size = 10 ** rng.uniform(-5, -2, n)
     y = rng.normal(size=(4, n)) * size
     h, p = np.zeros((4, n)), np.zeros((4, n))
-    for j in range(1, 4):  # the wall's own law, from rest off the wall
+    for j in range(1, 4):  # This is the wall's law, from rest off the wall.
         h[j] = np.maximum(0, y[j])
         p[j] = np.where(h[j] > 0, np.maximum(0, k * h[j] + b * (h[j] - h[j - 1])), 0)
     e = np.where(h > 0, (p - k * h) / np.maximum(b, 1e-300), 0) * (b > 0)
     u, r = np.diff(h, axis=0), y - h
     s = np.where(b > 0, e[1:] - u, 0) * 1.0
-    s = np.where((b > 0) & (h[1:] == 0), -u, s)  # off the wall its damper feels nothing
+    s = np.where((b > 0) & (h[1:] == 0), -u, s)  # Off the wall the damper's step e is zero.
     dr, dp = np.diff(r, axis=0)[1:], np.diff(p, axis=0)[1:]
     before, now, u = s[:-1], s[1:], u[1:]
     scale = 1e-12 * size**2
@@ -180,7 +180,7 @@ def test_six_facts_hold_at_every_transition():
 
 
 def steps_of(loop, coupling, damping):
-    """The proof's parts: the map G, the block with its storage P, the residue S on (x, h), and the multipliers."""
+    """Return the map G, the block, its storage P, the residue S on (x, h), and the multipliers."""
     asked = change(loop, delta=tuple(damping))
     multiplier = required_damping(asked, coupling, "this-environment").multiplier
     demand = THIS_ENVIRONMENT.block(loop.walled_before_delay(coupling, exact=True), asked, multiplier)
@@ -191,11 +191,11 @@ def steps_of(loop, coupling, damping):
     k = np.array([w.stiffness for w in loop.environment.walls])
     S1 = G.dc()
     S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
-    return G, block.floats(), P.floats() / 2, S, np.array(multiplier).reshape(4, -1)  # (KYP) is twice the balance
+    return G, block.floats(), P.floats() / 2, S, np.array(multiplier).reshape(4, -1)  # KYP is twice the balance of Z.
 
 
 class Walled:
-    """A loop among walls, tick by tick by the law of the controller, with the state of the block beside it."""
+    """A loop with walls that runs the controller's law tick by tick and holds the block's input v and state xi."""
 
     def __init__(self, loop, coupling, block):
         self.loop, self.block, self.m = loop, block, loop.channels
@@ -206,7 +206,7 @@ class Walled:
         self.xi = np.zeros(block.order)
 
     def step(self, x):
-        """(f, y, p) at this tick; depth, damper's step, s and the block's state are then those of this tick."""
+        """Return (f, y, p) at this tick. Update the depth h, the damper's step e, s, and the block's input v."""
         before, after = np.concatenate([self.state, x])[:, None], np.zeros((self.m + len(self.state), 1))
         self.tick(before, after)
         xi, f, last = self.state[: self.G.order], after[: self.m, 0], self.h
@@ -225,7 +225,7 @@ class Walled:
 
 @pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
 def test_every_step_of_the_proof(loop):
-    """Random motions: the balance of Z at every tick and Z >= 0, with f and the walls' forces of the running law."""
+    """On random motions of the running law the balance of Z holds at every tick, and Z >= min(0, its first value)."""
     rng = np.random.default_rng(0)
     need = required_damping(loop, BOTH, "this-environment").ratio
     delta = 1.01 * need * np.array(loop.delta)
@@ -235,7 +235,7 @@ def test_every_step_of_the_proof(loop):
     seen, pressed, left = [], 0, 0
     for k in range(ticks + 1):
         f, _, p = there.step(x[k])
-        there.xi = block.A @ there.xi + block.B @ there.v  # the inputs are the steps up to here, the first from rest
+        there.xi = block.A @ there.xi + block.B @ there.v  # The first input is the step from rest.
         X = np.concatenate([x[k], there.h])
         Z = there.xi @ P @ there.xi + X @ S @ X / 2 - (there.k * there.gap * there.h).sum()
         Z -= (m_ * there.b * there.s * there.e).sum()
@@ -243,7 +243,7 @@ def test_every_step_of_the_proof(loop):
         pressed, left = pressed + (p > 0).any(), left + ((p == 0) & (there.h > 0)).any()
     start = seen[0][2]
     assert 50 < pressed < ticks
-    assert (left > 0) == (loop is DAMPED)  # left faster than its damper lets it follow
+    assert (left > 0) == (loop is DAMPED)  # Only with dampers is p = 0 at h > 0.
     for (x0, f, Z), (x1, _, Z1) in itertools.pairwise(seen):
         dx = x1 - x0
         size = 1e-9 * (abs(Z) + abs(Z1) + 1e-6)
@@ -297,27 +297,27 @@ def test_what_is_not_covered_is_said():
 
 
 def test_couplings_may_be_stiffer_than_any_environment_allows():
-    """The one wall of 3000 N/m, without its damper: 1150 N/m and more, where any-environment ends at 1050."""
+    """At a wall of 3000 N/m without a damper 1300 N/m is proved, which any-environment refuses by over a fifth."""
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, gap=0.005),)))
     coupling = SpringDamper([1300.0], [0.45])
     assert any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).ratio > 1.2
     assert prove(loop, coupling, "this-environment").guarantee == "this environment"
 
 
-# Hands on a wall that is made and left, simulated exactly.
+# Hands that touch and leave a wall, simulated exactly.
 
 
 HANDS, TICKS = 60, 20000
 
 
 def pressed_at_rest(damping=0.0):
-    """One wall of 3000 N/m alone, 2 mm into the way of the tip at rest."""
+    """Build a loop with one wall of 3000 N/m, into which the tip at rest reaches 2 mm."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, damping, gap=-0.002),))
     return Loop(1e-3, (1,), (0,), (1,), (1.37,), network)
 
 
 def swinging(loop, coupling, damping, seed=11):
-    """The largest speed [m/s] of the lossless hands in the end, and how often the wall was made by them all."""
+    """Return the largest speed [m/s] of lossless hands in the last 2 % of the ticks, and the number of all contacts."""
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3, HANDS)
     A = np.zeros((HANDS, 3, 3))
@@ -346,12 +346,12 @@ def test_hands_rest_at_the_requirement_not_below(damping, short):
     need = required_damping(loop, coupling, "this-environment").required[0]
     fastest, made = swinging(loop, coupling, 1.02 * need)
     assert made > (300 if damping else 500)
-    assert fastest < 0.05  # and falling: 60 hands, the slowest of them heavy
-    assert swinging(loop, coupling, short * need)[0] > 0.5  # for ever, the wall made and left
+    assert fastest < 0.05  # Heavy hands come to rest last.
+    assert swinging(loop, coupling, short * need)[0] > 0.5  # These hands never rest.
 
 
 def test_damped_wall_designs_are_tight_and_proved():
-    """Stiffer than any passive environment allows, and softer than what every frozen state alone allows (1772 N/m)."""
+    """The design is stiffer than any-environment allows, and softer than all frozen states alone allow (1772 N/m)."""
     wall = Wall(("tip", GROUND), 3000.0, 2.0, 0.005)
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(wall,)))
     made = design_by_kind(loop, condition="this-environment")
@@ -363,7 +363,7 @@ def test_damped_wall_designs_are_tight_and_proved():
 
 @pytest.mark.parametrize("loop", [PAIR, pytest.param(DAMPED, marks=pytest.mark.slow)], ids=["springs", "dampers"])
 def test_frozen_walls_fall_to_a_nonnegative_value(loop):
-    """The step that bounds Z from below: x held, touched walls kept, also where they pull; from states of the loop."""
+    """With x held and the touched walls kept, even where they pull, Z falls from states of the loop to a value >= 0."""
     rng = np.random.default_rng(5)
     delta = (1.01 * required_damping(loop, BOTH, "this-environment").ratio * np.array(loop.delta)).tolist()
     G, block, P, S, _ = steps_of(loop, BOTH, delta)
@@ -382,7 +382,7 @@ def test_frozen_walls_fall_to_a_nonnegative_value(loop):
             X = np.concatenate([x[tick], h])
             Z = xi @ P @ xi + X @ S @ X / 2 - (k * gap * h).sum()
             assert last - Z >= -1e-9 * (abs(Z) + 1e-9)
-            free = G.C[m:] @ state + G.D[m:, :m] @ x[tick]  # the ways into the walls without their forces now
+            free = G.C[m:] @ state + G.D[m:, :m] @ x[tick]  # This is y without the walls' forces at this tick.
             p = solve @ np.where(on, (k + b) * (free - gap) - b * h, 0)
             after = np.where(on, free + G.D[m:, m:] @ p - gap, 0)
             steps = zip(after - h, b, strict=True)
