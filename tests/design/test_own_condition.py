@@ -1,4 +1,4 @@
-"""A condition and a coupling of one's own: what they do not say is not taken for said."""
+"""Tests of a user's own conditions, facts and couplings: only what they state is assumed."""
 
 import re
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ change = msgspec.structs.replace
 
 
 class Plain(Condition):
-    """this-environment of even ticks, written out again."""
+    """this-environment for a constant period, written again."""
 
     name = "plain"
 
@@ -113,7 +113,7 @@ def test_a_name_of_ours_is_refused(taken):
 
 
 def test_maps_and_comparisons_take_own_conditions():
-    """One by one, where ours is asked as a stack; and over frequency."""
+    """Maps and the demand over frequency of a user's condition equal those of this-environment."""
     scenario, K, B = load("omega-pair"), np.array([300.0, 4e3]), np.array([0.1, 1.0])
     plain, ours = Plain(), "this-environment"
     sweeps = (
@@ -131,7 +131,7 @@ def test_maps_and_comparisons_take_own_conditions():
 
 
 class Shifting(SwitchingDelays):
-    """Delays that switch, by a condition of one's own with a multiplier."""
+    """A user's condition with a multiplier, for delays that switch."""
 
     name, covers = "shifting", ("varying_delay",)
 
@@ -151,7 +151,7 @@ def test_own_multipliers_are_searched_stored_and_checked():
 
 @pytest.fixture(scope="module")
 def repeats():
-    """The fact that docs/extending.md shows, and the condition that takes it."""
+    """Run the example of docs/extending.md: a fact and the condition that uses the fact."""
     page = (Path(__file__).parents[2] / "docs/extending.md").read_text()
     text = re.search(r"```python\n# repeats.py\n(.*?)```", page, re.DOTALL)[1]
     assert sum(bool(line.strip()) and "import" not in line for line in text.splitlines()) <= 15
@@ -165,7 +165,7 @@ def test_facts_and_conditions_need_one_method_each():
 
 
 def test_an_own_fact_is_its_bound(repeats):
-    """The dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2), at the multiplier found and at others."""
+    """s is that of a dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2). No other tried a needs less."""
     own = repeats["RepeatedForces"]()
     found = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
@@ -223,7 +223,7 @@ def test_own_conditions_state_environments_and_limits():
 
 @dataclass(frozen=True)
 class Mean(Coupling):
-    """A spring behind a weighted mean of two samples; by its form `kept` times as soft, by its compliance `told`."""
+    """A spring after a mean of two samples. Its form is `kept` times as soft, its compliance `told` times."""
 
     K: float
     kept: float = 1.0

@@ -1,4 +1,4 @@
-"""The condition for delays that vary: closed forms, an independent convex solver, the energy itself, exact proofs."""
+"""Tests of the condition for varying delays: closed forms, a convex solver, the energy over time, exact proofs."""
 
 import json
 
@@ -37,13 +37,13 @@ def both(demand):
 
 
 def condition(z, G, alpha, lo, hi, damping, T=T):
-    """The condition's matrix at each z (k,), to be positive: (k, 2m, 2m) from G (k, m, m)."""
+    """Return the condition's matrix, which must be positive, at each z (k,): (k, 2m, 2m) from G (k, m, m)."""
     demand = switching_demand(Sampled(z[None], G[None], T), lo, hi, damping, alpha)
     return hermitian(both(demand).G[0])
 
 
 def block(z, G, alpha, lo, hi, damping):
-    """The same for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
+    """Return the condition's matrix for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
     c, h = (z ** -np.array(lo) + z ** -np.array(hi)) / 2 / (z - 1), np.subtract(hi, lo) / 2
     passing, error = cp.diag(cp.Constant(c)) @ G, cp.diag(cp.Constant(h)) @ G
     upper = (passing + cp.conj(passing).T) / 2 + cp.diag(damping / T - alpha / 2)
@@ -52,13 +52,13 @@ def block(z, G, alpha, lo, hi, damping):
 
 @pytest.mark.parametrize(("lo", "hi"), [(0, 0), (0, 1), (1, 2), (0, 3), (2, 5)])
 def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
-    """By hand: Theta_nom asks KT (lo + hi + 1)/2, at w = 0; the error alpha/2 + (hK)^2/(2 alpha), at the least hK.
+    """The mean of lo and hi needs KT (lo + hi + 1)/2, the error T (alpha/2 + (hK)^2/(2 alpha)), h = (hi - lo)/2.
 
-    Together KT (hi + 1/2), what the constant delay hi needs: for a spring, varying delays cost nothing more.
+    The least sum is KT (hi + 1/2), as for the constant delay hi: for a spring, varying delays cost nothing more.
     """
     K = 800.0
     found = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
-    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # SETTLED is 1e-7
+    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # twice _SETTLED
     assert found.multiplier[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # flat around its optimum
 
 
@@ -71,7 +71,7 @@ def test_one_delay_gives_the_this_environment_condition(theta):
 
 
 def test_the_least_factor_matches_a_convex_solver():
-    """An SDP in (s, alpha) at 13 frequencies: its optimum is the multiplier's bound there, from other code."""
+    """An SDP in (s, alpha) at 13 frequencies, which shares no code with the sweep, has the same least factor."""
     lo, hi = (0, 1), (3, 2)
     G, delta = sent(), np.array([1.37, 0.9])
     found = switching_sweep(G, lo, hi, delta)
@@ -79,7 +79,7 @@ def test_the_least_factor_matches_a_convex_solver():
     near = found.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
     w = np.concatenate([near, np.geomspace(3e-2, 3, 8)])
     z = np.exp(1j * w)
-    s, a = cp.Variable(), cp.Variable(2, nonneg=True)  # alpha in units of delta/T, G in units of 1000 N/m
+    s, a = cp.Variable(), cp.Variable(2, nonneg=True)  # alpha and G are in units of 1000 N/m
     scale = 1000.0
     conditions = [
         block(complex(v), cp.Constant(g / scale), a, lo, hi, s * delta * (1 / scale))
@@ -87,7 +87,7 @@ def test_the_least_factor_matches_a_convex_solver():
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
     solve(problem)
-    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # a peak 0.5 % off its sample, squared
+    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # peak 0.5 % off its sample: second order
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
@@ -97,7 +97,7 @@ def test_the_least_factor_matches_a_convex_solver():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_agrees(lo, hi):
-    """20000 frequencies: positive just above the requirement, not just below; no alpha does with 0.1 % less."""
+    """At 20000 frequencies it holds just above the requirement if all delays vary, and not 0.1 % below."""
     G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     alpha, needed, response = np.array(found.multiplier), np.array(found.required), G.at(z)
@@ -112,7 +112,7 @@ def test_a_dense_sweep_agrees(lo, hi):
 
 
 def test_the_energy_bound_holds_for_worst_ages():
-    """The claim itself, without z: sum f'dx + sum dx'(Delta/T)dx >= 0 from rest, with ages chosen against it."""
+    """Over time sum f'dx + sum dx'(Delta/T)dx > 0 from rest, with the worst age at every tick."""
     G, lo, hi = sent(), 1, 3
     needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).required)
     rng, ticks = np.random.default_rng(0), 3000
@@ -124,7 +124,7 @@ def test_the_energy_bound_holds_for_worst_ages():
             x = np.cumsum(rng.normal(size=(ticks, 2)), axis=0)
         x[0] = 0.0
         g, state = np.zeros((ticks + hi, 2)), np.zeros(G.order)
-        for k in range(ticks):  # g[k + hi] leaves at tick k; before that nothing has left
+        for k in range(ticks):  # g[k + hi] leaves at tick k; before tick 0 no force has left
             g[k + hi] = G.C @ state + G.D @ x[k]
             state = G.A @ state + G.B @ x[k]
         dx = np.diff(x, axis=0)
@@ -133,7 +133,7 @@ def test_the_energy_bound_holds_for_worst_ages():
         spent = (dx**2 * needed / T).sum(axis=1)
         spare.append((np.cumsum(stored + spent) / np.cumsum(spent))[10:].min())
     assert min(spare) > 0
-    assert min(spare) < 0.6  # these motions take two fifths of it, so the inequality is not idle
+    assert min(spare) < 0.6  # One motion uses over two fifths of the damping, so the test is not idle.
 
 
 def test_what_is_refused():
@@ -158,7 +158,7 @@ def test_what_holds_is_proved_exactly(lo, hi):
     assert found.certified
     assert found.proof == "rational"
     part = SwitchingFigures.of(loop_of(lo, hi), SOFT)
-    # equal where nothing varies
+    # The two are equal where no delay varies.
     assert part.playout.required_damping[0] <= part.requirement.required[0] * (1 + 1e-9)
     assert part.requirement.certified
 
@@ -182,7 +182,7 @@ def test_what_does_not_hold_has_no_exact_proof():
 
 
 def test_a_wall_with_damping():
-    """One channel, K = 2000 N/m and B = 1 N s/m, 0 to 1 samples: above the delay-free KT/2 + B and the constant 1."""
+    """With K = 2000 N/m, B = 1 N s/m and 0 to 1 samples it needs at least as much as for each constant delay."""
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
     needs = switching_sweep(G, [0], [1], [1.37]).required[0]
@@ -199,7 +199,7 @@ def audit(tmp_path, *options):
 @pytest.mark.slow
 def test_audit_reports_switching_beside_the_constants(tmp_path):
     code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--varying-delay", "1,2")
-    assert code == 1  # certified for the constant (1, 2), not for what was asked
+    assert code == 1  # certified for the constant (1, 2), not for switching
     assert report["assessment"]["requirements"]["this-environment"]["certified"]
     assert report["switching"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
     assert report["switching"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
@@ -209,11 +209,11 @@ def test_audit_reports_switching_beside_the_constants(tmp_path):
 
 
 def test_audit_of_a_wall_with_varying_delays(tmp_path):
-    """A spring of 800 N/m at 1 ms, 0 to 1 samples: KT (hi + 1/2), as the constant delay of 1."""
+    """A spring of 800 N/m at 1 ms with delays of 0 to 1 samples needs KT (hi + 1/2)."""
     options = ["--rigid", "--K", "800", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "1.37"]
     code, report = audit(tmp_path, *options, "--varying-delay", "0,1")
     assert code == 0
-    assert report["switching"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # SETTLED is 1e-7
+    assert report["switching"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # twice _SETTLED
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_audit_refuses_a_range_without_the_constant(tmp_path, varying_delay, mes
 
 
 def test_the_multiplier_is_best_in_random_loops():
-    """One to five channels, stars of random springs: the bound over all multipliers meets the requirement."""
+    """In stars of random springs with one to five channels the bound over all multipliers meets the requirement."""
     rng = np.random.default_rng(5)
     for channels in (1, 2, 5, 3):
         contacts = tuple(f"c{k}" for k in range(channels))
@@ -237,13 +237,13 @@ def test_the_multiplier_is_best_in_random_loops():
         found = switching_sweep(
             G, lo.tolist(), (lo + rng.integers(0, 4, channels)).tolist(), rng.uniform(0.1, 5, channels)
         )
-        # SETTLED is 1e-7, and ten times that for what the sweep finds between grid points
+        # The search ends within twice environments._SETTLED of the bound, which is 1e-6.
         assert found.bound <= found.ratio * (1 + 1e-9)
         assert found.ratio == pytest.approx(found.bound, rel=2e-6)
 
 
 def test_many_devices_use_the_springs_multiplier(monkeypatch):
-    """Of springs the best one; of these gains it asks a few percent more than the best, and any multiplier is safe."""
+    """It is the best for springs. For these gains it needs less than 10 % more, and any multiplier is safe."""
     best, spring = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING), Lti.constant([[800.0]], T)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 1)
     simple = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING)
