@@ -1,4 +1,4 @@
-"""The moving average: the stiffest coupling for any environment, its design, its file, and zeros that coincide."""
+"""The moving average, the stiffest coupling for any environment: its zeros, its design and its file."""
 
 import numpy as np
 import pytest
@@ -16,14 +16,14 @@ T = 1e-3
 
 
 def window(theta, delta, factor=1.0):
-    """factor T/(2 delta) (1 + ... + z^-theta), the moving average without a constant."""
+    """Return factor T/(2 delta) (1 + ... + z^-theta), the moving average without a constant."""
     return taps([factor * T / (2 * delta)] * (theta + 1), T)
 
 
 @pytest.mark.parametrize("theta", range(5))
 @pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.5])
 def test_scaled_moving_averages_need_less_damping(theta, factor):
-    """V and the window vanish together at its zeros, where nothing is asked: s = 1/factor at every frequency."""
+    """V and the window share their zeros, where no damping is required. The ratio is 1/factor elsewhere."""
     needs = any_environment(window(theta, 1.3, factor), [theta], [1.3])
     assert needs.reason is None
     assert needs.ratio == pytest.approx(1 / factor, rel=1e-5)
@@ -31,7 +31,7 @@ def test_scaled_moving_averages_need_less_damping(theta, factor):
 
 
 def test_channels_whose_zeros_differ():
-    """Each at its own frequency; with three of them the singular directions come in an order of no symmetry."""
+    """Each channel has its own zeros. With three, the order of the singular directions is not symmetric."""
     theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
     for m in (2, 3):
         V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])
@@ -40,7 +40,7 @@ def test_channels_whose_zeros_differ():
 
 @pytest.mark.parametrize(("weights", "theta"), [([1.0, 1.0], 2), ([1.0, 1.0], 0), ([1.0, 0.0, 1.0], 3)])
 def test_a_zero_of_the_coupling_alone_is_refused(weights, theta):
-    """There the delay asks for damping and the coupling has no passivity to spend."""
+    """At this zero the delay requires damping, but the coupling has no excess of passivity."""
     assert "damping vanishes" in (any_environment(taps([1e-3 * w for w in weights], T), [theta], [1.0]).reason or "")
 
 
@@ -48,7 +48,7 @@ def test_a_zero_of_the_coupling_alone_is_refused(weights, theta):
 def test_it_beats_the_spring_damper(name, case):
     loop = scenario_of(name).loop(case)
     stiff, soft = (design_coupling(loop, kind, "any-environment") for kind in ("moving-average", "spring-damper"))
-    limit = 2 * np.array(loop.delta) / ((np.array(loop.theta) + 1) * loop.T)  # of every linear coupling
+    limit = 2 * np.array(loop.delta) / ((np.array(loop.theta) + 1) * loop.T)  # bound for every linear coupling
     assert isinstance(stiff.coupling, MovingAverage)
     assert isinstance(soft.coupling, SpringDamper)
     assert (stiff.coupling.stiffness < limit).all()
@@ -62,7 +62,7 @@ def test_it_beats_the_spring_damper(name, case):
 
 
 def test_delay_in_the_environment():
-    """Phi covers what the environment lacks; the coupling's own excess is so large that it costs nothing."""
+    """With psi = (1, 0) the design is proved for any environment, and its exact simulation is stable."""
     scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))
     loop = scenario.loop("I")
     made = design_coupling(loop, "moving-average")

@@ -14,7 +14,7 @@ from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
 from haptic_loop.sim.scenario import load
 
-#: a clock that runs ten thousand times as fast: a search that it ended would end at once
+#: Run `design` on one core with clocks ten thousand times as fast: a search with a time limit would end at once.
 HURRIED = """
 import os, sys, time
 for name in ("monotonic", "perf_counter", "process_time", "thread_time", "time"):
@@ -31,7 +31,7 @@ def hurried(clock):
 
 
 def test_a_racing_clock_changes_no_byte(monkeypatch):
-    """Two bases are designed in this process by the clock as it is, and by one that races."""
+    """A design over two bases is the same with the real clocks and with clocks ten thousand times as fast."""
     loop = load(LOOPS / "o01-wall-light-device.toml").loop("I")
 
     def stored():
@@ -48,7 +48,7 @@ def test_a_racing_clock_changes_no_byte(monkeypatch):
 
 @pytest.mark.validate
 def test_clock_and_cores_change_no_byte(tmp_path):
-    """One design as it is, one on a single core by a clock that races. `make kernels` has six, under load."""
+    """A design on one core with fast clocks equals a plain one. `make kernels` compares six designs under load."""
     words = ["--scenario", str(LOOPS / "o01-wall-light-device.toml"), "--coupling", "optimal"]
     begun = {}
     for name, start in (("plain", ["-m", "design"]), ("hurried", ["-c", HURRIED])):

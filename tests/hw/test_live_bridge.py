@@ -1,8 +1,7 @@
-"""The bridge in real time, through pyserial and a pseudo-terminal, with the emulator in its own process.
+"""The bridge through pyserial and a pseudo-terminal, with the emulator in its own process, and its options.
 
-Nothing here judges timing: on a busy machine a session may end because the link was too slow, and is tried again. On
-every machine a session must end with a named cause, leave no armed device, and record a true trace. Of several
-attempts, slower and slower, one must be armed.
+On a busy machine the link may be too slow. So tests that need an armed session repeat it at ever slower paces, and
+one attempt must be armed. Every session must end with a named cause, and no device may stay armed.
 """
 
 import fcntl
@@ -64,7 +63,7 @@ def emulator():
 
 
 def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
-    settings = LinkSettings(measure=150, test_encoders=False)  # short, for machines that are busy
+    settings = LinkSettings(measure=150, test_encoders=False)  # a short measurement, for busy machines
     session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
     with SerialPort(emulator.path, 921_600) as port:
         device = SerialDevice(port, lambda: pace * time.monotonic())
@@ -99,7 +98,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
 
 
 def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
-    """The scene steps in the session's loop behind its shell, and the report keeps the account of energy."""
+    """The scene runs in the session behind its energy shell, and the report has the shell's account."""
     monkeypatch.chdir(tmp_path)
     report = commanded(capsys, "world-ball")
     (world,) = report["world"]
@@ -115,7 +114,7 @@ def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
-    """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
+    """After SIGINT the command lowers the gain to zero in 100 ms of session time and exits with 130."""
     monkeypatch.chdir(tmp_path)
     look = IncidentLog.update
 
@@ -143,7 +142,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
         with emulated("--nobody", f"--pace={pace}") as path:
             code = bridge.main([*options, "--port", path, "--no-preflight", "--no-plot", "--json", "-"])
         report = json.loads(capsys.readouterr().out)
-        if sent and report["session"]["stage"] == "finished":  # else the machine was too busy
+        if sent and report["session"]["stage"] == "finished":  # otherwise the machine was too busy
             break
     else:
         pytest.fail(f"never armed and interrupted, at last {report['session']}")
@@ -161,7 +160,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     ("name", "stage"), [("SIGINT", Stage.FINISHED), ("SIGTERM", Stage.FINISHED), ("SIGUSR1", Stage.ESTOP)]
 )
 def test_a_signal_while_forces_act(scenario, name, stage):
-    """In virtual time: SIGINT and SIGTERM end in a ramp of 100 ms, SIGUSR1 in an emergency stop that is latched."""
+    """In virtual time SIGINT and SIGTERM end a session by a ramp longer than 90 ms, SIGUSR1 by a latched e-stop."""
 
     def watch(session):
         if session.stage == Stage.ARMED and not sent:
@@ -248,7 +247,7 @@ class BridgeOnTerminal:
 
 @pytest.mark.slow
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
-    """The bridges draw the status line and read single keys. SIGQUIT is sent by typing Ctrl-\\."""
+    """Bridges that read single keys restore the terminal after SIGQUIT (typed Ctrl-\\) and SIGHUP."""
     names = ("SIGQUIT", "SIGHUP")
     with ExitStack() as devices:
         ports = [devices.enter_context(emulated("--pace=0.05")) for _ in names]
@@ -273,7 +272,7 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     ids=["once", "all"],
 )
 def test_a_device_is_identified_over_the_line(tmp_path, paces):
-    """Sweeps of 0.5 s bound the damping by at most the emulated device's 1.37 N s/m, or say why not."""
+    """Sweeps of 0.5 s give bounds up to the device's 1.37 N s/m, or the report names dry friction as the reason."""
     for pace in paces:
         options = ["--arm", "--seconds", "0.5", "--travel", "10", "--measure", "60", "--sittings", "1"]
         with emulated("--nobody", f"--pace={pace}") as path:
