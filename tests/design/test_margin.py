@@ -50,7 +50,7 @@ def test_any_environment_figures():
 
 @pytest.mark.parametrize("seed", range(10))
 def test_any_environment_is_the_trigonometric_maximum(seed):
-    """It is max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), n = theta + 1 and vt = 1 + z^-1 + .. + z^-theta."""
+    """The need is max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), n = theta + 1, vt = 1 + .. + z^-theta."""
     rng = np.random.default_rng(seed)
     theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))
     z = np.exp(1j * np.linspace(0, np.pi, 1_000_001))

@@ -165,7 +165,7 @@ def test_facts_and_conditions_need_one_method_each():
 
 
 def test_an_own_fact_is_its_bound(repeats):
-    """s is that of a dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2). No other tried a needs less."""
+    """A dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) gives the same s, and no smaller s for other a."""
     own = repeats["RepeatedForces"]()
     found = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))

@@ -97,7 +97,7 @@ def test_the_least_factor_matches_a_convex_solver():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_agrees(lo, hi):
-    """At 20000 frequencies it holds just above the requirement if all delays vary, and not 0.1 % below."""
+    """At 20000 frequencies the condition holds above the requirement if all delays vary, and not 0.1 % below."""
     G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     alpha, needed, response = np.array(found.multiplier), np.array(found.required), G.at(z)
@@ -182,7 +182,7 @@ def test_what_does_not_hold_has_no_exact_proof():
 
 
 def test_a_wall_with_damping():
-    """With K = 2000 N/m, B = 1 N s/m and 0 to 1 samples it needs at least as much as for each constant delay."""
+    """A wall with delays of 0 to 1 samples needs at least the damping of each constant delay."""
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
     needs = switching_sweep(G, [0], [1], [1.37]).required[0]
@@ -243,7 +243,7 @@ def test_the_multiplier_is_best_in_random_loops():
 
 
 def test_many_devices_use_the_springs_multiplier(monkeypatch):
-    """It is the best for springs. For these gains it needs less than 10 % more, and any multiplier is safe."""
+    """This multiplier is the best for springs. For these gains it needs less than 10 % more damping than the best."""
     best, spring = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING), Lti.constant([[800.0]], T)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 1)
     simple = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING)
