@@ -135,9 +135,10 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
     assert session.counters.unlike == 0
 
 
-def hand_driven(scenario, rungs):
+def hand_driven(scenario, rungs, tested=False):
     """Return a session that was just armed and a function that sends it a STATE; `lie` replaces the device's clock."""
-    session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
+    settings = LinkSettings(measure=50, test_encoders=tested)
+    session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)
     session.met(info_of(scenario), t)
     session.configured(Refused.ACCEPTED, t)
@@ -161,7 +162,7 @@ def hand_driven(scenario, rungs):
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
     """At 0.2 m/s a freeze of 2.4 ms adds 0.48 mm to a displacement; a tick allows a pulse of 0.12 mm."""
-    session, send = hand_driven(scenario, rungs)
+    session, send = hand_driven(scenario, rungs, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0
     for k in range(10):
