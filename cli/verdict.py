@@ -18,7 +18,7 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """Return the coupling of --coupling; if that is a kind, design one for --condition and --no-limiter."""
+    """Return the coupling that --coupling names; if it names a kind, design one by --condition and --no-limiter."""
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
         return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
 

@@ -247,7 +247,7 @@ class Limiter(Law):
     walls. Raises SingularLoop if the limited forces are not unique.
     """
 
-    limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
+    limit: Array  # (m,) [N], inf without a limit; the same for all channels of a ball
     rho: Array  # (m,) [N/m] resists changes of the slip; 0 for any-environment with psi = 0, else a share of delta/T
     balls: tuple[slice, ...] = ()  # groups of neighbouring channels whose force is limited as a vector
 

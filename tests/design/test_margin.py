@@ -188,7 +188,7 @@ def test_the_regular_part_keeps_the_hermitian_part():
 
 
 def test_supremum_finds_a_needle():
-    """An even grid would miss a peak of width 1e-7. This grid contains the frequency of its pole."""
+    """An even grid would miss a peak of width 1e-7. The grid of `frequencies` contains the frequency of the pole."""
     pole = (1 - 1e-7) * np.exp(1j * 1.2345)
     A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
     needle = Lti(A, [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]], T)

@@ -136,7 +136,7 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
 
 
 def hand_driven(scenario, rungs, tested=False):
-    """Return a session that was just armed and a function that sends it a STATE; `lie` replaces the device's clock."""
+    """Return a session that has begun to arm, and a function that sends it a STATE; `lie` is the device's clock."""
     settings = LinkSettings(measure=50, test_encoders=tested)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)
@@ -262,7 +262,7 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
 
 
 def test_fake_device_clocks_are_found(scenario, rungs):
-    """The device's clock reports T while STATEs come every 2 T: 20 STATEs differ by 20 T, 10 % of a block."""
+    """The device's clock reports T, STATEs come every 2 T: after 20, the host's is 10 % of a block (20 T) ahead."""
     session, send = hand_driven(scenario, rungs)
     assert session.link.last
     begun = session.link.last.t_us

@@ -298,7 +298,7 @@ def test_a_million_random_bytes_move_no_motor():
 
 
 def mutations(rng: random.Random, frame: bytes):
-    """Yield damaged copies of a frame, which has no delimiter; the copies have one.
+    """Yield damaged copies of a frame, each followed by the delimiter; the frame itself is passed without it.
 
     Copies have wrong bits or bytes, holes, insertions, cuts or swapped halves.
     """

@@ -1,4 +1,4 @@
-"""Many humans at once have the results of each human alone, in both engines, however the work is split."""
+"""Validating many humans at once gives the results of each human alone, in both engines, however the work is split."""
 
 import json
 import multiprocessing
@@ -75,7 +75,7 @@ KNOWN = load("omega-pair-known")
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_drawn_devices_are_within_their_bounds(engine):
-    """Validation judges each drawn pair of devices in the scene of these devices."""
+    """The growth rate of each drawn pair of devices equals that of a scene built with this pair."""
     question = Validation(KNOWN, NoCoupling(), 5, 40, MIXED, engine, 0.0)
     found, F = validate(question), assemble(KNOWN, NoCoupling()).F
     for index, people in question.crowds(range(8)):
@@ -187,7 +187,7 @@ def test_mujoco_maps_are_the_exact_maps(devices):
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
 def test_mujoco_maps_are_runge_kutta_polynomials(devices):
-    """MuJoCo's map of a period is four times Runge-Kutta's polynomial of order 4 in the plant's matrix."""
+    """MuJoCo's map of a period is the fourth power of the polynomial of RK4 in the plant's matrix, with step T/4."""
     held_by, process = (
         variants(devices, crowd(5, 2)),
         assemble(SCENARIO.replace(device=devices), PUBLISHED["I"]).process,
@@ -481,7 +481,7 @@ def test_own_engines_need_even_ticks():
 
 
 def slow_question(humans: int, seed: int, duration: float) -> Validation:
-    """Return a validation of three devices with delays around 0.3 kg on soft springs; motions decay in seconds."""
+    """Return a validation of three delayed devices, joined to 0.3 kg by soft springs; motions take seconds to decay."""
     rng = np.random.default_rng(seed)
     springs = tuple(Spring((end, "m"), float(rng.uniform(20, 400)), float(rng.uniform(0, 0.5))) for end in "abc")
     scenario = load("three-rigid").replace(environment=Network(("a", "b", "c"), springs, {"m": 0.3}), theta=(2, 3, 1))

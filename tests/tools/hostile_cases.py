@@ -1,4 +1,4 @@
-"""Cases of bad input, the good files in their folders, and functions that spoil these files."""
+"""The class of a case of bad input, the good files in its folder, and functions that spoil these files."""
 
 from __future__ import annotations
 

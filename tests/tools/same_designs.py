@@ -2,7 +2,8 @@
 
     python tests/tools/same_designs.py
 
-Each of six couplings is designed on an idle machine, under load, and three times at once, the last time on one core.
+Each of six couplings is designed on an idle machine, under load, and in three simultaneous processes,
+one of which is pinned to one core.
 The exit code is 1 if a file differs. Designs run through the public command, so each file is what a user stores.
 """
 
