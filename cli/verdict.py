@@ -93,7 +93,7 @@ def verdict(
 
 
 SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
-_NOTHING_DB = -1.0  # rms mismatch above which a force is about as wrong as none, if there is no stiffness to render
+_NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling in an object without stiffness is no better than none
 
 
 def _useless(assessment: Assessment) -> str:
@@ -132,7 +132,7 @@ def _percent(ratio: float) -> str:
 
 
 def _missing(assessment: Assessment) -> str:
-    """Return the part of the loop or the request that the guarantee does not cover, as a text."""
+    """Return what follows "Not certified": the failed condition with its shortfall, or the ranges with a reason."""
     if not assessment.decisive.certified:
         return f"by {_sentence(f'{assessment.condition}: {assessment.decisive.shortfall}')}"
     reason = assessment.ranges and assessment.ranges.reason

@@ -88,7 +88,7 @@ class Law(ReadOnly):
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Return whether each force (ticks, m, ..) was limited, here by the actuators' limits `most` (m, ..) [N]."""
+        """Return whether each force (ticks, m, ..) reached the actuators' limits `most` (m, ..) [N]."""
         return np.abs(force) >= most
 
     @property

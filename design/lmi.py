@@ -120,7 +120,7 @@ def symmetric_from(vector: Array, n: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _upper(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows and columns of the upper triangle of a matrix (n, n), row by row."""
+    """Return the row and the column of every entry in the upper triangle of an (n, n) matrix, in row order."""
     return np.triu_indices(n)
 
 

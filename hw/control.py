@@ -40,8 +40,8 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_JOLT = 20.0  # [N] more than motor and hand apply for a tick in one direction, and for the next in the other
-_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves where the requested kind gives none
+_JOLT = 20.0  # [N] no motor and hand apply this force for a tick, and its opposite for the next tick
+_FALLBACK = ("spring-damper", "any-environment")  # designs of softer couplings, if the requested kind gives none
 
 
 class Controller(Protocol):

@@ -311,7 +311,7 @@ _ALIKE = 0.005  # curves that differ by less, relative to the largest value, loo
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return the end of the label of each curve in values (N, m): the name of an earlier equal curve, or ""."""
+    """Return the last part of each curve's label, for values (N, m): which earlier curve looks the same, or ""."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):

@@ -69,7 +69,10 @@ def test_rigid_wall_closed_forms(K, B, theta, factor):
 
 
 def crossings(F: Lti, level: float) -> np.ndarray:
-    """Return angles where det(level/T I - F(1)/2 + He R) = 0 on the circle, by an extended symplectic pencil."""
+    """Return the angles of the points on the circle at which level/T I - F(1)/2 + He R is singular.
+
+    R is (F - F(1))/(z - 1). The points are eigenvalues of an extended symplectic pencil.
+    """
     R, n, m = F.split_at_one()[1], F.order, F.inputs
     direct = 2 * (level / F.T * np.eye(m) - F.dc() / 2)
     zero = np.zeros
@@ -198,7 +201,7 @@ def test_supremum_finds_a_needle():
 
 
 def test_rounding_elsewhere_hides_no_peak():
-    """Fifty maxima, like those of rounding, are higher than the grid points on both sides of the peak."""
+    """Fifty ripples of 1e-9, as rounding makes them, exceed all grid values beside the peak, but it is found."""
 
     def response(w):
         return np.where(w < 0.5, 1 + 1e-9 * np.cos(200 * np.pi * w), 1.001 - 200 * (w - 0.7525) ** 2)
@@ -209,7 +212,10 @@ def test_rounding_elsewhere_hides_no_peak():
 
 
 def test_the_factor_with_multiplier_is_least():
-    """He[H/(1-z)] >= H* Delta_V H, with H = V - Theta-hat/s, (11) to (14), is tight at s, true above, false below."""
+    """The inequality of (11) to (14) is tight at the factor s of the damping, true above it and false below it.
+
+    It is He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s.
+    """
     V, theta, delta, phi = SpringDamper([300.0, 200.0], [0.2, 0.3]).compliance(T), (1, 2), np.array(DELTA), (0.37, 0.1)
     w = np.linspace(0.05, 3.1, 23)
     z, star = on_circle(w), lambda M: np.conj(np.swapaxes(M, 1, 2))

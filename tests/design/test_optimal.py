@@ -300,7 +300,7 @@ def test_there_is_always_an_answer(seed):
 
 
 def test_ties_prefer_less_error_at_small_forces():
-    """At 0.6 Hz, hands of case I that move together get less than 2 % of the largest force, with an error below 5 %."""
+    """At 0.6 Hz, hands that move together ask for less than 2 % of the largest force; its error is below 5 %."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -501,7 +501,7 @@ def test_requests_that_make_no_sense_are_refused():
 
 @pytest.mark.parametrize("n", [1, 5, 60])
 def test_matrix_routines_are_those_of_scipy(n):
-    """Results equal scipy's bit for bit in every storage order, because couplings are compared by their bytes."""
+    """The routines give the bits of SciPy's in every storage order, because couplings are compared by their bytes."""
     rng = np.random.default_rng(n)
     rows = rng.standard_normal((3 * n, n))
     U = scipy.linalg.qr(rows, mode="r")[0][:n]

@@ -240,7 +240,7 @@ def test_vertex_force_maps_match_raw_matrices(robust):
     for member in LOOP.members():
         F = force_map(environment(member.network, T), robust.coupling, THETA, (0, 0)).at(np.exp(1j * w))
         expected = by_hand(member.network, robust.coupling, w)
-        # Near z = 1, where |z - 1| is 1e-3, both computations lose digits to its square and to the resonance.
+        # Both computations divide by (z - 1)^2, which is 1e-6 at the lowest frequency, and near a resonance.
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
@@ -256,7 +256,7 @@ def test_one_filter_holds_at_every_vertex(robust, nominal_only):
 def test_the_sweep_agrees_with_the_condition_by_hand(robust):
     check = check_ranges(LOOP, robust.coupling, samples=0)
     for member, requirement in zip(check.members, check.at_members, strict=True):
-        # A dense grid may miss the peak of the 6 Hz resonance.
+        # The sweep by hand has no point exactly at the peak near 6 Hz, so its value is a little lower.
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
 
 

@@ -159,7 +159,7 @@ def test_six_facts_hold_at_every_transition():
     e = np.where(h > 0, (p - k * h) / np.maximum(b, 1e-300), 0) * (b > 0)
     u, r = np.diff(h, axis=0), y - h
     s = np.where(b > 0, e[1:] - u, 0) * 1.0
-    s = np.where((b > 0) & (h[1:] == 0), -u, s)  # Off the wall the damper's step e is zero.
+    s = np.where((b > 0) & (h[1:] == 0), -u, s)  # e is zero where the wall is not touched
     dr, dp = np.diff(r, axis=0)[1:], np.diff(p, axis=0)[1:]
     before, now, u = s[:-1], s[1:], u[1:]
     scale = 1e-12 * size**2

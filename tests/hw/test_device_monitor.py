@@ -161,7 +161,7 @@ def hand_driven(scenario, rungs, tested=False):
 
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
-    """At 0.2 m/s a freeze of 2.4 ms adds 0.48 mm to a displacement; a tick allows a pulse of 0.12 mm."""
+    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; a jump that 20 N cannot cause is 0.12 mm."""
     session, send = hand_driven(scenario, rungs, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0
@@ -276,7 +276,7 @@ def test_fake_device_clocks_are_found(scenario, rungs):
 
 
 def run_clock(ticks):
-    """Give the monitor of the device's clock ticks of these lengths [us]; the clock wraps around on the way."""
+    """Feed ticks of these lengths [us] to the monitor of the device's clock, which wraps around on the way."""
     pace, t = _ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
     for lasts in ticks:
         pace.note(round(t) & 0xFFFFFFFF, 1)
@@ -393,9 +393,9 @@ def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
 
 @pytest.mark.slow
 def test_answers_that_overtake_each_other_are_timed(scenario):
-    """A late answer that comes together with a younger one leaves no trace, so a second round tells them apart.
+    """A late answer that comes with a younger one cannot be timed; a second round of ignored FORCEs times it.
 
-    Without the second round, the first link was measured at 2.7 ms, which needs 6 ticks of 0.5 ms in place of 7.
+    Without the second round the first link was measured at 2.7 ms, 6 ticks of 0.5 ms; the true delay needs 7.
     """
     rng = np.random.default_rng(3)
     links = [(5e-4, "down:jitter=0.0005", "down:burst=0.0017")]

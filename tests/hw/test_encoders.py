@@ -58,7 +58,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
 )
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
-    """Encoders with counts of 1 to 100 um answer a force of at most `most` [N], with hands on the handles or not."""
+    """A force of at most `most` [N] shows that encoders with counts of `step` [m] work, with and without hands."""
     still = scenario if held else nobody(scenario)
     forces = []
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, held=held))

@@ -40,7 +40,7 @@ def felt(port, w, device=DEVICE):
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_every_frequency_is_decided_without_a_grid(seed, n):
-    """A random impedance is accepted if D lifts the least Re Z of a dense sweep above 0, and refused below 0."""
+    """A random impedance is accepted if a dense sweep finds Re Z > 0 everywhere, and refused if Re Z < 0 somewhere."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(n, n))
     A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(n)
@@ -301,7 +301,7 @@ def test_ports_that_cannot_be_are_refused(call, message):
 
 @pytest.mark.parametrize(("d", "b"), [(2.0, 1.5), (2.0, 2.0), (1.0, 1.5)])
 def test_dead_times_take_their_pade_form(d, b):
-    """d + b (1 - s tau/2)/(1 + s tau/2) is d + b exp(-s tau) to b (w tau)^3/12, and passive only if d >= b."""
+    """d + b (1 - s tau/2)/(1 + s tau/2) equals d + b exp(-s tau) within b (w tau)^3/12; it is passive if d >= b."""
     tau = 0.05
     parts = [[-2 / tau]], [[1.0]], [[4 * b / tau]], d - b
     if d < b:

@@ -29,7 +29,7 @@ def test_a_setting_fails_and_the_rule_holds(hard):
 
 @pytest.mark.parametrize(("side", "wrong"), [(-0.1, None), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
 def test_within_a_tenth_of_the_boundary(side, wrong):
-    """RK4 with the default substeps gives the right verdict where the exact growth is -0.1 or 0.1 1/s.
+    """The default RK4 gives the right verdict for loops whose exact growth is -0.1 or 0.1 1/s.
 
     At 0.1 1/s cheaper settings call the loop stable: MuJoCo's integrators err to that side, so at -0.1 none is wrong.
     """

@@ -92,7 +92,7 @@ def test_drawn_devices_are_within_their_bounds(engine):
 @pytest.mark.slow
 @pytest.mark.parametrize("humans", [60, pytest.param(400, marks=pytest.mark.validate)])
 def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
-    """With 1.001 times the damping that known-device requires no hand grows on any device; the worst replays."""
+    """At 1.001 times the damping of known-device no hand makes a drawn device unstable; the worst one replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
     base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed", "--no-limiter"]
@@ -140,7 +140,7 @@ def test_both_engines_agree_on_a_person():
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
-    # After the tap speeds ring at the transmissions' 90 Hz; even RK4 x 4 errs by only 1.3e-5 of the largest.
+    # After the tap, the speeds ring at 90 Hz, where RK4 x 4 errs by 1.3e-5 of the largest speed.
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
 
 
@@ -260,7 +260,7 @@ class EveryThirdLossless:
 
 
 def test_sampled_traces_are_those_of_all_hands():
-    """MuJoCo traces lossless hands, those nearest to the limit and 64 more; the exact engine traces the others."""
+    """MuJoCo traces lossless hands, those nearest to the limit and a random sample; the exact engine, the others."""
     people = SCENARIO.replace(population=EveryThirdLossless())
     question = Validation(people, PUBLISHED["I"], 3, 200, 1, "both", 0.3)
     some, every = validate(question), validate(replace(question, all_traces=True))
@@ -295,7 +295,7 @@ def test_designed_coupling_holds_for_everyone():
     np.testing.assert_allclose(traced.trace, traced.exact, atol=1e-3)
     assert not traced.clipped.any()
     assert (traced.energy >= 0).all()
-    # The paper's Definition 3: with these damped humans motions decay within two seconds.
+    # Definition 3 of the paper: damped humans come to rest, so the last quarter is calmer than the second.
     assert (traced.settling < 1).all()
 
 
@@ -510,7 +510,7 @@ def test_traces_decide_only_what_eigenvalues_say():
 
 
 def test_short_traces_do_not_vote():
-    """If a short trace grows by 0.168 1/s, but all maps decay by 0.331 1/s, the trace is no disagreement."""
+    """A trace that grows while all maps decay is no disagreement if its error exceeds its rate."""
     found = slow_loops(4, 0, 0.3)
     rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}
     slow = replace(found, **rates, trace_error=np.full(4, 2.0))

@@ -39,7 +39,7 @@ class Case:
     before: Callable[[], object] | None = None  # runs in the child, in the case's folder
 
 
-QUICK = {  # options that a command needs beside the tested one
+QUICK = {  # a command's required arguments, and options that keep it short
     "run": ("--no-plot", "--duration", "0.1"),
     "validate": ("--humans", "2", "--duration", "0", "--no-plot"),
     "zwidth": ("--grid", "4", "--points", "0", "--humans", "2", "--no-plot"),
