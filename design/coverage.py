@@ -108,7 +108,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of `design` over the ranges, after those of the design by `nominal` without ranges, if any."""
+    """Return the figures of `design` over the ranges, preceded by those of the design without ranges if it exists."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

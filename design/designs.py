@@ -132,7 +132,7 @@ def design_by_kind(
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
         why = f"{kind} couplings are not designed for a condition of your own, allowed are {able} and FILE.py:NAME"
-        raise ValueError(f"condition is {own.name}: {why}; a coupling in a FILE.json is only judged")
+        raise ValueError(f"condition is {own.name}: {why}; it can judge a stored coupling FILE.json")
     condition_name = usual_condition(loop, kind) if own or not name else name
     able = {c.name: c for c in chosen.conditions}
     if condition_name not in able:

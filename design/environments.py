@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block`, affine in s and `multiplier`, which holds s times the multipliers of the hands' side."""
+        """Return `block`, affine in s and `multiplier`, in which those of the hands' side are multiplied by s."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -273,7 +273,7 @@ class _Search:
     def _values(self, x: Array) -> tuple[float, ...]:
         """Return the multiplier for the unknowns x, of which the last is s.
 
-        The values are rounded to _DIGITS digits. `allowed` scales those of the hands' side after their division by s.
+        The values are rounded to _DIGITS digits. Those of the hands' side are divided by s and scaled by `allowed`.
         """
         values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
@@ -332,7 +332,7 @@ class ThisEnvironment(Multiplied):
 
     @property
     def extensible(self) -> bool:
-        """False for subclasses, because the block for limited forces and the fast sweeps do not contain their facts."""
+        """False for subclasses: the block for limited forces and the fast sweeps do not contain a subclass's facts."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:

@@ -225,7 +225,7 @@ def _less(W: _Integers, units: int) -> _Integers:
 def _definite(W: _Integers, bits: int) -> bool:
     """Return whether the symmetric integer matrix W (n, n), in units of 2^-bits, is proved to be positive definite.
 
-    Between passes the largest entry is shortened to 32 bits more than `bits`, and all others by as many bits. Each
+    Between passes all entries lose the same number of low bits, so that the largest keeps 32 more than `bits`. Each
     entry then changes by less than one unit, and the norm of the matrix by less than n units, which are subtracted from
     the diagonal.
     """
@@ -249,8 +249,8 @@ def _longest(W: _Integers) -> int:
 def _dominates(W: Array) -> bool:
     """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
 
-    The answer holds for the integers from which `_floats` made W. Rounding changed each by 2^-53 of itself and 2^-900
-    of the largest, and changes a sum of n < 2^11 terms by n 2^-53. Both are below 2^-40, the factor's excess over one.
+    The answer holds for the integers from which `_floats` made W. Rounding changed each by at most 2^-53 of itself plus
+    2^-900 of the largest, and changes a sum of n < 2^11 terms by at most the share n 2^-53. The test allows for more.
     """
     diagonal = np.diag(W)
     others = np.abs(W).sum(axis=1) - np.abs(diagonal)

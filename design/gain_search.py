@@ -64,7 +64,7 @@ class SampledLoop:
     multiplier.
     """
 
-    #: channels with a second row in the block and an unknown multiplier; in KnownDeviceLoop all devices
+    #: indices of the channels with a multiplier and a second row in the block; in KnownDeviceLoop those of all devices
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
@@ -323,7 +323,7 @@ def _shared(loop: Loop) -> tuple[list[int], Array]:
 class SwitchingLoop(SampledLoop):
     """The loop under any switching of delays: x = (log K, B/delta, log(alpha T/delta) of `active`).
 
-    `judged` searches its own multiplier alpha in the sweep of `SWITCHING`.
+    `judged` ignores the alpha in x and searches the best one with `SWITCHING`.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))

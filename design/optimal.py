@@ -184,7 +184,7 @@ def _over_bases(
     return improving, results, False
 
 
-#: tried betas, as shares of the largest one; all channels have the same share, because others gain hardly anything
+#: tried shares of the largest beta, the same in all channels, because different shares gain hardly anything
 _ETAS = 0.15, 0.3, 0.5
 _SCALINGS = 6  # most scalings of the forces; each reduces them by at least MARGIN
 
