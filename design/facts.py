@@ -59,7 +59,7 @@ class Demand(Generic[Block]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Return delta T/T_max (m,) [N s/m], which stands at the constant period T for delta in periods up to T_max.
+    """Return delta T/T_max (m,) [N s/m]: proofs for a constant T with this damping hold for periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
     the energy balance does not depend on T_k: the force map is the same at every tick.
