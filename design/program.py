@@ -61,8 +61,8 @@ _EVEN = 0.002  # weight of the error relative to each motion's own force (`_even
 _LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10
-# Duality gaps before the first and before each later sweep, relative to the objective or to its gain over zero force,
-# whichever is less.
+# Duality gaps before the first and before each later sweep, relative to the objective, or to the difference between the
+# objectives of zero force and of the solution, whichever is less.
 _GAPS = (0.05, 0.01)
 _FORGIVEN = 5e-4  # allowed violation of an inequality between the frequencies of its grid; scaling removes it
 _STEEPER = 3.0  # factor between successive weights of the barrier method

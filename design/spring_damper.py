@@ -601,7 +601,7 @@ def _stiffest_in_frame(loop: Loop) -> Design:
     """Return the stiffest linear coupling for any environment with a latency or switching delays.
 
     He[V/(1-z)] = chi is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, whose series is finite, and V(1)/2 is the
-    mean of chi (docs/theory.md). A convex program or a closed form gives the multiplier of least mean.
+    mean of chi (docs/theory.md). A convex program or a closed form gives the multiplier that minimises this mean.
     """
     if loop.latency and loop.varying_delay:
         line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
