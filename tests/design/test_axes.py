@@ -281,7 +281,7 @@ def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> Non
     """A proof exists above the requirement; 2 % below it, the sweeps of the two environment conditions refuse."""
     least = required_damping(LOOP, BUILT, condition).ratio
     enough = scaled(LOOP, float(f"{1.02 * least:.6g}"))
-    if not isinstance(condition, str):  # the limiter's rho is a share of the damping
+    if not isinstance(condition, str):  # rho is a share of the damping, so scaling would change the limiter
         enough, condition = LOOP, condition
     proof = prove(enough, BUILT, condition)
     assert proof.proof == "rational"
@@ -305,7 +305,7 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
 
 @pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
 def test_a_wall_meets_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
-    """s Delta >= c n n' (n is the normal) holds for s = c n' Delta^-1 n; a bare wall needs c [N s/m] of one axis."""
+    """s Delta >= c n n' (n is the normal) holds for s = c n' Delta^-1 n; one axis needs c [N s/m] at this wall."""
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
     network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})
@@ -367,7 +367,7 @@ def test_turning_the_axes_changes_nothing(turns: int) -> None:
 
 
 def test_decoupled_axes_need_what_one_needs() -> None:
-    """Three axes of an isotropic device, each with its own chain, need what one such device needs."""
+    """Three axes of an isotropic device, each with a separate chain, need the damping of one axis with its chain."""
 
     def chains(axes: int) -> Network:
         springs, masses = [], {}
@@ -476,7 +476,7 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
     ],
 )
 def test_full_levels_meet_walls(known: bool, condition: str) -> None:
-    """The spring-damper before a wall is proved; it uses 99 % of the damping or has the largest stiffness."""
+    """The designed spring-damper is proved; it uses at least 99 % of the damping or has the largest stiffness."""
     coordinates = ("a.x", "a.y")
     wall = Wall(("a", "ground"), 1000.0, 1.0, normal=(0.6, 0.8))
     springs = Spring(("a.x", "ground"), 300.0, 0.5), Spring(("a.y", "ground"), 100.0, 0.5)
@@ -732,7 +732,7 @@ def test_reports_show_matrix_gains_on_their_diagonal() -> None:
 
 @pytest.mark.parametrize("loop", [ONE_DEVICE, pytest.param(LOOP, marks=pytest.mark.validate)])
 def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
-    """The multiplier of a design over two bases has one row per device."""
+    """The multiplier of a design over two bases has one number per device."""
     design = design_by_kind(loop, "optimal", limiter=True, bases=((1, 1), (2, 1)))
     needs = required_damping(loop, design.coupling, LimitedForces(0.0, 1))
     assert design.requirement.certified
@@ -757,7 +757,7 @@ def _chains(stiffness: float, c: float) -> Loop:
     [(100.0, 0.91), *(pytest.param(*each, marks=pytest.mark.validate) for each in ((50.0, 0.93), (100.0, 0.9)))],
 )
 def test_phi_is_below_the_level_with_many_states(stiffness: float, c: float) -> None:
-    """Phi is positive and below Delta_D, and the environment's dynamic stiffness with Phi is passive on a fine grid."""
+    """0 <= Phi < Delta_D, and E-hat + Phi is passive on a fine grid."""
     loop = _chains(stiffness, c)
     assert loop.E().order > 30
     needs = ANY_ENVIRONMENT.judge(loop, SpringDamper((20.0, 20.0), (0.3, 0.3)))

@@ -103,7 +103,7 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
 
 @pytest.mark.parametrize("name", ["n1-omega-II", "o12-free-mass-late"])
 def test_the_integral_errs_by_less_than_its_bound(name):
-    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/w>."""
+    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/rho>."""
     loop = loop_of(name)
     dual = module._Dual.of(loop, (1.0, 100.0), 16)
     x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)

@@ -93,7 +93,7 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
 def test_safe_gains_are_proved_again_from_files(tmp_path, coupling, condition, ratio):
     stored = certified(DEFAULT, coupling, condition)
     assert stored.certificate.proof == "rational"
-    if ratio:  # the design notes give these ratios
+    if ratio:  # None: this ratio is not compared
         assert stored.certificate.required[0] / 1.37 == pytest.approx(ratio, abs=1e-3)
     save(stored, tmp_path / "coupling.json")
     assert load(tmp_path / "coupling.json") == stored
@@ -180,7 +180,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of one to three contacts with 0.5 to 1.5 times the needed damping, counted as at most 100."""
+    """Return a star of one to three contacts and a coupling; delta is 0.5 to 1.5 times the need, capped at 100."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]

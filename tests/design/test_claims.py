@@ -457,7 +457,7 @@ def test_every_step_of_the_convex_sequence_improves():
 
 
 class Resonant(Environment):
-    """H (1 - 1/z), where H is 500 plus a pair of poles: it may supply power within a millionth of one frequency."""
+    """H (1 - 1/z), where H is 500 plus a pair of poles: it may supply power in a band of some 1e-6 rad/sample."""
 
     contacts = ("tip",)
 

@@ -242,7 +242,7 @@ def kyp(G: Lti, P: np.ndarray) -> np.ndarray:
 
 
 def test_a_static_block_is_refused_exactly(monkeypatch):
-    """D + D' has the determinant -1/2^60, which a sweep in floating point may take for positive."""
+    """D has the determinant -1/2^60, which a sweep in floating point may take for positive."""
     monkeypatch.setattr(exact, "_least_eigenvalue", lambda G: (1e-17, 0.0))
     D = [[Fraction(1), Fraction(1)], [Fraction(1), 1 - Fraction(1, 2**60)]]
     P, reason = find_storage(Lti.constant(D, Fraction(1, 1000)))
@@ -318,7 +318,7 @@ def test_unreachable_states_are_left_out():
     B, C = [[1], [1], [0], [0]], [[0.1, 0, 0.1, 0.1]]
     G = Lti(*(numbers(part, Fraction(1)) for part in (A, B, C, [[1]])), Fraction(1))
     assert reached(G) is G
-    P, reason = find_storage(G)  # equal and opposite states drive the third and fourth
+    P, reason = find_storage(G)  # the first two states are equal, and cancel in the third
     assert reason is None
     assert P.shape == (4, 4)
     late = Lti(G.A.T, numbers([[0], [0], [1], [0]], Fraction(1)), G.C, G.D, Fraction(1))

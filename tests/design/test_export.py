@@ -394,7 +394,7 @@ def test_bad_input_is_one_line(place, options, message):
 
 
 def test_one_channel(tmp_path):
-    """The process of a single device and a wall has the static stiffness of two springs in series."""
+    """The process of one device has the static stiffness of the coupling and the spring to ground in series."""
     wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
     save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
     static = process_block(load(tmp_path / "one.json")).system.at(1.0)

@@ -1,4 +1,7 @@
-"""Test devices of known motor mass and transmission: reference figures, the steps of the proof, and attacks."""
+"""Test devices of known motor mass and transmission: reference figures, the steps of the proof, and attacks.
+
+docs/theory.md, "What is known of the device counts", numbers these steps and states Theorems A and B.
+"""
 
 from fractions import Fraction
 from functools import cache, partial
@@ -91,7 +94,7 @@ def test_constants_of_one_period():
     cost = period_cost(one(1.2e-3, 1.37), 1.0, np.array([3e-5]))
     c0, c2, q, T = 1.2753875, 1.7998875e-6, 1.1073999408e-3, 1.2e-3
     expected = c0 / (T - q), c0 * q / (T - q), c0 * q * T / (T - q), c2 / q
-    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)  # q is printed to ten digits
+    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)  # T - q is known to 5e-10
     own, first, last = cost.move[0], cost.mean[0] / 4 + cost.step[0], cost.mean[0] / 4 - cost.step[0]
     assert (own, -cost.cross[0] / 2) == pytest.approx((1.37730743e4, -7.62615086), rel=1e-8)
     assert (first, last) == pytest.approx((6.20101795e-3, 2.95036309e-3), rel=1e-8)
@@ -133,7 +136,7 @@ def test_a_bare_spring_gains_nothing():
 
 @pytest.mark.parametrize(("theta", "known", "present"), [(0, 5913.6, 2283.3), (1, 1887.4, 1141.7), (2, 1029.7, 761.1)])
 def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present):
-    """The coupling has V(1) = 2 mean(`chi_by_hand`) over the circle; unknown devices have the mean n T/(4 delta)."""
+    """V(1) is twice the mean of `chi_by_hand` over the circle; for beta -> 0 this mean is n T/(4 delta)."""
     z = np.exp(2j * np.pi * (np.arange(512) + 0.5) / 512)
     loop, top = one(1.2e-3, 1.37, theta), 2 * np.sqrt(1.37 * 0.5) / 14500
 
@@ -361,7 +364,7 @@ def test_the_proof_is_tight_for_the_papers_loop(coupling):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Attacks: lossless hands behind the transmission, with resonators near and above half of the sampling rate.
+# Attacks: lossless hands behind the transmission, with resonators from 1 Hz to four times the sampling rate.
 
 
 def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
@@ -503,7 +506,7 @@ def test_the_paper_loop_is_proved_exactly():
 
 
 def test_a_sweep_sees_what_the_block_is():
-    """The least eigenvalue of the block vanishes at the required damping, for both forms."""
+    """The least eigenvalue of the block vanishes at the required damping, for this and for any environment."""
     loop = change(KNOWN, theta=(0, 1), lam=(0, 1))
     coupling = SpringDamper([4000.0, 1300.0], [6.0, 2.5])
     V, F = coupling.compliance(loop.T), loop.F(coupling)
@@ -764,7 +767,7 @@ def test_a_map_agrees_with_single_sweeps(name):
     drawn = named(name).ratios(loop, SpringDamper(K[:, None], B[:, None]))
     for k, b, ratio in zip(K, B, drawn, strict=True):
         swept = required_damping(loop, SpringDamper([k], [b]), name).ratio
-        if ratio > 0.05:  # below 0.05 a map returns a sufficient share
+        if ratio > 0.05:  # below 0.05 the ratio of a map may exceed the least one
             assert ratio == pytest.approx(swept, rel=0.03)
         assert ratio >= swept * 0.98
 
@@ -846,8 +849,8 @@ def test_periods_that_vary_lose_no_lossless_hand():
 def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=4000):
     """Simulate moving lossless hands before one-sided walls, one each, whose force is limited, without delay.
 
-    Return the energy of motor, transmission and hand at each tick, (ticks, hands). Before a spring, a limiter of
-    rho = 0 clips the force of spring-damper and wall in series.
+    Return the energy of motor, transmission and hand at each tick, (ticks, hands). With rho = 0 the limiter clips the
+    force of coupling and wall in series.
     """
     (device,), T, n = loop.known_devices, loop.T, len(drawn)
     m, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_max
@@ -1020,7 +1023,7 @@ LIMITED = LimitedKnownDevice(LimitedForces(held=(RHO,)))
 
 
 def limited(theta, *walls):
-    """Return the loop of a known device with 50 g on 20 N/m and 0.3 N s/m, and `walls`."""
+    """Return the loop of a known device; its environment is 50 g on 20 N/m and 0.3 N s/m, and `walls`."""
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
     return Loop(1e-3, (theta,), (0,), (0,), (1.37,), network, known_devices=(DEVICE,))
 
@@ -1155,7 +1158,7 @@ def test_no_hand_gains_energy_from_ages_of_forces(name):
 
 @pytest.mark.slow
 def test_switching_before_any_environment_is_that_of_chi():
-    """He[V/(1-z)] > l (Lam - alpha d d*/2)^-1 l*/4 + h^2/(2 alpha), d = (1, beta (z - 1)), l of the mean delay."""
+    """He[V/(1-z)] > l (Lam - alpha d* d/2)^-1 l*/4 + h^2/(2 alpha): d = (1, beta (z - 1)), l the mean for lo and hi."""
     loop, coupling = change(one(1e-3, 1.0, 1), varying_delay=DelayRange((0,), (2,))), SpringDamper([600.0], [1.2])
     found = required_damping(loop, coupling, "known-device-any")
     beta, alpha, share = found.multiplier[0], found.multiplier[3], found.required[0]

@@ -31,7 +31,7 @@ def test_scaled_moving_averages_need_less_damping(theta, factor):
 
 
 def test_channels_whose_zeros_differ():
-    """Each channel has its own zeros. With three, the order of the singular directions is not symmetric."""
+    """Channels have different zeros. With three, the permutation to singular vectors is not its own inverse."""
     theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
     for m in (2, 3):
         V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])
@@ -62,7 +62,7 @@ def test_it_beats_the_spring_damper(name, case):
 
 
 def test_delay_in_the_environment():
-    """With psi = (1, 0) the design is proved for any environment, and its exact simulation is stable."""
+    """With psi = (1, 0) the design is proved under any-environment, and its exact simulation is stable."""
     scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))
     loop = scenario.loop("I")
     made = design_coupling(loop, "moving-average")

@@ -83,7 +83,7 @@ def dense() -> np.ndarray:
     return np.union1d(np.linspace(1e-3, np.pi, 3000), np.geomspace(1e-3, np.pi, 3000))
 
 
-# what is returned ----------------------------------------------------------------------------------------------------
+# designs and bounds --------------------------------------------------------------------------------------------------
 
 #: loop, largest rms mismatch [dB] with the two smallest bases, least share of the static stiffness
 REACHED = [
@@ -253,7 +253,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition number of 1e15, and all its digits are stored; without a heavier weight g would be 0.017."""
+    """P has a condition number of 1e15, and all its digits are stored; a light weight of g would give g = 0.017."""
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
@@ -300,7 +300,7 @@ def test_there_is_always_an_answer(seed):
 
 
 def test_ties_prefer_less_error_at_small_forces():
-    """At 0.6 Hz, hands that move together ask for less than 2 % of the largest force; its error is below 5 %."""
+    """At 0.6 Hz, hands that move together should feel under 2 % of the largest force; its error is below 5 %."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -337,11 +337,11 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     assert 1.05 / (2 * theta + 1) < stiffness < 1 / (theta + 1)
 
 
-# further demands -----------------------------------------------------------------------------------------------------
+# switching, other objectives and ranges ------------------------------------------------------------------------------
 
 
 def test_switching_delays_match_a_separate_formula():
-    """[[He F/(z-1) + (delta - alpha T/2)/T, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F of the mean delay."""
+    """[[He F/(z-1) + delta/T - alpha/2, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F = (z^-lo + z^-hi)/2 G."""
     loop = loop_of("n3")
     found = design(loop.switching(DelayRange((4,), (6,))), SMALLEST)
     assert found.proved
@@ -501,7 +501,7 @@ def test_requests_that_make_no_sense_are_refused():
 
 @pytest.mark.parametrize("n", [1, 5, 60])
 def test_matrix_routines_are_those_of_scipy(n):
-    """The routines give the bits of SciPy's in every storage order, because couplings are compared by their bytes."""
+    """The routines and SciPy's give the same bits in every storage order: tests compare couplings byte by byte."""
     rng = np.random.default_rng(n)
     rows = rng.standard_normal((3 * n, n))
     U = scipy.linalg.qr(rows, mode="r")[0][:n]
@@ -760,7 +760,7 @@ def test_a_longer_period_is_a_smaller_damping():
 def test_late_walls_match_their_closed_form():
     """The K that solves (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2 needs all of delta; a design reaches 0.98 K."""
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
-    K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
+    K = 1000 * delta / 0.841354  # with any latency in [0, t2] this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
     assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
     found = design(loop, SMALLEST)

@@ -48,7 +48,7 @@ SMALLEST = Options(bases=((4, 3),))
 
 @pytest.fixture(scope="module")
 def robust():
-    """The optimal coupling for the small ranges."""
+    """Return the optimal coupling for the small ranges."""
     return optimal.design(LOOP, SMALLEST)
 
 
@@ -91,7 +91,7 @@ def test_vertices_are_range_ends_and_absences():
 
 
 def test_a_contact_that_is_made():
-    """The environment has no spring to the ground, the vertices have one. Its absence gives the environment again."""
+    """The environment has no spring to the ground, the vertices have one. Without it, one would be the environment."""
     ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
     nominal, *vertices = members(FIGURE_4, ranges)
     assert len(nominal.network.springs) == 2
@@ -364,7 +364,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
-    # The design also weighs each motion's relative error, which cost 0.014 dB with the one basis of a slow machine.
+    # The design also weighs each motion's relative error: on a slow machine, with one basis, this cost 0.014 dB.
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == "these ranges"
 

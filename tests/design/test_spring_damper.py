@@ -143,7 +143,7 @@ def gains_of_least(cost, theta, sigma):
     [(0, np.inf, 1000), (12, np.inf, 1000), (7, 3.0, 1000), (12, np.inf, 0), (7, 3.0, 0)],
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
-    """The set's furthest points, by one matrix inequality or many, equal those of cvxpy to 1e-5; many miss 2e-6."""
+    """One matrix inequality and many give cvxpy's optimum to 1e-5; with many the error is 2e-6."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
     certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in (np.array([-1.0, -0.2]), np.array([-0.2, -1.0]), np.array([-1.0, 1.0])):
@@ -180,7 +180,7 @@ def test_three_channels_with_different_devices():
 
 
 def test_weights_shift_the_optimum():
-    """By a flat weight the design for this weight is at least as good as the design for the default low-pass."""
+    """Measured by a flat weight, its own design is at least as good as that for the default low-pass."""
     flat = Lti.constant(np.eye(2), T)
     loop = asked((0, 0))
     found, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
@@ -353,7 +353,7 @@ def test_limits_help_no_loop_that_fails_without() -> None:
 @pytest.mark.parametrize("steps", [7, 100])
 @pytest.mark.parametrize("release", [scipy.__version__, "1.15.0"])
 def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
-    """Both find the same point of Rosenbrock's function inside a disc bit for bit, also when 7 steps are too few."""
+    """`_slsqp` and SciPy end Rosenbrock's function in a disc at the same bits, also when 7 steps are too few."""
     disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
     bounds, options = [(-1.5, 0.9)] * 2, {"maxiter": steps, "ftol": 1e-7}
     start = [-1.6, 1.0]  # outside the bounds
@@ -376,5 +376,6 @@ def test_the_least_eigenpair_solves_its_equation(rows):
     np.testing.assert_allclose(values, np.linalg.eigvalsh(H)[:, 0], atol=1e-13)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-13)
     residual = np.einsum("kij,kj->ki", H, vectors) - values[:, None] * vectors
-    # For 15 rows a step of inverse iteration leaves 1e-13 of the largest entry over the vector's share in the start.
+    # For 15 rows a step of inverse iteration leaves 1e-13 of the largest entry, divided by the start's component
+    # along the vector.
     assert np.abs(residual).max() < (1e-12 if rows < 15 else 1e-10)

@@ -1,4 +1,4 @@
-"""The mismatch figures equal those of the agreed table, of dense sweeps, and of closed forms."""
+"""The mismatch figures equal recorded figures, dense sweeps and closed forms."""
 
 import numpy as np
 import pytest
