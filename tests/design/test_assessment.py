@@ -177,7 +177,7 @@ def test_the_shell_needs_a_coupling_for_any_environment(changes, coupling, holds
         assert meta["assessment"]["reason"] in words
 
 
-def test_the_energy_budget_is_what_its_run_guarantees():
+def test_a_budgeted_run_guarantees_its_budget():
     """The certificate does not cover forces that the budget scales, so the guarantee is that of the budget."""
     scenario = load("omega-pair").replace(duration=0.1)
     meta = simulate(scenario, HERE_ONLY, "exact", energy_budget=0.02).meta

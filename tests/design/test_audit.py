@@ -97,7 +97,7 @@ def test_rigid_wall_couplings_are_proved_and_stored(theta, proved, tmp_path):
         assert certificate.verify(again).proved
 
 
-def test_what_a_rigid_wall_cannot_have():
+def test_impossible_rigid_walls_are_refused():
     loop, _ = wall(1000, 0)
     with pytest.raises(ValueError, match="no loop with a delayed environment is stable"):
         msgspec.structs.replace(loop, psi=(1,))
@@ -262,7 +262,7 @@ def test_any_coupling_can_be_audited():
     assert "needs a coupling" in needs(nothing, "any-environment")["reason"]
 
 
-def test_promises():
+def test_guarantees_name_their_environments():
     assert safe_with(report(*pair(SAFE))) == "any passive environment"
     assert assess(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2]))).guarantee.environments == "this environment"
     assert assess(*wall(5000, 0)).guarantee is None

@@ -366,7 +366,7 @@ def test_turning_the_axes_changes_nothing(turns: int) -> None:
         assert after == pytest.approx(before[i], abs=1e-10), (number, condition)
 
 
-def test_decoupled_axes_need_what_one_needs() -> None:
+def test_decoupled_axes_need_the_damping_of_one() -> None:
     """Three axes of an isotropic device, each with a separate chain, need the damping of one axis with its chain."""
 
     def chains(axes: int) -> Network:
@@ -475,7 +475,7 @@ def test_principal_axes_are_orthogonal_exactly() -> None:
         pytest.param(True, "known-device", marks=pytest.mark.validate),
     ],
 )
-def test_full_levels_meet_walls(known: bool, condition: str) -> None:
+def test_full_level_designs_at_walls_are_proved(known: bool, condition: str) -> None:
     """The designed spring-damper is proved; it uses at least 99 % of the damping or has the largest stiffness."""
     coordinates = ("a.x", "a.y")
     wall = Wall(("a", "ground"), 1000.0, 1.0, normal=(0.6, 0.8))

@@ -149,7 +149,7 @@ def test_three_steps_beat_the_structured_design(loop, order, diagonal):
 
 
 @pytest.mark.slow
-def test_delay_in_the_environment_is_paid_for():
+def test_environment_delay_designs_never_worsen_their_start():
     loop = asked((0, 0), SOFT_NETWORK, psi=(1, 1))
     found = ccl.design(loop, most_sdps=3)
     assert found.requirement.certified

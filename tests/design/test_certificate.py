@@ -154,7 +154,7 @@ def test_a_static_asymmetry_is_refused():
             prove(change(DEFAULT, environment=anchored), V, condition)
 
 
-def test_only_this_environment_proves_environment_delay():
+def test_environment_delay_needs_more_for_any_environment():
     loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
     damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
     assert verify(certified(loop, damped, "this-environment")).proved
@@ -354,7 +354,7 @@ def test_near_sharp_resonances_proof_and_run_agree():
     assert certified(loop, coupling, "this-environment").certificate.proof == "rational"
 
 
-def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
+def test_a_failed_sweep_refuses_the_proof(monkeypatch):
     good = certified(DEFAULT, STIFF, "this-environment")
     worse = this_environment(DEFAULT.F(STIFF), (1.0, 1.0))
     ratio = worse.required[0] / 1.37 * 1.01

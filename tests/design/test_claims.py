@@ -403,7 +403,7 @@ def test_saturation_is_outside_every_certificate():
         assert np.abs(late(limiting)).max() < 0.01
 
 
-def test_what_the_multiplier_costs():
+def test_the_multiplier_block_has_a_schur_complement():
     """The block is positive definite exactly if Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1, as in (14)."""
     rng = np.random.default_rng(7)
     seen = set()

@@ -116,7 +116,7 @@ def test_a_broken_setting_is_skipped(answer, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(), TypeError("a bug of ours")])
-def test_what_is_not_the_solvers_fault_passes_through(error, monkeypatch):
+def test_interrupts_and_bugs_pass_through(error, monkeypatch):
     answering(monkeypatch, error)
     with pytest.raises(type(error)):
         LEAST_TRACE.solve("it")

@@ -25,7 +25,7 @@ def test_friction_needed_by_ten_micrometre_steps():
         encoder_friction(F, [STEP])
 
 
-def test_a_published_bound_pays_for_no_encoder_step():
+def test_a_published_bound_covers_no_encoder_step():
     coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
     needed = encoder_friction(F, steps)
     bounded = EncoderSteps.of(LOOP, coupling, steps, [0.0, 0.0], [0.26, 0.26])

@@ -183,7 +183,7 @@ def test_any_environment_of_a_full_compliance():
 
 
 @pytest.mark.parametrize("psi", [1, 2, 5])
-def test_the_multiplier_that_a_delayed_spring_asks(psi):
+def test_the_multiplier_of_a_delayed_spring(psi):
     """Phi must exceed (psi - 1/2) K T, as He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
     E = loop(to_ground(1000.0), (0,), (psi,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)

@@ -290,7 +290,7 @@ def rubbing_motor(rng, promised, delta, beta, ticks, T, mass=None):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_held_forces_pay_the_least_cost(seed):
+def test_held_forces_supply_the_least_cost(seed):
     """The inequality of step 4 holds from rest for hands with friction, a clutch and a stiffening spring."""
     rng = np.random.default_rng(seed)
     sides = rubbing_motor(rng, DEVICE, 1.3, 5e-5 * rng.uniform(0.2, 0.9), 60, 1e-3)
@@ -458,13 +458,13 @@ def required_on_even_periods() -> float:
         ("transmission_damping_min", 0.5, False),
     ],
 )
-def test_directions_that_the_guarantee_allows(field, factor, helps):
+def test_device_bounds_move_the_requirement_as_proved(field, factor, helps):
     F, loop = wall(800.0, 0.6, 1, 1e-3), one(1e-3, 1.0, 1)
     moved = change(loop, known_devices=(change(DEVICE, **{field: factor * getattr(DEVICE, field)}),))
     assert (required(F, moved) < required_on_even_periods()) == helps
 
 
-def test_a_small_beta_gives_the_present_condition():
+def test_a_small_beta_gives_this_environment():
     """As beta -> 0 the cost becomes delta dx^2/T, and the requirement becomes that of this-environment."""
     cost = period_cost(one(1e-3, 1.3), 1.0, np.array([1e-12]))
     assert cost.move[0] == pytest.approx(1300.0, rel=1e-3)
@@ -505,7 +505,7 @@ def test_the_paper_loop_is_proved_exactly():
     assert find_storage(block)[0] is None
 
 
-def test_a_sweep_sees_what_the_block_is():
+def test_the_block_is_singular_at_the_requirement():
     """The least eigenvalue of the block vanishes at the required damping, for this and for any environment."""
     loop = change(KNOWN, theta=(0, 1), lam=(0, 1))
     coupling = SpringDamper([4000.0, 1300.0], [6.0, 2.5])
@@ -545,7 +545,7 @@ def test_bounds_of_q_enclose_it_and_are_checked():
 SPRING = Network(("tip",), (Spring(("tip", GROUND), 1000.0),))
 
 
-def test_files_prove_it_and_forgeries_are_refused():
+def test_files_are_proved_and_forgeries_are_refused():
     coupling = PUBLISHED["I"]
     assert not required_damping(KNOWN, coupling, "this-environment").certified
     certificate = prove(KNOWN, coupling, "known-device")
@@ -730,7 +730,7 @@ def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
-def test_exact_loops_on_known_devices_need_no_coupling():
+def test_no_coupling_is_optimal_where_it_is_certified():
     found = design_coupling(KNOWN, "optimal")
     assert isinstance(found.coupling, NoCoupling)
     assert found.objective == 0
@@ -819,7 +819,7 @@ def test_no_pair_grows_above_the_requirement(theta):
     assert worst[short] > 1 + 1e-6  # rounding alone gives 1 + 1e-13
 
 
-def test_periods_that_vary_lose_no_lossless_hand():
+def test_no_lossless_hand_grows_under_varying_periods():
     """At 1.01 of the requirement for T_min to T_max no product of steps of random periods grows, for 200 hands."""
     K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
     loop, F = one(T, 1.0, theta, T_max=high, T_min=low), wall(K, B, theta, T)
@@ -879,7 +879,7 @@ def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=400
 
 
 @pytest.mark.slow
-def test_any_environment_gets_walls_and_limiter_free():
+def test_any_environment_covers_walls_and_limiter():
     """At 1.01 of the need of known-device-any no lossless hand gains energy at a limited wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)
     loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])
@@ -1157,7 +1157,7 @@ def test_no_hand_gains_energy_from_ages_of_forces(name):
 
 
 @pytest.mark.slow
-def test_switching_before_any_environment_is_that_of_chi():
+def test_switching_for_any_environment_follows_from_chi():
     """He[V/(1-z)] > l (Lam - alpha d* d/2)^-1 l*/4 + h^2/(2 alpha): d = (1, beta (z - 1)), l the mean for lo and hi."""
     loop, coupling = change(one(1e-3, 1.0, 1), varying_delay=DelayRange((0,), (2,))), SpringDamper([600.0], [1.2])
     found = required_damping(loop, coupling, "known-device-any")

@@ -196,7 +196,7 @@ def test_it_is_proved_stored_and_verified(latency, longest):
         prove(short, SOFT, "this-environment")
 
 
-def test_where_it_is_not_derived_it_is_refused():
+def test_loops_without_a_derived_condition_are_refused():
     loop = change(PAIR, latency=((0.0, TAU),) * 2)
     assert requirements_of(loop, SOFT)["this-environment"].proof == "rational"
     with pytest.raises(NotProved, match="delay in the environment"):

@@ -136,7 +136,7 @@ def test_no_multiplier_on_a_grid_is_better():
     assert min(others) >= best * (1 - 1e-6)
 
 
-def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
+def test_many_devices_use_the_zero_multiplier(monkeypatch):
     """Above `MULTIPLIER_ROWS` one sweep at c = 0 replaces the search, and may need more damping."""
     best = required_damping(PAIR, BUILT, LIMITER)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 3)
@@ -207,7 +207,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
     assert proof.margin == pytest.approx(1.37 / 1.32327, rel=1e-5)
 
 
-def test_files_without_it_stay_as_they_were(tmp_path):
+def test_linear_proofs_survive_a_refused_limiter(tmp_path):
     """STIFF needs 1.385 with the limiter: its linear proof stays, the limiter's is refused and names the figure."""
     stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
@@ -217,7 +217,7 @@ def test_files_without_it_stay_as_they_were(tmp_path):
         prove_limiter(PAIR, stiff)
 
 
-def test_any_environment_is_its_own_proof():
+def test_any_environment_covers_the_limiter():
     soft = SpringDamper((879.0, 552.0), (0.39, 0.52))
     loop = msgspec.structs.replace(PAIR, delta=(1.4, 1.4))
     assert lag(loop, prove(loop, soft, "any-environment")) == (0.0, 0.0)
@@ -245,7 +245,7 @@ def tampered(stored, **fields):
         ({"matrices": {"P": (("1",),)}}, "limiter: P has 1 rows"),
     ],
 )
-def test_what_was_changed_is_refused(stored, fields, reason):
+def test_changed_certificates_are_refused(stored, fields, reason):
     verdict = verify(tampered(stored, **fields))
     assert not verdict.proved
     assert reason in str(verdict.reason)

@@ -247,7 +247,7 @@ def test_separate_channels_have_the_smallest_margin():
         (Lti.constant([[1.0, 0.5], [0.0, 1.0]], T), "symmetric"),
     ],
 )
-def test_what_no_inequality_is_needed_to_refuse(V, word):
+def test_unstable_or_asymmetric_couplings_are_refused_without_inequalities(V, word):
     E = environment(FIGURE_4, T) if V.inputs == 2 else environment(Network(("c",), (Spring(("c", "ground"), 9.0),)), T)
     found = analysis(V, E, [0] * V.inputs, [0] * V.inputs, [1.0] * V.inputs)
     assert found.margin == -np.inf

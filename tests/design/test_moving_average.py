@@ -45,7 +45,7 @@ def test_a_zero_of_the_coupling_alone_is_refused(weights, theta):
 
 
 @pytest.mark.parametrize(("name", "case"), [("omega-pair", "I"), ("omega-pair", "II"), ("three-rigid", "I")])
-def test_it_beats_the_spring_damper(name, case):
+def test_moving_averages_beat_spring_dampers(name, case):
     loop = scenario_of(name).loop(case)
     stiff, soft = (design_coupling(loop, kind, "any-environment") for kind in ("moving-average", "spring-damper"))
     limit = 2 * np.array(loop.delta) / ((np.array(loop.theta) + 1) * loop.T)  # bound for every linear coupling
@@ -90,6 +90,6 @@ def test_stored_proved_and_read_again(tmp_path):
         (([1e-3, 1e-3], [2], [0.0]), "2, 1 and 1 entries"),
     ],
 )
-def test_what_is_no_moving_average(fields, message):
+def test_invalid_moving_averages_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         MovingAverage(*fields)

@@ -104,7 +104,7 @@ def test_figures_are_reached(name, most, stiffness):
 @pytest.mark.parametrize(
     "name", ["n0", "n2", "n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n4", "o13"))]
 )
-def test_the_sweep_that_knows_no_solver_certifies_it(name):
+def test_the_sweep_certifies_the_optimal_coupling(name):
     loop, found = loop_of(name), best(name)
     requirement = this_environment(force(loop, found.coupling), loop.delta)
     assert requirement.ratio <= 1 - 0.9 * MARGIN
@@ -291,7 +291,7 @@ def random_loop(seed: int) -> Loop:
         *(pytest.param(n, marks=pytest.mark.validate) for n in (0, *range(2, 12))),
     ],
 )
-def test_there_is_always_an_answer(seed):
+def test_random_loops_get_a_proved_design(seed):
     loop = random_loop(seed)
     found = design(loop, SMALLEST)
     assert found.proved
@@ -314,7 +314,7 @@ def test_ties_prefer_less_error_at_small_forces():
 
 
 @pytest.mark.parametrize("theta", [0, 1, 16])
-def test_a_scaled_wall_needs_what_is_known(theta):
+def test_scaled_walls_need_the_closed_form(theta):
     """g K behind theta samples needs g K (theta + 1/2) T, and a scaled filter scales its need exactly."""
     loop = wall(3000.0, theta, 1.3)
     for g in (0.1, 0.5):
@@ -461,7 +461,7 @@ def test_partial_delay_constraints_leave_a_bound(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_bound_says_what_it_does_not_know(monkeypatch):
+def test_a_bound_names_what_it_leaves_out(monkeypatch):
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
     loop, light = loop_of("n3"), loop_of("o01")
     T_max = msgspec.structs.replace(light, T_max=1.2 * light.T)
@@ -517,7 +517,7 @@ def test_matrix_routines_are_those_of_scipy(n):
         barrier._solve_positive(-H, b)
 
 
-def test_the_barrier_finds_what_a_cone_solver_finds():
+def test_the_barrier_reaches_a_cone_solvers_optimum():
     rng = np.random.default_rng(3)
     n, r, k = 6, 2, 5
     A, b, c = rng.normal(size=(9, n)), rng.normal(size=9), rng.normal(size=n) / 3
@@ -678,7 +678,7 @@ def test_a_filter_stands_behind_the_environment():
         ([], [], [[[0.5, 0.1], [0.1, 0.5]]], "expected g times the identity"),
     ],
 )
-def test_what_no_filter_can_be(poles, pairs, R, message):
+def test_impossible_filters_are_refused(poles, pairs, R, message):
     with pytest.raises(ValueError, match=message):
         ForceFilter(poles, pairs, R)
 
@@ -698,7 +698,7 @@ def brief(monkeypatch):
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
 
 
-def test_the_report_says_that_seconds_ended_it(tmp_path, capsys, monkeypatch):
+def test_the_report_says_that_seconds_ended_the_search(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
     options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", "1e-3"]

@@ -102,7 +102,7 @@ def test_named_ranges_are_proved_at_every_vertex():
 
 
 @pytest.mark.parametrize("taken", ["any-environment", "this-environment", "limiter", "", 7])
-def test_a_name_of_ours_is_refused(taken):
+def test_shipped_or_invalid_condition_names_are_refused(taken):
     own = type("Steal", (Plain,), {"name": taken})()
     for asked in (lambda: required_damping(PAIR, SOFT, own), lambda: prove(PAIR, SOFT, own)):
         with pytest.raises(ValueError, match="condition Steal: its name is"):
@@ -164,7 +164,7 @@ def test_facts_and_conditions_need_one_method_each():
     assert (Fact.__abstractmethods__, Condition.__abstractmethods__) == ({"enter"}, {"demand"})
 
 
-def test_an_own_fact_is_its_bound(repeats):
+def test_an_own_fact_matches_a_dense_sweep(repeats):
     """A dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) gives the same s, and no smaller s for other a."""
     own = repeats["RepeatedForces"]()
     found = required_damping(PAIR, SOFT, own)
@@ -197,7 +197,7 @@ def test_an_own_fact_is_proved_and_mapped(repeats):
     assert nearby.required_over_available > plain.required_over_available
 
 
-def test_limited_forces_are_not_covered_by_ones_own():
+def test_own_conditions_cover_no_limited_forces():
     assert lag(PAIR, prove(PAIR, SOFT, Plain())) is None
     assert lag(PAIR, prove(PAIR, SOFT, "any-environment")) == (0.0, 0.0)
 

@@ -63,7 +63,7 @@ def test_longest_period_scales_switching_and_multipliers():
     assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "any-environment", found.phi))).proved
 
 
-def test_so_it_does_while_forces_are_limited():
+def test_the_longest_period_scales_limited_forces():
     """The limiter's rho belongs to the controller, so no period changes it. The exact certificate agrees."""
     loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
     longer = change(loop, T_max=LONG)

@@ -398,7 +398,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     assert validated["worst"]["environment"] in validated["environments"]["names"]
 
 
-def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, capsys):
+def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
     """These gains have the least mismatch in the nominal environment and are certified there only."""
     stiff = ["--K", "7806,3137", "--B", "0.105,1.68"]
     assert audit_main(["--scenario", str(scenario_file), *stiff, "--json", "-"]) == 1

@@ -54,7 +54,7 @@ def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
 
 
 @pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
-def test_a_damper_of_nothing_is_zero(condition):
+def test_dampers_that_cost_stiffness_are_zero(condition):
     """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness, so B = 0 is best at a stiff wall."""
     wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
     found = design(asked((0,), wall, (0,), (0,), (0.5,)), condition)
@@ -315,7 +315,7 @@ def test_slopes_match_finite_differences(sampled, psi):
     np.testing.assert_allclose(at.room_slope(x), differenced, atol=1e-6)
 
 
-def test_what_would_take_minutes_is_refused_at_once():
+def test_designs_that_take_minutes_are_refused_early():
     names = tuple(f"c{i}" for i in range(49))
     springs = tuple(Spring((name, "ground"), 300.0) for name in names)
     many = Loop(T, *[(0,) * 49] * 3, (1.0,) * 49, Network(names, springs))

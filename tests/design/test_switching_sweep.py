@@ -136,7 +136,7 @@ def test_the_energy_bound_holds_for_worst_ages():
     assert min(spare) < 0.6  # One motion uses over two fifths of the damping, so the test is not idle.
 
 
-def test_what_is_refused():
+def test_unsafe_or_malformed_switching_is_refused():
     floating = switching_sweep(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
     assert (
         floating.ratio
@@ -153,7 +153,7 @@ def test_what_is_refused():
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
-def test_what_holds_is_proved_exactly(lo, hi):
+def test_certified_switching_is_proved_exactly(lo, hi):
     found = judged(loop_of(lo, hi), SOFT, SWITCHING)
     assert found.certified
     assert found.proof == "rational"
@@ -163,7 +163,7 @@ def test_what_holds_is_proved_exactly(lo, hi):
     assert part.requirement.certified
 
 
-def test_what_does_not_hold_has_no_exact_proof():
+def test_uncertified_switching_has_no_exact_proof():
     loop = loop_of((1, 1), (2, 2))
     found = judged(loop, STIFF, SWITCHING)
     assert not found.certified

@@ -277,7 +277,7 @@ def test_it_is_proved_stored_and_verified(loop, coupling):
         assert not verify(change(stored, certificate=forged)).proved
 
 
-def test_longer_periods_scale_it():
+def test_longer_periods_scale_wall_requirements():
     loop, longer = held(3000.0), change(held(3000.0), T_max=1.5e-3)
     found = required_damping(loop, COUPLING, "this-environment")
     assert required_damping(longer, COUPLING, "this-environment", found.multiplier).required[0] == pytest.approx(
@@ -285,7 +285,7 @@ def test_longer_periods_scale_it():
     )
 
 
-def test_what_is_not_covered_is_said():
+def test_uncovered_wall_loops_are_named():
     loop = held(3000.0)
     with pytest.raises(NotProved, match="cannot include the walls"):
         prove(loop, _InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")

@@ -181,7 +181,7 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
     assert part["reason"].startswith("proved at every vertex, but violated between them: 1.04")
 
 
-def test_fewer_samples_do_not_make_it_a_guarantee():
+def test_certify_searches_between_vertices():
     requirement = certify(EDGE, VERTICES_ONLY)["this-environment"]  # certify draws no samples
     assert not requirement.certified
     assert requirement.ratio == pytest.approx(1.0428, abs=1e-3)
@@ -189,7 +189,7 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
 
 
 @pytest.mark.slow
-def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
+def test_couplings_violated_between_vertices_are_stored_without_ranges(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
     assert store(RANGED, design, tmp_path / "c.json").proof == "rational"

@@ -91,7 +91,7 @@ def test_drawn_devices_are_within_their_bounds(engine):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("humans", [60, pytest.param(400, marks=pytest.mark.validate)])
-def test_hundreds_of_hands_pass_on_known_devices(tmp_path, humans):
+def test_no_hand_makes_known_devices_unstable(tmp_path, humans):
     """At 1.001 times the damping of known-device no hand makes a drawn device unstable; the worst one replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
