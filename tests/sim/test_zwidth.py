@@ -8,6 +8,7 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from driven import drive
 from worlds import force_map, loop_of
 
 from haptic_loop.cli import zwidth
@@ -25,11 +26,12 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import build, crowds, variants
 from haptic_loop.sim import zwidth as zwidth_map
 from haptic_loop.sim.engines import _discretised
-from haptic_loop.sim.limit_cycles import HeldDevices, Plan
+from haptic_loop.sim.limit_cycles import UNDECIDED, HeldDevices, Plan, Points, _press_forces
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import dominant_mode, exact_loops
 from haptic_loop.sim.trace import oscillation, slowest_seen
-from haptic_loop.sim.zwidth import CouplingSweep, _Grid, draw_map, make_grid
+from haptic_loop.sim.zwidth import CouplingSweep, Map, Mark, _Grid, draw_map, make_grid
+from haptic_loop.sim.zwidth_report import MapReport
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")
@@ -201,8 +203,15 @@ def test_the_grid_says_what_is_wrong_with_it():
     assert wide.B[-1] > 9
     assert wide.scale == "linear"
     assert make_grid(of(PAIR, (1, 1)), 8, None, None).scale == "log"
+    assert sweep.stiffness_scale == pytest.approx(DELTA / T)  # 2 delta/((theta + 1) T) with theta = 1
     with pytest.raises(InputError, match="--B-range begins at 0"):
         make_grid(of(PAIR, (1, 1)), 8, None, (0, 2))
+
+
+def test_edges_interpolate_along_their_axis():
+    K, ratio = np.array([1.0, 10.0, 1000.0]), np.array([0.1, 0.75, 1.75])  # 1 is a quarter of the way
+    assert zwidth_map._interpolated(K, ratio, 1, "linear") == pytest.approx(257.5)
+    assert zwidth_map._interpolated(K, ratio, 1, "log") == pytest.approx(10 * 10**0.5)
 
 
 # --- the population ------------------------------------------------------------------------------------------------
@@ -218,6 +227,7 @@ def test_the_population_is_decided_as_one_by_one(links):
     for index, some in crowds(sweep.population, 1, 3, range(30), links):
         modes = dominant_mode(exact_loops(variants(sweep.devices, some), F))
         np.testing.assert_allclose(growth[index], modes.growth, atol=1e-7)
+        np.testing.assert_array_equal([crowd.links(human) for human in index], some.links)
     assert (audible <= growth + 1e-9).all()
     assert (growth > 0).any()
     half = np.arange(30) < 15
@@ -236,6 +246,31 @@ def test_cells_without_unstable_leaders_test_everyone():
     worst, count = zwidth_map._population(crowd, [F], ~unstable)
     assert count == unstable.sum()
     assert worst == pytest.approx(growth.max())
+    calm = sweep.force_maps(np.array([10.0]), np.array([0.5]))[0][0]
+    for leading in (~unstable, np.full(40, True)):  # one unstable contact state is enough
+        assert zwidth_map._population(crowd, [calm, F], leading) == (worst, count)
+
+
+def test_marks_take_the_worst_contact_state():
+    loop = load("one-wall").replace(T=T, theta=(1,)).loop("I")
+    sweep = CouplingSweep(PAIR.device[:1], PAIR.population, loop)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, T, 0, 8, 1)
+    ((_, some),) = crowds(sweep.population, 1, 0, range(8), 1)
+    coupling = SpringDamper([1500.0], [0.4])
+    states = [exact_loops(variants(sweep.devices, some), state.F(coupling)) for state in loop.frozen()]
+    growth = [dominant_mode(state).growth for state in states]
+    assert (growth[0] < growth[1] - 1).any()
+    found = zwidth_map._growth(sweep, crowd, 1500.0, 0.4)
+    np.testing.assert_allclose(found, np.maximum(*growth), atol=1e-7)
+
+
+def test_random_hands_meet_the_latest_forces():
+    sweep = rigid(1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, T, 3, 4, 1, ((1e-4, 5e-4),))
+    F = sweep.force_maps(np.array([900.0]), np.array([0.4]))[0][0]
+    ((_, some),) = crowds(sweep.population, 1, 3, range(4), 1)
+    modes = dominant_mode(exact_loops(variants(sweep.devices, some), F, late=[5e-4]))
+    np.testing.assert_allclose(crowd.growth(F)[0], modes.growth, atol=1e-7)
 
 
 # --- the simulated points ------------------------------------------------------------------------------------------
@@ -327,6 +362,34 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
     data.ctrl[:] = 0.5 * force, 0.0
     mujoco.mj_step(model, data, 4 * 500)
     assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # half the friction does not move the device
+
+
+@pytest.mark.parametrize("between", [("tip", GROUND), (GROUND, "tip")])
+def test_hands_press_towards_the_wall(between):
+    """A tip that moves in the direction of the press meets the wall, and one that moves away does not."""
+    loop = loop_of(Network(("tip",), walls=(Wall(between, 900.0, 0.7, 1e-3),)), (0,), (0,), T)
+    ahead = 0.01 * zwidth_map._press_directions(loop)[0]
+    process = Process(loop.law(SpringDamper([2000.0], [0.5])), np.full(1, np.inf), np.zeros(1))
+    (force,) = drive(process, np.array([[[ahead, -ahead]]])).f[0]
+    assert force[0] * ahead > 0 == force[1]
+
+
+def test_hands_press_steadily_after_half_a_second():
+    scene, press = build(PAIR.device, PAIR.human), np.array([3.0, -3.0])
+    w = _press_forces(scene, T, press, 0, 800)
+    for force, column in zip(press, scene.pushed, strict=True):
+        np.testing.assert_allclose(w[[0, 250, 500, 799], column], [0, force / 2, force, force], atol=1e-12)
+    np.testing.assert_array_equal(_press_forces(scene, T, press, 300, 500), w[300:])
+
+
+def test_slow_rates_contradict_no_simulation():
+    """Within 0.2 1/s of zero a trace cannot tell growth from a limit cycle."""
+    growth, unknown = np.array([-0.3, -0.1, 0.1, 0.3]), np.zeros(4)
+    on, off = (Points(np.arange(4), np.full(4, seen), unknown, unknown, growth) for seen in (True, False))
+    assert on.differ.tolist() == [True, False, False, False]
+    assert on.verdicts == ["oscillates", UNDECIDED, UNDECIDED, "oscillates"]
+    assert off.differ.tolist() == [False, False, False, True]
+    assert off.verdicts == ["rests"] * 4
 
 
 def points(sweep, K, B, **changes):
@@ -427,6 +490,31 @@ def test_the_map_holds_together(audit):
         assert error["figure_relative"] < 3e-8
         # Interpolation is exact for this straight edge; the search for the true edge stops at 1e-7.
         assert error["edge_relative_in_K"] < 1e-6
+
+
+def test_a_failing_mark_or_cell_is_reported():
+    """A map holds if all its marks are certified, and no hand and no simulation contradicts a linear loop."""
+    sweep, grid = rigid(0), _Grid(np.array([1.0, 2.0]), np.array([0.0, 1.0]), "linear")
+    good, bad = (
+        Mark(K, 0.0, {name: sweep.requirement(name, K, 0.0) for name in sweep.conditions}, -1.0, 0, {})
+        for K in (100.0, 5000.0)
+    )
+
+    def report(growth, *marks, sweep=sweep, points=None):
+        ratio = dict.fromkeys(sweep.conditions, np.array([0.1, 0.2, 0.3, np.inf]))
+        growths, points = np.array([-1.0, growth, -1.0, -1.0]), points or Points.joined([])
+        drawn = Map(grid, ratio, growths, np.zeros(4), points, {}, False)
+        return MapReport.of(PAIR, sweep, drawn, Plan(0, 3.0, 2.0, 1e-5), None, marks, 7, 0)
+
+    assert report(-1.0, good).holds
+    assert not report(-1.0, good, bad).holds
+    told = report(1e-3, good)
+    assert not told.holds
+    assert [(r.certified_cells, r.contradicted_cells) for r in told.ratios.values()] == [(3, 1)] * 2
+    assert told.population.stable_cells == 3
+    moving = Points(np.array([0]), np.array([True]), *np.array([[1e-3], [40.0], [-1.0]]))
+    assert not report(-1.0, good, points=moving).holds
+    assert report(-1.0, good, points=moving, sweep=with_devices(sweep, friction=0.2)).holds
 
 
 def test_the_files_of_a_map(audit):
