@@ -72,7 +72,7 @@ class RealTimeEmulator:
         self._partial = b""
 
     def now(self) -> float:
-        """The device's clock [us]."""
+        """Return the device's clock [us]."""
         return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
     def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:

@@ -161,7 +161,7 @@ class _Slow:
 
     network: int
     decided: int  # traces whose rate is larger than its error
-    contradicted: int  # traces of these that contradict the eigenvalues
+    contradicted: int  # decided traces that contradict the eigenvalues
     worst: float  # |rate - eigenvalue's| over the error that the trace states
     holds: bool
 

@@ -183,7 +183,7 @@ def test_channels_without_latency_have_no_row():
 
 
 @pytest.mark.parametrize(("latency", "longest"), [(((TAU, TAU), (0.0, TAU)), 1.5e-3), (((0.0, TAU), (0.0, 0.0)), None)])
-def test_it_is_proved_stored_and_verified(latency, longest):
+def test_latency_is_proved_stored_and_verified(latency, longest):
     loop = change(PAIR, latency=latency, T_max=longest)
     stored = Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment"))
     again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)

@@ -87,7 +87,7 @@ def test_the_least_factor_matches_a_convex_solver():
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
     solve(problem)
-    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # peak 0.5 % off its sample: second order
+    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # a peak 0.5 % from a sample costs the square of that
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],

@@ -255,7 +255,7 @@ def test_every_step_of_the_proof(loop):
     ("loop", "coupling"),
     [(held(3000.0), COUPLING), (PAIR, BOTH), pytest.param(DAMPED, BOTH, marks=pytest.mark.validate)],
 )
-def test_it_is_proved_stored_and_verified(loop, coupling):
+def test_walls_are_proved_stored_and_verified(loop, coupling):
     stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
     assert set(stored.certificate.multipliers) == {"a", "a + c", "d", "m"}
     assert stored.certificate.facts == ("walls",)
