@@ -119,7 +119,7 @@ def test_speed_and_error_side_by_side(benchmark, scene):
     assert abs(errors[f"RK4 x {substeps}"]) <= 1e-3
 
 
-def test_what_a_force_evaluation_is_made_of(benchmark):
+def test_the_cost_of_a_force_evaluation(benchmark):
     """Without its position stage, but after mj_tendon, a force evaluation is cheaper and gives equal accelerations."""
     simulation = assemble(load(), PUBLISHED["I"])
     model, calls = simulation.scene.model, 20_000
@@ -185,7 +185,7 @@ def test_many_hands(benchmark):
     print()
 
 
-def test_how_long_a_period_may_be(benchmark):
+def test_long_periods_stay_exact(benchmark):
     """One step of 0.1 s, in which the fastest mode turns 497 rad, is within 1e-9 of the matrix exponential."""
     simulation = assemble(SCENES["transmission of 1.45e6 N/m"], PUBLISHED["I"])
     T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1

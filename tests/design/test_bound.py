@@ -125,7 +125,7 @@ def test_the_integral_errs_by_less_than_its_bound(name):
     assert error < 1e-8 * abs(total)
 
 
-def test_what_is_negative_only_between_samples_is_found():
+def test_negative_values_between_samples_are_found():
     sums = np.zeros((9, 1, 1))
     sums[0], sums[8] = 0.999, 1.0  # D = .999 + cos 8 w: -.001 at odd multiples of pi/8
     grid = np.linspace(0.1, 0.3, 4)

@@ -266,7 +266,7 @@ def test_a_bad_file_is_one_line(tmp_path, old, new, names):
 @pytest.mark.parametrize(
     ("content", "said"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
 )
-def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
+def test_other_files_are_refused_in_one_line(tmp_path, content, said):
     path = tmp_path / "coupling.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"coupling.json: .*{said}"):
@@ -532,7 +532,7 @@ def test_a_loop_that_no_file_holds_names_its_field(tmp_path):
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 @pytest.mark.parametrize("theta", [(0, 0), (1, 2)])
 @pytest.mark.parametrize(("room", "certified"), [(0.0, False), (1e-15, False), (-1e-15, False), (1e-6, True)])
-def test_all_the_damping_is_never_enough(condition, theta, room, certified):
+def test_no_condition_certifies_at_equality(condition, theta, room, certified):
     """No condition certifies at equality, where rounding alone would decide."""
     loop = msgspec.structs.replace(PAIR, theta=theta, lam=theta)
     need = required_damping(loop, SOFT, condition).required

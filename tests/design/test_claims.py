@@ -473,7 +473,7 @@ class Resonant(Environment):
         return Lti(A, B, C, D, T) @ step
 
 
-def test_an_own_active_object_gets_no_guarantee():
+def test_an_active_environment_gets_no_guarantee():
     """A narrow active resonance is not certified for any environment; a passive one as narrow is."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):

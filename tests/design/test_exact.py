@@ -120,7 +120,7 @@ def test_definiteness_below_rounding_is_not_proved():
 
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
-def test_what_rounding_makes_definite_is_not_proved(monkeypatch, bits):
+def test_matrices_that_rounding_makes_definite_are_not_proved(monkeypatch, bits):
     """J + u M (J has ones, |M| <= 1/2) is not definite, but rounded to multiples of u it is J + u I, which is."""
     monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
@@ -296,7 +296,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
             assert (found is None) == proved
 
 
-def test_what_floating_point_refuses_exact_arithmetic_refuses_too():
+def test_floating_point_refuses_no_definite_matrix():
     """M = e P with ill-conditioned P and e as small as rounding: M is definite, though often not as computed."""
     rng, indefinite = np.random.default_rng(7), 0
     for _ in range(60):

@@ -393,7 +393,7 @@ def test_bad_input_is_one_line(place, options, message):
         main([option.format(gains=place / "gains.json", place=place) for option in options])
 
 
-def test_one_channel(tmp_path):
+def test_one_device_has_two_springs_in_series(tmp_path):
     """The process of one device has the static stiffness of the coupling and the spring to ground in series."""
     wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
     save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")

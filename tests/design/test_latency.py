@@ -121,7 +121,7 @@ def by_a_dense_program(loop, coupling, latencies):
     ("coupling", "range", "needs"),
     [(SOFT, (0.0, 0.4 * T), 0.691186), pytest.param(STIFF, (0.1 * T, 0.6 * T), 1.324571, marks=pytest.mark.validate)],
 )
-def test_a_pair_needs_what_a_dense_program_finds(coupling, range, needs):
+def test_pair_requirements_match_a_dense_program(coupling, range, needs):
     loop = change(PAIR, latency=(range, range))
     found = required_damping(loop, coupling, "this-environment")
     assert found.required[0] == pytest.approx(needs, rel=2e-6)

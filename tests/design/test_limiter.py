@@ -251,7 +251,7 @@ def test_changed_certificates_are_refused(stored, fields, reason):
     assert reason in str(verdict.reason)
 
 
-def test_a_storage_matrix_of_something_else_proves_nothing(stored):
+def test_a_changed_storage_matrix_proves_nothing(stored):
     P = [list(row) for row in stored.certificate.matrices["P"]]
     P[0][0] = "1/1000"
     assert "limiter: " in str(verify(tampered(stored, matrices={"P": tuple(map(tuple, P))})).reason)

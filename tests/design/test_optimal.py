@@ -174,7 +174,7 @@ def test_parallel_walls_have_one_walls_bound(channels):
     assert several.rms > 0.1
 
 
-def test_there_is_no_bound_where_nothing_is_lost():
+def test_the_bound_of_safe_environments_is_zero():
     """The environment of this loop is safe without a coupling, so its mismatch and its bound are zero."""
     assert bound(loop_of("o02"), knots=8).rms == 0
 

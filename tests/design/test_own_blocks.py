@@ -69,7 +69,7 @@ def test_proofs_with_empty_multipliers_are_verified():
     assert verify(proved, PerWall()).proved
 
 
-def test_what_exact_arithmetic_contradicts_is_not_certified():
+def test_conditions_that_exact_arithmetic_contradicts_are_not_certified():
     assert required_damping(PAIR, STIFF, Contradicting()).certified
     found = requirements_of(PAIR, STIFF, own=Contradicting())["contradicting"]
     assert not found.certified
@@ -77,7 +77,7 @@ def test_what_exact_arithmetic_contradicts_is_not_certified():
     assert found.required == (np.inf, np.inf)
 
 
-def test_check_does_not_replace_what_is_on_file(tmp_path, capsys):
+def test_check_does_not_replace_the_proof_on_file(tmp_path, capsys):
     stored = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, PerWall()))
     assert stored.certificate
     edited = change(stored, loop=change(PAIR, delta=(5.0, 5.0)), certificate=change(stored.certificate, seal="0" * 64))

@@ -72,7 +72,7 @@ def test_the_longest_period_scales_limited_forces():
     assert prove_limiter(longer, SOFT, c=c).required == uneven.required
 
 
-def test_the_any_environment_line_by_hand():
+def test_any_environment_follows_its_formula():
     """He[(1 - 1/z) V] >= T_max |1 - z^-n|^2 / (4 delta) holds for one spring at theta = 1, so n = 2."""
     V, n = SpringDamper([500.0], [0.0]).compliance(T), 2
     w = np.linspace(0.01, np.pi, 4000)

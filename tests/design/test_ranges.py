@@ -90,7 +90,7 @@ def test_vertices_are_range_ends_and_absences():
     assert vertices[-1].name == "vertex 20 (contact 1-mass absent; mass-contact 2 840 N/m, 1 N s/m; mass 2 kg)"
 
 
-def test_a_contact_that_is_made():
+def test_an_added_spring_may_be_absent():
     """The environment has no spring to the ground, the vertices have one. Without it, one would be the environment."""
     ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
     nominal, *vertices = members(FIGURE_4, ranges)
@@ -260,7 +260,7 @@ def test_the_sweep_agrees_with_the_condition_by_hand(robust):
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
 
 
-def test_an_environment_that_no_device_feels_asks_nothing():
+def test_an_absent_environment_needs_no_damping():
     """At the vertex where both springs are absent, the forces are zero and no damping is required."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
     loop = change(LOOP, ranges=both)
@@ -301,7 +301,7 @@ def test_a_broken_vertex_proof_is_rejected(stored, tmp_path):
     assert "expected P, P1, P2, P3" in verdict.reason
 
 
-def test_wider_ranges_are_another_claim(stored):
+def test_wider_ranges_need_another_certificate(stored):
     wider = change(LOOP, ranges=Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 850.0), absent=True),)))
     assert "digest differs" in verify(change(stored, loop=wider)).reason
     smuggled = change(stored, loop=LOOP.at(FIGURE_4))
@@ -316,7 +316,7 @@ def test_nominal_couplings_are_not_proved_for_ranges(nominal_only):
     assert part["vertices_certified"] == 2
 
 
-def test_nothing_is_promised_where_a_sample_inside_violates(robust):
+def test_violating_samples_leave_ranges_unproved(robust):
     """Every vertex is proved, but one sample inside that violates the condition leaves the ranges unproved."""
     check = check_ranges(LOOP, robust.coupling, samples=6)
     assert check.proved
@@ -432,7 +432,7 @@ def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp
         (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no ranges"),
     ],
 )
-def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message):
+def test_missing_vertices_are_refused(scenario_file, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         run_main(["--scenario", str(scenario_file), "--out", str(tmp_path), *options])
 

@@ -340,7 +340,7 @@ def test_many_device_searches_match_exhaustive_starts(monkeypatch):
     assert all(float(f"{gain:.5g}") == gain for gain in (*made.coupling.K, *made.coupling.B))
 
 
-def test_limits_help_no_loop_that_fails_without() -> None:
+def test_no_limiter_search_follows_a_failed_linear_one() -> None:
     """Where no coupling is certified for free forces, no search is spent on limited ones."""
     loop, limited = asked((0,), WALL, (1,), (1,), (1e-3,)), []
     with pytest.MonkeyPatch.context() as patch:

@@ -169,7 +169,7 @@ def test_a_proof_goes_with_its_range(stored):
     assert "facts are ['switching'], expected []" in verify(Stored.of(PAIR, SOFT, smuggled)).reason
 
 
-def test_a_multiplier_below_zero_lends_no_damping():
+def test_negative_multipliers_are_refused():
     """A channel of constant delay has no second row with alpha, so a negative alpha would add damping for free."""
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
     found = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)

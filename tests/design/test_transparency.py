@@ -77,7 +77,7 @@ def test_integral_of_nothing():
     assert integral(np.zeros_like, np.linspace(0, 1, 5)) == 0
 
 
-def test_integral_of_what_is_only_rounding():
+def test_integrals_of_rounding_noise_end():
     """Halving intervals gains nothing in noise: the work stays bounded, and the integral is near the mean."""
     noise, asked = np.random.default_rng(1), []
 
@@ -98,7 +98,7 @@ def test_the_environment_itself_has_no_mismatch():
     assert transparency(same, E, (0, 0)).rms_mismatch < 1e-9
 
 
-def test_what_needs_no_force_makes_tau_infinite():
+def test_a_singular_static_stiffness_makes_tau_infinite():
     """E(1) of Figure 4 has rank one, so (25) divides by zero."""
     assert transparency(force_map(E, PUBLISHED["I"], THETA, (0, 0)), E, THETA).tau == np.inf
 
