@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from haptic_loop.cli import options, render
+from haptic_loop.cli.painter import skip_docstrings
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
@@ -118,6 +119,7 @@ def _beside(couplings: Sequence[Alternative], own: Condition | None) -> render.T
 
 
 def _side_by_side(couplings: Sequence[Alternative], path: Path, names: tuple[str, ...]) -> Path:
+    skip_docstrings()
     from haptic_loop.sim.plots import Panel, plot_side_by_side
 
     panels = [

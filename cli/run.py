@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
+from haptic_loop.cli.painter import Painter
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
@@ -22,6 +23,7 @@ from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.engines import INTEGRATORS
 from haptic_loop.sim.run import ENGINES, EngineSettings
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
+from haptic_loop.sim.shown import Contacts, Onset, Signals
 
 if TYPE_CHECKING:
     from haptic_loop.controller.budget import BudgetFigures
@@ -42,11 +44,11 @@ def main(argv: list[str]) -> int:
         raise InputError(
             "--error chooses MuJoCo's integrator and substeps: leave out --engine exact, --integrator and --substeps"
         )
-    scenario, out = _scenario(args), options.out_folder(args, "run")
+    scenario, out, painter = _scenario(args), options.out_folder(args, "run"), Painter(not args.no_plot)
     if is_world(scenario):
         from haptic_loop.cli import world
 
-        return world.run(args, scenario, out)
+        return world.run(args, scenario, out, painter)
     environment, simulated = _environment(args, scenario)
     chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
@@ -65,7 +67,7 @@ def main(argv: list[str]) -> int:
         report = replace(report, paper=_paper(args, simulated, report))
     render.show(args, _tables(scenario, report), report.remarks, _details(report))
     with render.progress("storing the trace and drawing the picture"):
-        files = _save(args, out, run, report)
+        files = _save(args, out, run, report, painter)
     render.publish(args, report, (), folder=out, files=files)
     return options.exit_code(True, run.trace.interrupted)
 
@@ -159,15 +161,13 @@ def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | 
         return robustness_nearby(loop, chosen.coupling, named(chosen.asked))
 
 
-def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
+def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport, painter: Painter) -> list[Path]:
     from haptic_loop.sim.view.drawn_object import scene_xml
 
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", scene_xml(run.simulation)))
     if render.is_drawn(args, out / "figure.png", bool(result.t.size)):
-        from haptic_loop.sim.plots import Contacts, Onset, draw_run, save
-
         apart = report.ideal_force.error_percent
         ideal = None if apart is None else (report.ideal_force.ideal, apart)
         grows = stability.exact_verdict == "unstable" and run.exact is not None and not report.switched
@@ -176,7 +176,8 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
         around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
         title = _title(run.simulation.scenario.title(args.case), report)
         hertz = stability.exact_frequency_hz
-        files.append(save(draw_run(result, title, hertz, ideal, onset, around), out / "figure.png"))
+        shown = Signals.of(result), title, hertz, ideal, onset, around
+        files.append(painter.draw(out / "figure.png", "draw_run", *shown))
     return files
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts_of
+from haptic_loop.cli.painter import Painter
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.conditions import this_environment
@@ -48,6 +49,7 @@ def main(argv: list[str]) -> int:
         from haptic_loop.cli import world
 
         return world.validate(args, scenario, out)
+    painter = Painter(not args.no_plot)
     chosen = chosen_by(args, scenario)
     assessment = assessment_of(args, scenario, chosen)
     question = _question(args, scenario, chosen, assessment)
@@ -56,7 +58,7 @@ def main(argv: list[str]) -> int:
     if args.adversary and not (findings.interrupted or findings.lost):
         searched = _searched(args, question, chosen, assessment)
     report = _reported(args, chosen, assessment, question, findings, wall, searched)
-    files = _save(args, out, question, findings, searched.worst, chosen.kind)
+    files = _save(args, out, question, findings, searched.worst, chosen.kind, painter)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     lines = [
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
@@ -190,7 +192,13 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
 
 
 def _save(
-    args: argparse.Namespace, out: Path, question: Validation, findings: Findings, worst: Worst | None, kind: str
+    args: argparse.Namespace,
+    out: Path,
+    question: Validation,
+    findings: Findings,
+    worst: Worst | None,
+    kind: str,
+    painter: Painter,
 ) -> list[Path]:
     """Save humans for `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
@@ -208,12 +216,11 @@ def _save(
         remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
         files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons, worst.mechanics))
     if render.is_drawn(args, out / "population.png", bool(findings.index.size)):
-        from haptic_loop.sim.plots import plot_population
-
         coupling = "no coupling" if args.case == "none" else f"{kind} coupling"
         what = scenario.title(args.case).removesuffix(", no coupling")
         title = f"{what}, {coupling}: {findings.index.size} random humans"
-        files.append(plot_population(findings.mass, findings.damping, findings.exact, out / "population.png", title))
+        shown = findings.mass, findings.damping, findings.exact, title
+        files.append(painter.draw(out / "population.png", "draw_population", *shown))
     return files
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from haptic_loop.cli import options, render
+from haptic_loop.cli.painter import Painter
 from haptic_loop.design.api import proved, store
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.designs import design_by_kind
@@ -22,6 +23,7 @@ from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import EngineSettings
 from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.shown import Contacts, Signals
 from haptic_loop.sim.world import (
     LOSSLESS,
     RANDOM,
@@ -141,7 +143,7 @@ _WHOLE = "the report has no further lines"
 _WRITTEN = ("scene.xml", "world.xml")  # the model of the devices, and that of the scene with its springs
 
 
-def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
+def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painter) -> int:
     """Run a scenario with a world and report it. Return 0 if the run was completed, 130 if interrupted."""
     for name in ("paper", "cross_check", "error", "vertex"):
         if getattr(args, name, None):
@@ -178,12 +180,9 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
     if render.is_drawn(args, out / "figure.png", trace.t.size > 1):
-        from haptic_loop.sim.plots import Contacts, draw_run, save
-
-        around = Contacts(scenario.environment.contacts)
-        files.append(
-            save(draw_run(labelled, f"{scenario.name}: a MuJoCo world", 1.0, around=around), out / "figure.png")
-        )
+        title, around = f"{scenario.name}: a MuJoCo world", Contacts(scenario.environment.contacts)
+        shown = Signals.of(labelled), title, 1.0, None, None, around
+        files.append(painter.draw(out / "figure.png", "draw_run", *shown))
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
     _publish(args, report, title, _run_rows(report, figures, scenario), out, files)
     return options.exit_code(True, trace.interrupted)

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.cli import options, render
+from haptic_loop.cli.painter import skip_docstrings
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.designs import name_and_own
@@ -67,6 +68,7 @@ def main(argv: list[str]) -> int:
     report = MapReport.of(scenario, sweep, drawn, plan, fixed, points, args.humans, args.seed)
     files = [save_csv(drawn, out / "map.csv")]
     if render.is_drawn(args, out / "zwidth.png"):
+        skip_docstrings()
         from haptic_loop.sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))

@@ -32,6 +32,8 @@ MAKING = (
 )
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
+#: titles of two conditions in pictures; every other condition has its name as its title
+TITLES = {"this-environment": HERE, "any-environment": ANY}
 #: what every certificate assumes and does not cover, in words
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.result import GUARD, suffices
+from haptic_loop.design.result import GUARD, TITLES, suffices
 from haptic_loop.sim import plots
 from haptic_loop.sim.limit_cycles import UNDECIDED
 from haptic_loop.sim.stability import MARGINAL
@@ -85,7 +85,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
             axes.contour(drawn.grid.B, drawn.grid.K, height, [1 - GUARD], **drawing)
         side = "inside this edge" if about_environment else "below this edge"
         where = side if safe and unsafe else "everywhere here" if safe else "nowhere here"
-        label = f"{plots.TITLES.get(name, name)}: certified {where}"
+        label = f"{TITLES.get(name, name)}: certified {where}"
         entries.append(Line2D([], [], label=label, **style))
     return entries
 

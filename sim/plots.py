@@ -1,14 +1,15 @@
 """Pictures that commands write, in one style: readable in black and white and by the colour-blind.
 
-A plot function writes one picture and returns its path; `draw_run` returns its figure.
+A function plot_.. writes one picture and returns its path; a function draw_.. returns its figure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,36 +19,20 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
-from haptic_loop.controller.lti import Array
 from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
-from haptic_loop.design.result import ANY
+from haptic_loop.sim.shown import Contacts, Onset, Run
+
+if TYPE_CHECKING:  # A second process (cli.painter) draws the picture of a run, which needs none of these modules.
+    from haptic_loop.controller.lti import Array
 
 Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison; importing them would be circular
-
-
-class Run(Protocol):
-    """The part of a sim.trace.Trace that a picture shows; N samples, m channels."""
-
-    @property
-    def t(self) -> Array: ...  # (N,) [s]
-    @property
-    def x(self) -> Array: ...  # (N, m) [m]
-    @property
-    def f(self) -> Array: ...  # (N, m) [N]
-    @property
-    def x_handle(self) -> Array: ...  # (N, m) [m]
-    @property
-    def names(self) -> tuple[str, ...]: ...  # (m,) names of the channels; () if they are only numbered
 
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
 
-#: titles of two conditions; every other condition has its name as its title
-TITLES = {"this-environment": "this environment", "any-environment": ANY}
 #: Okabe and Ito's palette, with a line style for each colour
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
@@ -147,17 +132,25 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     kind = Path(path).suffix.lower()
     if kind not in _FORMATS:
         raise InputError(f"picture {path}: the suffix is {kind!r}, allowed are {', '.join(_FORMATS)}")
+    if kind == ".png":
+        return write(path, png(figure, dpi))
     _literal(figure)
     relabel(figure)
-    if kind != ".png":
-        figure.set_layout_engine("constrained")
-        _fit_paper(figure)
-    if kind == ".png":
-        figure.set_dpi(dpi)
-        picture = FigureCanvasAgg(figure)  # savefig would draw a figure with a layout twice
-        fast = {"compress_level": 3}  # two thirds of the default's time, and a file that is 6 % larger
-        return write(path, lambda file: picture.print_png(file, pil_kwargs=fast))
+    figure.set_layout_engine("constrained")
+    _fit_paper(figure)
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
+
+
+def png(figure: Figure, dpi: int = 130) -> bytes:
+    """Return the figure as the content of a PNG file; only tick labels are parsed as formulas."""
+    _literal(figure)
+    relabel(figure)
+    figure.set_dpi(dpi)
+    content = BytesIO()
+    # savefig would draw a figure with a layout twice. Compression 3 takes two thirds of the default's time, and gives a
+    # file that is 6 % larger.
+    FigureCanvasAgg(figure).print_png(content, pil_kwargs={"compress_level": 3})
+    return content.getvalue()
 
 
 _PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
@@ -201,27 +194,6 @@ def _plain_numbers(axes: Any) -> None:
 # Runs, as in the paper's Figures 5 and 6.
 
 _SAME = 1e-6  # [%] a smaller force error is rounding: the commanded force equals that of the object itself
-
-
-@dataclass(frozen=True, eq=False)
-class Contacts:
-    """The contacts in a picture: names, places of walls, and the ticks at which a wall is touched."""
-
-    names: Sequence[str] = ()  # (m,) of the channels; empty for "device 1", ..
-    walls: Sequence[tuple[int, float, str]] = ()  # channel (from 0), position [m] and name of each wall on ground
-    touching: NDArray[np.bool_] | None = None  # (N,) whether any wall is touched
-
-    def name(self, i: int) -> str:
-        return self.names[i] if self.names else f"device {i + 1}"
-
-
-@dataclass(frozen=True)
-class Onset:
-    """The onset of an oscillation: its predicted growth, and the time up to which the run is credible."""
-
-    growth: float | None  # [1/s] predicted by the eigenvalues; None where nothing grows
-    steady: int  # ticks before the first clipped one
-    until: float | None = None  # [s] at which the motion leaves the devices' credible limits; None if it never does
 
 
 def draw_run(
@@ -542,8 +514,8 @@ def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
     return save(figure, path)
 
 
-def plot_population(mass: Array, damping: Array, growth: Array, path: Path, title: str) -> Path:
-    """Plot growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,).
+def draw_population(mass: Array, damping: Array, growth: Array, title: str) -> Figure:
+    """Draw growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,).
 
     Where a loop has several humans, mass and damping are geometric means over them.
     """
@@ -560,7 +532,7 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
     axes[0, 0].set_ylabel("growth rate [1/s]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 2)
-    return save(figure, path)
+    return figure
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -600,6 +572,8 @@ def plot_singular_values(report: Comparison, path: Path) -> Path:
 
 def plot_required_damping(report: Comparison, path: Path) -> Path:
     """Plot the damping that each condition requires at each frequency, the available one, and where conditions bind."""
+    from haptic_loop.design.result import ANY, TITLES
+
     title = "required damping over frequency; o: where it binds, ^: above the picture"
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))

@@ -33,7 +33,7 @@ HOMES = {
     "cvxpy": {"design/lmi.py"},  # the paper's lemmas as cvxpy expressions
     "clarabel": {"design/cone.py"},
     "serial": {"hw/transport.py"},
-    "matplotlib": {"sim/map_plot.py", "sim/plots.py", "cli/render.py"},  # cli/render.py makes its import faster
+    "matplotlib": {"sim/map_plot.py", "sim/plots.py", "cli/painter.py"},  # cli/painter.py makes its import faster
     "PIL": {"sim/view/"},
 }
 

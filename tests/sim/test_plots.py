@@ -9,7 +9,9 @@ from matplotlib.text import Text
 
 from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import InputError
+from haptic_loop.design.result import ANY
 from haptic_loop.sim import map_plot, plots
+from haptic_loop.sim.shown import Contacts, Onset
 from haptic_loop.sim.trace import Trace
 
 
@@ -96,7 +98,7 @@ def test_names_walls_and_curves_that_coincide(drawn):
     wave = np.sin(t / 300)
     f = np.stack([wave, wave, 2 * wave], axis=1)
     touching = wave > 0.5
-    around = plots.Contacts(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
+    around = Contacts(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
     figure = plots.draw_run(trace(f), title="t", frequency_hz=80.0, around=around)
     displacement, force = figure.axes
     assert legend(figure) == [
@@ -123,7 +125,7 @@ def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
     middle, sizes = plots._amplitudes(result, 84.0, 5000)
     np.testing.assert_allclose(sizes[:, 0], 1e-6 * np.exp(1.4 * middle), rtol=0.02)
     assert middle[-1] < 5.0  # the amplitudes end before the first clipped tick
-    onset = plots.Onset(1.4, 5000, 4.0)
+    onset = Onset(1.4, 5000, 4.0)
     figure = plots.draw_run(result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
     assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
@@ -150,7 +152,7 @@ def test_wrong_verdicts_are_crossed(drawn):
 
 def test_every_human_is_a_point(drawn):
     mass, damping, growth = np.array([0.1, 1.0, 2.0]), np.array([3.0, 2.0, 1.0]), np.array([-1.0, 0.0, 2.0])
-    figure = drawn(plots.plot_population, mass, damping, growth, title="t")
+    figure = plots.draw_population(mass, damping, growth, "t")
     assert legend(figure) == ["stable: 2", "unstable: 1"]
     stable, unstable = (part.get_offsets().tolist() for part in figure.axes[1].collections)
     assert stable == [[3.0, -1.0], [2.0, 0.0]]
@@ -163,7 +165,7 @@ HZ = np.array([1.0, 10.0, 100.0])
 def coupling(name, ratio, at, delayed):
     demand = np.array([0.1, ratio / 2, ratio])
     part = SimpleNamespace(ratio=ratio, demand=demand, requirement=SimpleNamespace(frequency_hz=at, guarantee="here"))
-    met = SimpleNamespace(guarantee="with a multiplier" if delayed else plots.TITLES["any-environment"])
+    met = SimpleNamespace(guarantee="with a multiplier" if delayed else ANY)
     none = SimpleNamespace(ratio=np.inf, demand=None, requirement=met)
     felt = SimpleNamespace(
         stiffness=np.array([[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]]), damping=np.array([[0.1, 2.0]] * 3)
@@ -269,7 +271,7 @@ def test_environment_maps_mark_their_design_point(drawn):
 def test_every_unit_in_a_picture_becomes_radians():
     """Tick labels have no unit, so they are not rewritten."""
     f = np.sin(np.arange(2000) / 20)[:, None] * np.exp(np.arange(2000) / 500)[:, None]
-    figure = plots.draw_run(trace(f), "2 mm", 8.0, ideal=(f, 15.0), onset=plots.Onset(2.0, 1500))
+    figure = plots.draw_run(trace(f), "2 mm", 8.0, ideal=(f, 15.0), onset=Onset(2.0, 1500))
     figure.axes[0].annotate("1 N", (0, 0))
     ticks = [len(part.majorTicks) for axis in figure.axes for part in (axis.xaxis, axis.yaxis)]
     plots.relabel(figure, "rad")

@@ -1,0 +1,63 @@
+"""A second process draws the same picture, and this process draws where there is no second one."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from haptic_loop.cli.painter import Painter
+from haptic_loop.controller.units import speak, spoken
+from haptic_loop.sim import plots
+from haptic_loop.sim.shown import Signals
+
+T = np.arange(300) * 1e-3
+WAVE = np.sin(30 * T)[:, None]
+SHOWN = Signals(T, 1e-3 * WAVE, WAVE, 1e-3 * WAVE, ("knob",)), "a turn", 5.0
+
+
+@pytest.fixture
+def in_radians():
+    before = spoken()
+    speak("rad")
+    yield
+    speak(before)
+
+
+PROGRAM = """
+import pickle, sys
+from pathlib import Path
+from haptic_loop.controller.units import speak
+from haptic_loop.cli.painter import Painter
+
+speak("rad")
+painter = Painter()
+painter.draw(Path(sys.argv[1]), "draw_run", *pickle.load(sys.stdin.buffer))
+assert "matplotlib" not in sys.modules
+"""
+
+
+@pytest.mark.usefixtures("in_radians")
+def test_the_second_process_draws_the_same(tmp_path):
+    path = tmp_path / "a.png"
+    subprocess.run([sys.executable, "-c", PROGRAM, path], input=pickle.dumps(SHOWN), check=True, timeout=120)
+    assert path.read_bytes() == plots.png(plots.draw_run(*SHOWN))
+    speak("m")
+    assert path.read_bytes() != plots.png(plots.draw_run(*SHOWN))
+
+
+@pytest.mark.parametrize("program", ["/bin/false", "/nowhere/python", ""])
+def test_without_a_second_process_this_one_draws(program, monkeypatch, tmp_path):
+    with monkeypatch.context() as patch:
+        patch.delitem(sys.modules, "matplotlib")
+        patch.setattr(sys, "executable", program)
+        painter = Painter()
+    path = painter.draw(tmp_path / "a.png", "draw_run", *SHOWN)
+    assert path.read_bytes() == plots.png(plots.draw_run(*SHOWN))
+
+
+def test_an_unwanted_painter_starts_no_process(monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setattr(subprocess, "Popen", None)
+    Painter(wanted=False)
