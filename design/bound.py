@@ -38,7 +38,7 @@ from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.controller.passivity import sizes_around
 from haptic_loop.design import budgets
 from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
-from haptic_loop.design.conditions import even_damping
+from haptic_loop.design.conditions import even_level
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.files import off_table
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
@@ -91,8 +91,10 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     T_max are replaced by even periods with less damping, as in the condition.
     """
     started = time.perf_counter()
-    even = tuple(even_damping(loop).tolist())
-    loop = msgspec.structs.replace(loop, delta=even, T_max=None)
+    level = even_level(loop)
+    delta = tuple(np.diag(level).tolist())
+    levels = loop.levels and tuple(tuple(map(tuple, level[own, own].tolist())) for own in loop.devices)
+    loop = msgspec.structs.replace(loop, delta=delta, levels=levels, T_max=None)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     sampled, charged = (float(np.sqrt(max(square - _QUADRATURE, 0.0))) for square in dual.best())
     proved = charged > 0 or sampled == 0  # A bound of zero needs no proof.
@@ -145,14 +147,24 @@ class _Dual:
 
     @property
     def start(self) -> Array:
-        """The point h = 0 and C_0 = I, where D = I, in units of 1/delta. It is also the vector c with c'x = tr C_0."""
+        """The point h = 0 and C_0 = I, where D = I, in units of 1/delta."""
+        return self._weights(np.eye(self.loop.channels))
+
+    @property
+    def cost(self) -> Array:
+        """The vector c with c'x = tr C_0 Delta_D."""
+        root = np.sqrt(self.loop.delta)
+        return self._weights(self.loop.Delta() / np.outer(root, root))
+
+    def _weights(self, M: Array) -> Array:
+        """Return the vector c with c'x = tr C_0 M for a symmetric M (m, m)."""
         m = self.loop.channels
-        unit = [float(i == j) for i, j in _triangle(m)]
-        return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
+        each = [M[i, j] * (1 if i == j else 2) for i, j in _triangle(m)]
+        return np.concatenate([np.zeros(m * m * len(self.target)), each, np.zeros(len(self.forbidden))])
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c with -2 <H, Lambda E> - <H, H/w> = |b|^2 - |A x - b|^2; c'x is tr C_0."""
-        return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.start
+        """Return A, b, c with -2 <H, Lambda E> - <H, H/w> = |b|^2 - |A x - b|^2; c is `cost`."""
+        return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.cost
 
     def imposed(self) -> Array:
         """Return the first frequencies at which D > 0 is imposed, dense at the band's ends, modes and delays."""
@@ -262,7 +274,7 @@ class _Dual:
         missed = 4 * half * most * _DISK ** (-2.0 * _POINTS.size) / (1 - 1 / _DISK)
         of_sum = (w.size + 40) * _UNIT * (weight * (2 / np.pi * h * g + squares * g**2))
         of_values = weight * (2 / np.pi * h + squares * (2 * g + error[:, None])) * error[:, None]
-        return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
+        return -value - float(self.cost @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
         """Return (the bound on J from x with C_0 increased, frequencies at which D was evaluated, least eigenvalues).

@@ -451,9 +451,10 @@ class _Search:
         """
         m, beta, weights = self.device.size, self.beta(x), self.weights(x)
         block = parts[0] + np.tensordot(np.concatenate([x[: self.m], weights]), parts[1:], axes=1)
-        alpha = named_parts(self.sweep.unknowns, self.values(x)).get("alpha")
-        for i, weight in enumerate(self.sweep.loop.per_channel(alpha) if alpha else ()):
-            speed, v = beta[i] * (z - 1), m + i
+        alpha, loop = named_parts(self.sweep.unknowns, self.values(x)).get("alpha"), self.sweep.loop
+        even = loop.per_channel([np.mean(loop.delta[own]) for own in loop.devices])
+        for i, each in enumerate(loop.per_channel(alpha) if alpha else ()):
+            weight, speed, v = each * (loop.delta[i] / even[i]), beta[i] * (z - 1), m + i
             for part in self.sweep.moves:
                 block[:, part[i], v] -= weight / 2 * speed
                 block[:, v, part[i]] -= weight / 2 * np.conj(speed)

@@ -3,12 +3,15 @@
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import scipy.integrate
 
 import haptic_loop
-from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
 from haptic_loop.design import bound as module
 from haptic_loop.design.bound import BoundBeside, bound
 from haptic_loop.design.dual_matrix import DualMatrix
@@ -121,7 +124,7 @@ def test_the_integral_errs_by_less_than_its_bound(name):
         fine, coarse = (scipy.integrate.simpson(g[::step], dx=step * (b - a) / 400) for step in (1, 2))
         total, wrong = total + fine, wrong + abs(fine - coarse)
     assert wrong < 1e-7 * abs(total)
-    assert abs(-total - float(dual.start @ x) - found) <= error + wrong
+    assert abs(-total - float(dual.cost @ x) - found) <= error + wrong
     assert error < 1e-8 * abs(total)
 
 
@@ -174,3 +177,36 @@ def test_only_a_proved_bound_is_called_one(monkeypatch):
     nothing = bound(loop_of("n3"), knots=8)
     assert not nothing.proved
     assert nothing.rms == nothing.sampled_rms > 0
+
+
+SPRINGS = Spring(("x", GROUND), 900.0, 0.5), Spring(("x", "y"), 300.0, 0.3)
+LEVEL = ((1.2, 0.9), (0.9, 1.0))  # [N s/m]
+PLANE = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.2, 1.0), Network(("x", "y"), SPRINGS), axes=(2,), levels=(LEVEL,))
+
+
+def test_a_full_level_enters_the_dual_value():
+    """At every dual point tr C_0 Delta + 2 <H, F> is <D, S>, the mean of Re tr D*S for S = He[Delta + T F/(z-1)].
+
+    At z = 1 the measure S has the mass T F(1)/2. The trapezoidal rule errs by 1e-5 of the value.
+    """
+    dual = module._Dual.of(PLANE, (1.0, 100.0), 8)
+    x = np.random.default_rng(0).normal(size=dual.start.size)
+    F, root, low = PLANE.F(SpringDamper([700.0, 500.0], [0.4, 0.3])), np.sqrt(PLANE.delta), dual.band[0]
+    w = np.union1d(np.geomspace(low / 1e3, np.pi, 2000), np.linspace(low / 1e3, np.pi, 3000))
+    z = np.exp(1j * w)
+    S = hermitian(np.array(LEVEL) + PLANE.T * F.at(z) / (z - 1)[:, None, None])
+    D = dual.matrix(x).at(np.append(0.0, w)) / np.outer(root, root)
+    H = np.stack([np.interp(w, dual.grid, each, left=0, right=0) for each in dual.h(x).reshape(-1, 4).T], axis=-1)
+    mass = np.trace(D[0].real @ F.dc()) * PLANE.T / 2
+    product = np.trapezoid((np.conj(D[1:]) * S).real.sum(axis=(1, 2)), w) / np.pi + mass
+    forces = 2 / np.pi * np.trapezoid((np.conj(H.reshape(-1, 2, 2)) * F.at(z)).real.sum(axis=(1, 2)), w)
+    assert dual.objective()[2] @ x == pytest.approx(product - forces, rel=1e-4)
+
+
+def test_the_longest_period_scales_a_full_level(monkeypatch):
+    """Periods up to 2 T count as periods T of devices with half the level."""
+    seen = []
+    monkeypatch.setattr(module._Dual, "best", lambda dual: (seen.append(dual.loop), 1.0, 1.0)[1:])
+    bound(msgspec.structs.replace(PLANE, T_max=2 * PLANE.T), knots=8)
+    np.testing.assert_array_equal(seen[0].Delta(), np.array(LEVEL) / 2)
+    assert seen[0].T_max is None

@@ -1144,6 +1144,21 @@ def test_facts_on_known_devices_are_proved_from_files(name):
     assert not required_damping(short, COUPLING, condition, multiplier).certified
 
 
+def test_a_search_weighs_axes_by_their_damping():
+    """The energy alpha_i dq_i^2/2 with dq = dx + beta (v+ - v) has alpha_i = alpha delta_i/mean(delta)."""
+    network = Network(("x", "y"), (Spring(("x", GROUND), 500.0, 0.5), Spring(("y", GROUND), 800.0, 0.3)))
+    span, delta = DelayRange((0, 0), (1, 1)), (0.5, 2.0)
+    loop = Loop(
+        1e-3, (0, 0), (0, 0), (0, 0), delta, network, varying_delay=span, known_devices=(DEVICE,) * 2, axes=(2,)
+    )
+    search = _Search(KNOWN_DEVICE.sweep(loop, SpringDamper([800.0, 600.0], [0.5, 0.5])), 5.0)
+    x = np.array([1e-3, 0.7, 5.0])  # beta [s], 1/alpha in its unit, share of the damping
+    (alpha,), z = search.values(x), search.sampled[0][0]
+    speed = np.diagonal(search.idle(z, search.sampled[0][1], x), axis1=1, axis2=2)[:, 2:4]
+    expected = -alpha / 2 * np.array(delta) / 1.25 * (1e-3 * np.abs(z - 1)[:, None]) ** 2
+    np.testing.assert_allclose(speed, expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "name",
     ["switching", *(pytest.param(n, marks=pytest.mark.validate) for n in ("limiter-switching", "walls-switching"))],
