@@ -1,4 +1,4 @@
-"""Measure speed and error of the exponential engine, four Runge-Kutta steps and the exact engine, in turn.
+"""Measure speed and error of the exponential engine, Runge-Kutta steps and the exact engine, in turn.
 
 make bench    (or: python -m pytest tests/benchmarks/test_engine_cost.py --benchmark-only -s)
 

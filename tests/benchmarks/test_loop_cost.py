@@ -1,4 +1,4 @@
-"""Measure the cost of the limiter while no force is limited, and the speed of the exact engine.
+"""Measure the cost of the limiter below and at its limits, and the speed of the exact engine.
 
 make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
 """

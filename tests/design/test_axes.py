@@ -666,7 +666,7 @@ def test_a_turned_filter_keeps_its_static_share() -> None:
 
 
 def test_switching_search_shares_a_multiplier() -> None:
-    """An option gives delays per device; the slope by gains and multipliers equals that of central differences."""
+    """An option gives delays per device; the slope by gains and multipliers equals central differences."""
     loop = msgspec.structs.replace(LOOP, levels=None)
     span = delay_range(((0, 1), (2, 2)), loop, 9)
     assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))

@@ -253,7 +253,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition number of 1e15, and all its digits are stored; a light weight of g would give g = 0.017."""
+    """P has a condition number of 1e15, and all its digits are stored; a second solve weighs g more, or g = 0.017."""
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)

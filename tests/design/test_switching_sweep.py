@@ -237,7 +237,7 @@ def test_the_multiplier_is_best_in_random_loops():
         found = switching_sweep(
             G, lo.tolist(), (lo + rng.integers(0, 4, channels)).tolist(), rng.uniform(0.1, 5, channels)
         )
-        # The search ends within twice environments._SETTLED of the bound, which is 1e-6.
+        # The search ends within 2 environments._SETTLED = 1e-6 of the bound.
         assert found.bound <= found.ratio * (1 + 1e-9)
         assert found.ratio == pytest.approx(found.bound, rel=2e-6)
 
