@@ -25,7 +25,7 @@ def test_a_link_stays_a_link(tmp_path):
     assert target.read_text() == "new"
 
 
-def test_what_is_no_file_is_not_replaced(tmp_path):
+def test_pipes_and_devices_are_not_replaced(tmp_path):
     pipe, got = tmp_path / "pipe", []
     os.mkfifo(pipe)
     reader = threading.Thread(target=lambda: got.append(pipe.read_text()))

@@ -44,13 +44,13 @@ def parser():
         ("--conut 3", "unknown option --conut, did you mean --count?"),
     ],
 )
-def test_one_line_for_bad_words(words, message):
+def test_bad_options_get_one_line(words, message):
     with pytest.raises(InputError) as caught:
         parser().parse_args(words.split())
     assert str(caught.value).startswith(message)
 
 
-def test_good_words():
+def test_good_options_are_parsed():
     words = "--count 3 --length 1e-3 --K 1,2 --theta 0 --mark 5000,0 --mark 1,2 --varying-delay 1-2,0-3"
     args = parser().parse_args(words.split())
     assert (args.count, args.length, args.K, args.theta) == (3, 1e-3, (1.0, 2.0), (0,))

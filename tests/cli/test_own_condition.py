@@ -35,7 +35,7 @@ def run(command: str, *words: str) -> int:
     return import_module(f"haptic_loop.cli.{command}").main([*words, "--condition", OWN])
 
 
-def test_a_design_for_it_is_proved_and_tight(folder):
+def test_own_condition_designs_are_proved_and_tight(folder):
     report = json.loads((folder / "design.json").read_text())
     needs = report["assessment"]["requirements"][NAME]
     assert decisive(report) == needs
@@ -66,7 +66,7 @@ def test_a_design_for_it_is_proved_and_tight(folder):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys):
+def test_every_command_judges_by_the_own_condition(command, words, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert run(command, *words, *JSON) == 0
     shown, text = capsys.readouterr().out, Path("report.json").read_text()
@@ -110,7 +110,7 @@ def test_a_file_without_its_condition_is_explained(folder, monkeypatch):
         (["--scenario", "one-wall"], "the loop has walls, which the condition joined-devices does not name in covers"),
     ],
 )
-def test_designs_that_do_not_take_it_are_refused(words, message, folder, monkeypatch):
+def test_designs_without_own_conditions_are_refused(words, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
     with pytest.raises(ValueError, match=message) as caught:
         run("design", *words)
@@ -134,7 +134,7 @@ def test_a_condition_that_is_none_is_refused(named, message, folder, monkeypatch
         import_module("haptic_loop.cli.design").main(["--condition", named])
 
 
-def test_in_python_it_is_the_class(folder, monkeypatch):
+def test_python_takes_the_conditions_class(folder, monkeypatch):
     monkeypatch.chdir(folder)
     own = import_module("joined_devices").JoinedDevices()
     loop = load("omega-pair").loop("I")

@@ -273,7 +273,7 @@ def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("content", "message"), [(b"", "not a trace"), (b"PK\x03\x04rubbish", "not a trace"), (None, "No such file")]
 )
-def test_a_trace_that_is_none(tmp_path, content, message):
+def test_files_that_are_no_trace_are_refused(tmp_path, content, message):
     path = tmp_path / "trace.npz"
     if content is not None:
         path.write_bytes(content)

@@ -365,7 +365,7 @@ def test_a_force_that_is_not_finite_becomes_zero():
         ({"delta": [0.0]}, r"delta is \[0.0\]"),
     ],
 )
-def test_budgets_that_cannot_be(changed, message):
+def test_impossible_budgets_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         EnergyBudget(**({"delta": [1.0], "T": T, "packets": Packets([1])} | changed))
 

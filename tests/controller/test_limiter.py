@@ -125,7 +125,7 @@ WALLED = Network(
 
 
 @pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
-def test_out_of_reach_nothing_changes(network):
+def test_limits_out_of_reach_change_nothing(network):
     x = wander(500, 2, 3)
     limiter = loop_of(network, (0, 2), (0, 0)).law(STIFF, (1e6, 1e6), (10.0, 20.0))
     limiting, without = drive(closed(limiter), x), drive(unlimited(network, (0, 2)), x)
@@ -316,6 +316,6 @@ def test_bad_limits_are_named():
         Limiter(G, (0, 0, 0), limit=np.ones(3), rho=np.ones(3))
 
 
-def test_limits_have_room_between_them_on_every_axis():
+def test_upper_limits_exceed_lower_ones():
     with pytest.raises(ValueError, match="expected lower < upper"):
         BoxProblem(np.eye(2), np.zeros(2), np.array([1.0, 0.0]))

@@ -95,7 +95,7 @@ def test_a_block_equals_the_network_of_its_numbers():
         (Lti.constant([[1.0, 0.0]], T), r"D is \[\[1.0, 0.0\]\], expected 1 rows of 1 numbers"),
     ],
 )
-def test_what_is_no_passive_block_is_refused(E, message):
+def test_active_or_malformed_blocks_are_refused(E, message):
     with pytest.raises(ValueError, match=message):
         Block.of(E)
 

@@ -136,7 +136,7 @@ def test_encoders_do_not_move_the_device():
         (lambda: StepBuffer(process(wall(1.0)), 1, 0), "must be the positions"),
     ],
 )
-def test_what_cannot_be_built(build, message):
+def test_impossible_couplings_and_processes_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

@@ -111,7 +111,7 @@ class Weighted(Coupling):
         return Lti.diag(*[taps([0.8 / 900, 0.2 / 900], T)] * 2)
 
 
-def test_a_wall_behind_a_coupling_of_ones_own():
+def test_a_wall_behind_an_own_coupling():
     """A wall between two contacts sends f = max(0, k w) with w = a - b - 2 (0.8 f + 0.2 f-)/900."""
     network = Network(("a", "b"), walls=(Wall(("a", "b"), 3000.0),))
     x = wander(60, 2, 1)

@@ -104,7 +104,7 @@ def test_certificates_cover_the_spread_of_ticks():
     assert timed(known, ages, 0.9, 100.0)[0].T_max == 1.4e-3
 
 
-def test_what_one_overlong_tick_may_cost():
+def test_the_cost_of_one_overlong_tick():
     """The greatest power -f v - delta v^2 over all v is f^2/(4 delta)."""
     v = np.linspace(-3, 3, 100_001)
     most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))
@@ -145,7 +145,7 @@ def test_a_session_replays_bit_for_bit(tmp_path, capsys):
         (["--latency", "1e-4"], "latency: hw.bridge does not simulate this key"),
     ],
 )
-def test_what_does_not_go_together(more, said):
+def test_options_that_exclude_arrival_latching_are_refused(more, said):
     with pytest.raises(InputError, match=said):
         bridge(["--rehearse", "--latch", "arrival", *more])
 

@@ -75,7 +75,7 @@ def test_a_vector_keeps_its_direction_at_its_cap():
     assert limits.capped(forces).tolist() == [[True] * 3, [False] * 3]
 
 
-def test_the_trap_that_the_order_of_checks_avoids():
+def test_forces_of_nan_are_refused_before_clipping():
     assert max(-12.0, min(12.0, math.nan)) == 12.0
     with pytest.raises(SafetyStop, match="asked for nan, 0 N, which is no force"):
         LIMITS.shape((math.nan, 0.0), (0.0, 0.0), 0.0, T)

@@ -311,7 +311,7 @@ def test_a_session_without_forces_keeps_no_older_files(scenario, rungs, tmp_path
     assert files == [*tmp_path.iterdir()] == [tmp_path / "report.json"]
 
 
-def test_results_of_nothing():
+def test_an_empty_recording_has_no_ticks():
     recorder = Recorder(2)
     assert recorder.link()["x"].shape == (0, 2)
 

@@ -89,7 +89,7 @@ def test_one_lag_is_passive_two_are_not():
         Impedance(*twice[:3], [[0.999 * 3.0 / 8]])
 
 
-def test_a_lossless_impedance_is_no_rounding_victim():
+def test_nearly_lossless_impedances_are_accepted():
     """Re Z of a lightly damped resonance at 30 rad/s is nearly zero at most frequencies."""
     assert Impedance([[-1e-3, -30.0], [30.0, -1e-3]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]]).order == 2
 
@@ -104,7 +104,7 @@ def test_a_lossless_impedance_is_no_rounding_victim():
         (([[-1.0]], [[1.0, 2.0]], [[1.0]], [[0.0]]), r"B has the shape \(1, 2\), expected \(1, 1\)"),
     ],
 )
-def test_what_is_no_passive_impedance_is_refused(parts, message):
+def test_active_or_malformed_impedances_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         Impedance(*parts)
 
@@ -294,7 +294,7 @@ def test_chains_equal_their_classes():
         (lambda: build([DEVICE], [Own(Person((1, 2), 1, 1, 1).port())]), "has 2 handles, expected one"),
     ],
 )
-def test_ports_that_cannot_be_are_refused(call, message):
+def test_impossible_ports_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 

@@ -212,7 +212,7 @@ def test_the_reported_seed_draws_the_periods():
         (lambda: certify(SHORT.loop("I"), SpringDamper([1.0], [0.0])), "K has 1 entries, .* has 2 contacts"),
     ],
 )
-def test_what_makes_no_sense_is_refused(call, message):
+def test_bad_arguments_are_named(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert isinstance(caught.value, InputError | ValueError)

@@ -54,7 +54,7 @@ def test_a_limit_cycle_has_its_forces_deviation():
     assert row.cycle_deviation_error == 0
 
 
-def test_the_front_is_what_nothing_beats():
+def test_undominated_rows_form_the_pareto_front():
     values = [("a", 1, 1, 1, True), ("a", 2, 0.5, -0.5, True), ("a", 3, 0.5, -0.6, True), ("b", 9, 9, 9, True)]
     cycle, values = (None,) * 4, (*values, ("a", 0.5, 2, 2, False))
     rows = [Row(kind, None, None, p, g, right, *cycle, wall) for kind, wall, p, g, right in values]

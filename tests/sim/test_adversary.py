@@ -32,7 +32,7 @@ def _few(monkeypatch):
     monkeypatch.setattr(adversary, "_CANDIDATES", 60)
 
 
-def test_it_finds_what_random_humans_do_not():
+def test_the_search_destabilises_loops_below_the_requirement():
     """With 5 % less damping than required, the search finds a lossless hand that destabilises each loop."""
     rows = attempts(LOOPS, np.array([0.05]), generations=60)
     assert all(row.worst.destabilises for row in rows)
@@ -46,7 +46,7 @@ def test_nobody_destabilises_sufficient_damping():
 
 
 @pytest.mark.slow
-def test_where_the_condition_binds_slowly_it_is_tight():
+def test_the_condition_is_tight_with_long_delays():
     """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping a hand is found."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)

@@ -330,7 +330,7 @@ def test_friction_keeps_the_error_with_fewest_steps():
             assert missed("RK4", found.substeps // 2) > asked / 4
 
 
-def test_what_the_finest_run_misses_is_no_chance():
+def test_gaps_between_runs_bound_the_finest_error():
     """For runs x + c/n the bound is 1.5 c/n; if gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q)."""
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
@@ -353,7 +353,7 @@ def test_what_the_finest_run_misses_is_no_chance():
         (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
     ],
 )
-def test_errors_that_nothing_keeps(scenario, error, message):
+def test_unreachable_errors_are_refused(scenario, error, message):
     with pytest.raises(InputError, match=message):
         cheapest(assemble(scenario, PUBLISHED["I"]), error, 100)
 

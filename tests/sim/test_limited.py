@@ -29,7 +29,7 @@ def weak(*limits):
     return base.replace(device=devices, duration=2.0)
 
 
-def test_which_limiter_a_coupling_may_have():
+def test_the_limiter_follows_from_the_requirements():
     scenario = weak(12.0, 5.657)
     loop = scenario.loop("I")
     any_environment = _covered_limits(loop, SOFT, requirements_of(loop, SOFT))

@@ -137,7 +137,7 @@ def test_the_live_window_equals_the_simulator(files, form):
 
 
 @pytest.mark.parametrize("form", ["filter", "pair"])
-def test_the_bridge_rehearses_it(files, form):
+def test_the_bridge_rehearses_optimal_couplings(files, form):
     scenario, _, path = files[form]
     couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))

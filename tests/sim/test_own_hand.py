@@ -75,7 +75,7 @@ def rms(a, b):
     return np.sqrt(np.mean(np.square(a - b)) / np.mean(np.square(b)))
 
 
-def test_both_engines_simulate_it_and_agree():
+def test_engines_agree_on_own_hands():
     scenario = held_by(Muscle(), Muscle(elastic=900.0, tissue=0.03))
     exact, mujoco = (simulate(scenario, PUBLISHED["I"], engine=engine) for engine in ("exact", "mujoco"))
     assert np.abs(exact.x).max() > 2e-3  # the muscles move the devices
@@ -95,7 +95,7 @@ def test_matrices_and_bodies_give_equal_runs():
     assert rms(space.f, bodies.f) < 1e-9
 
 
-def test_the_tissue_s_mass_goes_to_nothing():
+def test_a_vanishing_tissue_mass_changes_nothing():
     """Half the tissue's mass halves the difference to the hand without tissue."""
     light = simulate(held_by(Light(), Light()), PUBLISHED["I"], engine="exact").x
     off = [
@@ -123,7 +123,7 @@ def test_impedances_run_in_uneven_late_ticks():
         assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
 
 
-def test_where_devices_rub_runge_kutta_moves_an_impedance():
+def test_friction_with_an_impedance_needs_runge_kutta():
     rubbing = held_by(Light(), Light())
     devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
     simulation = assemble(rubbing.replace(device=devices), PUBLISHED["I"])
@@ -232,7 +232,7 @@ def test_the_adversary_takes_a_population_file(tmp_path):
     assert [human["class"] for human in found["human"]] == ["Grip", "Grip"]
 
 
-def test_its_verdicts_are_those_of_each_hand_alone():
+def test_population_verdicts_equal_those_of_single_hands():
     scenario = SCENARIO.replace(population=Muscles(Light))
     found = validate(scenario, PUBLISHED["I"], humans=6, duration=0.0, engine="exact")
     for i in (0, 5):

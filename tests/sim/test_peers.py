@@ -43,7 +43,7 @@ def test_every_peer_is_looked_at():
 
 @pytest.mark.filterwarnings("default")  # the tools emit warnings
 @pytest.mark.parametrize("name", ALLOWED)
-def test_it_is_the_same_loop(loop, name):
+def test_peers_simulate_the_same_loop(loop, name):
     allowed, needed = ALLOWED[name]
     if needed:
         pytest.importorskip(needed, reason=f"{needed} is no dependency: this runs where somebody has installed it")

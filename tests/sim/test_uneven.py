@@ -121,7 +121,7 @@ def test_draws_lie_in_range_and_are_seeded():
         ({"period": {"min": 2e-4, "max": 2e-3}, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, said):
+def test_impossible_tick_times_are_refused(changes, said):
     with pytest.raises(InputError, match=said):
         PAIR.replace(**changes)
 
@@ -148,7 +148,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
 
 
 @pytest.mark.validate
-def test_hands_that_meet_uneven_ticks(tmp_path):
+def test_engines_agree_on_hands_at_uneven_ticks(tmp_path):
     """With a coupling no hand makes the loop grow; without one some do, and both engines agree which."""
     file = tmp_path / "r.json"
     ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "3", "--duration", "0.3"]

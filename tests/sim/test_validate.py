@@ -306,7 +306,7 @@ def test_uncoupled_loops_are_mostly_unstable():
     np.testing.assert_allclose(findings.trace, findings.exact, atol=1e-6)
 
 
-def test_what_a_disagreement_is():
+def test_opposite_growth_is_a_disagreement():
     exact, other = np.array([1.0, -1.0, 5e-4, 1.0]), np.array([-1.0, 1.0, -1.0, np.nan])
     assert disagree(exact, other).tolist() == [True, True, False, False]
 
@@ -509,7 +509,7 @@ def test_traces_decide_only_what_eigenvalues_say():
     assert 0 < sum(row.decided for row in rows) < 150
 
 
-def test_short_traces_do_not_vote():
+def test_inaccurate_traces_are_no_disagreement():
     """A trace that grows while all maps decay is no disagreement if its error exceeds its rate."""
     found = slow_loops(4, 0, 0.3)
     rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}

@@ -282,7 +282,7 @@ def test_every_tick_is_made_or_counted_as_lost(steps):
     assert pace.overruns <= sum(step > 0.098 for step in steps)
 
 
-def test_what_is_too_late_is_lost_and_said():
+def test_late_ticks_are_lost_and_counted():
     pace = _Pace(1e-3, patience=0.1)
     assert pace.due(0.05) == 50
     assert pace.due(1.05) == 100

@@ -194,7 +194,7 @@ TRAY = f"""<mujoco><worldbody><body name="left" pos="-0.05 0 0">{TIP}</body><bod
 UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
-def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
+def test_the_shell_credits_released_gravity(tmp_path):
     """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
     acted = {}

@@ -99,7 +99,7 @@ def test_the_map_is_that_of_design_margin(name):
 
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
-def test_no_cell_of_the_widest_plane_is_lost(scenario):
+def test_maps_of_the_widest_plane_match_sweeps(scenario):
     """A free mass on K = 1e-3 N/m swings near 1e-5 rad/sample, so the value for F(1) must be taken far below that."""
     sweep = of(scenario, scenario.theta)
     K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
@@ -110,7 +110,7 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
 @pytest.mark.parametrize(
     ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
 )
-def test_maps_before_walls_match_designs(theta, least):
+def test_maps_at_walls_match_single_sweeps(theta, least):
     """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; with delay frozen contact needs less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
@@ -281,7 +281,7 @@ def wave(amplitude, growth, hz, seconds=1.5):
     return (amplitude * np.exp(growth * t) * np.sin(2 * np.pi * hz * t + 0.3))[:, None, None]
 
 
-def test_what_counts_as_an_oscillation():
+def test_sustained_oscillations_are_told_from_decays():
     t = (np.arange(1500) * T)[:, None, None]
     cases = [
         (wave(1e-4, 0.0, 40), True),  # a limit cycle
@@ -411,7 +411,7 @@ def with_devices(sweep, **changes):
     return replace(sweep, devices=tuple(msgspec.structs.replace(device, **changes) for device in sweep.devices))
 
 
-def test_friction_stops_what_grows_from_a_millimetre():
+def test_friction_stops_growing_oscillations():
     free = points(rigid(1), [1500.0, 2500.0], [0.0, 0.2])
     assert free.oscillates.all()
     assert (free.growth > 1).all()
@@ -474,7 +474,7 @@ def test_where_the_limits_of_an_omega3_lie(audit):
     assert 2740 < mark["stiffest_K_at_this_B"]["population"] < 3200
 
 
-def test_the_map_holds_together(audit):
+def test_the_parts_of_a_map_agree(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
     ratio = np.array(report["this-environment"]["required_over_available"], float)
