@@ -186,7 +186,7 @@ def test_many_hands(benchmark):
 
 
 def test_long_periods_stay_exact(benchmark):
-    """One step of 0.1 s, in which the fastest mode turns 497 rad, is within 1e-9 of the matrix exponential."""
+    """One step of 0.1 s, in which the fastest mode turns 521 rad, is within 1e-9 of the matrix exponential."""
     simulation = assemble(SCENES["transmission of 1.45e6 N/m"], PUBLISHED["I"])
     T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1
     step = benchmark.pedantic(
