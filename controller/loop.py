@@ -101,7 +101,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     varying_delay: DelayRange | None = None  # the forces' delays, if they may change at every tick
     T_max: _Positive | None = None  # [s] longest period if periods vary; None: T
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and largest latency of forces after kT
-    T_min: _Positive | None = None  # [s] shortest period, for the known-device condition
+    T_min: _Positive | None = None  # [s] shortest period, for the known-device condition and the latency
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
     axes: tuple[int, ...] | None = None  # number of channels of each device; None: one each
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], with diagonals as in delta; None: diag(delta)
@@ -172,10 +172,11 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
         if len(latency) != len(self.theta):
             raise ValueError(f"latency has {len(latency)} ranges for {len(self.theta)} channels")
+        name, shortest = ("T_min", self.T_min) if self.T_min else ("T", self.T)
         for i, (least, most) in enumerate(latency, start=1):
-            if not 0 <= least <= most < self.T:
+            if not 0 <= least <= most < shortest:
                 raise ValueError(
-                    f"latency #{i} is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
+                    f"latency #{i} is {least:g} to {most:g} s, expected 0 <= least <= most < {name} = {shortest:g} s"
                 )
 
     def _check_varying_delay(self, span: DelayRange) -> None:

@@ -38,8 +38,8 @@ TITLES = {"this-environment": HERE, "any-environment": ANY}
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
     "or pass the limiter that a report names. "
-    "They do not cover periods longer than T_max (T without one), encoder steps that do more work than Coulomb "
-    "friction dissipates, velocity filters or friction compensation."
+    "They do not cover periods longer than T_max (T without one) or shorter than the latency, encoder steps that do "
+    "more work than Coulomb friction dissipates, velocity filters or friction compensation."
 )
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching", "limiter" or the name of a user's own condition

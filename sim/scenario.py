@@ -95,7 +95,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
-    T_min: float | None = None  # [s] the shortest period if periods vary; only the known-device condition uses it
+    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; above every latency
     period: Periods | None = None  # the simulated periods; the coupling is computed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 
@@ -238,7 +238,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
         if self.period and self.T_min is not None and self.period.shortest < self.T_min:
             raise ValueError(f"period is from {self.period.shortest:g} s, below T_min = {self.T_min:g} s")
-        shortest = self.period.shortest if self.period else self.T
+        shortest = self.shortest_period or self.T
         for i, (_, most) in enumerate(self.latency or (), start=1):
             if most >= shortest:
                 raise ValueError(f"latency #{i} is up to {most:g} s, expected less than every period, {shortest:g} s")

@@ -203,6 +203,8 @@ def test_loops_without_a_derived_condition_are_refused():
         prove(change(loop, psi=(1, 1)), SOFT, "any-environment")
     with pytest.raises(ValueError, match=r"latency #2 is 0 to 0\.0012 s"):
         change(loop, latency=((0.0, TAU), (0.0, T)))
+    with pytest.raises(ValueError, match=r"latency #1 .* < T_min"):
+        change(loop, T_max=2 * T, T_min=TAU)
 
 
 # Loops whose latency switches, simulated exactly: the previous force acts until kT + tau_k, then the new one.

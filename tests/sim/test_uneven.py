@@ -119,6 +119,7 @@ def test_draws_lie_in_range_and_are_seeded():
         ({"period": {"recorded": [1e-3, 1.0]}}, r"period\.recorded has 1 s"),
         ({"period": {"min": 1e-3, "max": 2e-3}, "T_max": 1.5e-3}, r"period is up to 0\.002 s, above T_max"),
         ({"period": {"min": 2e-4, "max": 2e-3}, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
+        ({"T_min": 2e-4, "T_max": 2e-3, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
     ],
 )
 def test_impossible_tick_times_are_refused(changes, said):
