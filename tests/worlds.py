@@ -73,11 +73,11 @@ def loop_of(network, theta, psi, period: float = T) -> Loop:
 
 
 def environment_by_hand(network: Network, z: np.ndarray, period: float = T) -> np.ndarray:
-    """Return E(z) (k, 2, 2) at k points z: M s^2 + D s + K with the inner node eliminated."""
-    M, D, K = network.matrices()
+    """Return E(z) (k, m, m) at k points z: M s^2 + D s + K with the single inner node eliminated."""
+    (M, D, K), m = network.matrices(), len(network.contacts)
     s = ((z - 1) / (period * z))[:, None, None]
     Z = M * s**2 + D * s + K
-    return Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
+    return Z[:, :m, :m] - Z[:, :m, m:] @ Z[:, m:, :m] / Z[:, m:, m:]
 
 
 def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:

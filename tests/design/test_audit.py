@@ -303,7 +303,6 @@ def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside)
 @pytest.mark.parametrize(
     ("argv", "code", "required"),
     [
-        (["--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
         (["--rigid", "--K", "5000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1.37"], 1, 2.5),
         (["--rigid", "--K", "2000", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "3.1"], 0, 3.0),
         (["--device", "omega.3"], 1, 32.5),
@@ -313,7 +312,6 @@ def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside)
         (["--device", "omega", "--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
         (["--device", "touch", "--delta", "1.37", "--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--case", "none"], 1, 1.7229),
-        (["--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--scenario", "three-rigid", "--K", "300", "--B", "0.2"], 0, None),
     ],
 )

@@ -583,13 +583,13 @@ def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> n
         energies[k, :m, :m], energies[k, m:, m:] = stiffness / 2, mass / 2
         state[m:, k] = rng.normal(size=m) * 10 ** rng.uniform(-1, 1)
     before, after = np.zeros((law.open.order + m, count)), np.zeros((law.open.order + m, count))
-    tick, energy = law.transition(), lambda s: np.einsum("in,nij,jn->n", s, energies, s)
+    tick, energy = law.transition(), lambda s: (s.T[:, None] @ energies @ s.T[:, :, None])[:, 0, 0]
     start = energy(state)
     most = start.copy()
     for _ in range(ticks):
         before[-m:] = state[:m]
         tick(before, after)
-        state = np.einsum("nij,jn->in", steps, np.vstack([state, after[:m]]))
+        state = (steps @ np.vstack([state, after[:m]]).T[:, :, None])[:, :, 0].T
         before[:-m] = after[m:]
         most = np.maximum(most, energy(state))
     return most / start
@@ -598,7 +598,7 @@ def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> n
 def test_limited_hands_in_space_get_no_energy() -> None:
     """No lossless hand of 60 gains energy at 1.02 of the requirement 0.518330; at 0.6 of it five or more do."""
     assert (most_energy(1.02 * 0.518330, 1) <= 1 + 1e-9).all()
-    assert (most_energy(0.6 * 0.518330, 1) > 1.001).sum() >= 5
+    assert (most_energy(0.6 * 0.518330, 1, ticks=200) > 1.001).sum() >= 5
 
 
 def test_energy_budget_of_a_level() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from asked import any_environment, this_environment
 from driven import driven
-from scipy.signal import dlsim, lfilter
 from worlds import FIGURE_4, SOFT, STIFF, force_map
 
 from haptic_loop.controller.arithmetic import numbers
@@ -103,10 +102,12 @@ def test_sampled_energy_balance_of_devices_and_hands():
 
 
 def supplied(F, dx):
-    """Return the sum over k < N of f'dx + (1/T) dx' Delta dx for every N, from rest at x = 0."""
-    x = np.cumsum(np.vstack([np.zeros(2), dx]), axis=0)[:-1]
-    _, f, _ = dlsim((F.A, F.B, F.C, F.D, T), x)
-    return np.cumsum((f * dx + DELTA / T * dx**2).sum(axis=1))
+    """Return the sum over k < N of f'dx + (1/T) dx' Delta dx for every N, from rest; dx is (ticks, 2, runs)."""
+    x, f, state = np.cumsum(dx, axis=0) - dx, np.empty_like(dx), np.zeros((F.order, dx.shape[2]))
+    for k, now in enumerate(x):
+        f[k] = F.C @ state + F.D @ now
+        state = F.A @ state + F.B @ now
+    return np.cumsum((f * dx + DELTA / T * dx**2).sum(axis=1), axis=0)
 
 
 def test_certified_forces_give_less_than_devices_dissipate():
@@ -114,11 +115,11 @@ def test_certified_forces_give_less_than_devices_dissipate():
     rng = np.random.default_rng(2)
     for coupling in (STIFF, SOFT):
         F = force_map(E, coupling, THETA, (0, 0))
-        for _ in range(20):
-            colour = rng.uniform(0, 0.99)
-            slow = lfilter([1.0], [1.0, -colour], rng.normal(size=(1500, 1)), axis=0)
-            dx = 1e-4 * (slow @ rng.normal(size=(1, 2)) + rng.normal(size=(1500, 2)))
-            assert supplied(F, dx).min() >= -1e-12
+        colour, slow = rng.uniform(0, 0.99, 20), rng.normal(size=(1500, 1, 20))
+        for k in range(1, 1500):
+            slow[k] += colour * slow[k - 1]
+        dx = 1e-4 * (slow * rng.normal(size=(2, 20)) + rng.normal(size=(1500, 2, 20)))
+        assert supplied(F, dx).min() >= -1e-12
     # An uncertified map loses energy to motion in the worst direction at the frequency where the condition binds.
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = this_environment(F, (DELTA, DELTA)).frequency_hz
@@ -126,7 +127,7 @@ def test_certified_forces_give_less_than_devices_dissipate():
     H = F.at(z) / (z - 1) + DELTA / T * np.eye(2)
     worst = np.linalg.eigh((H + H.conj().T) / 2)[1][:, 0]
     wave = (worst * z ** np.arange(20_000)[:, None]).real
-    assert supplied(F, wave)[-1] < 0
+    assert supplied(F, wave[:, :, None])[-1, 0] < 0
 
 
 def random_pairs(links, count):
@@ -149,10 +150,10 @@ def test_without_coupling_only_the_compliant_device_oscillates():
     """A model of rigid devices does not reproduce the oscillations of Figure 5."""
     base, unstable = load(), {}
     for name, devices in (("compliant", base.device), ("rigid", (RigidDevice(), RigidDevice()))):
-        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 60)]
+        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 30)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 36 < unstable["compliant"] < 56  # 0.78 of many pairs oscillate; three binomial standard deviations
+    assert 16 < unstable["compliant"] < 30  # 0.78 of many pairs oscillate; three binomial standard deviations
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():
@@ -396,11 +397,10 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(calmer)).max() < 0.01
     unlimited = replace(simulation, process=replace(simulation.process, force_limit=np.full(2, np.inf)))
     assert np.abs(late(unlimited)).max() < 0.01
-    for beta in (0.0, 0.01):  # With the limiter instead of clipping, every start comes to rest.
-        rho = LimitedForces(beta).rho(base.loop("I"))
-        law = base.loop("I").law(STIFF, (12.0, 5.657), rho)
-        limiting = replace(simulation, process=replace(simulation.process, law=law))
-        assert np.abs(late(limiting)).max() < 0.01
+    # With the limiter instead of clipping, every start comes to rest.
+    law = base.loop("I").law(STIFF, (12.0, 5.657), LimitedForces().rho(base.loop("I")))
+    limiting = replace(simulation, process=replace(simulation.process, law=law))
+    assert np.abs(late(limiting)).max() < 0.01
 
 
 def test_the_multiplier_block_has_a_schur_complement():
