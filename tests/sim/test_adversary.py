@@ -13,7 +13,7 @@ from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.design.environments import ThisEnvironment
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import hold
-from haptic_loop.models.scene import build, plant
+from haptic_loop.models.scene import HumanSets, build, plant, variants
 from haptic_loop.sim import adversary
 from haptic_loop.sim.adversary import _DESTABILISED, search
 from haptic_loop.sim.run import assemble
@@ -43,6 +43,14 @@ def test_nobody_destabilises_sufficient_damping():
     assert not any(row.worst.destabilises for row in rows)
     # The growth with lossless hands approaches 0 from below, up to the rounding of eigenvalues.
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
+
+
+def test_it_searches_the_latest_forces():
+    """The loops have the longest period and the largest latencies."""
+    scenario = SCENARIO.replace(T_max=2e-3, latency=((1e-4, 3e-4), (0.0, 5e-4)))
+    F, hands = assemble(scenario, NoCoupling()).F, HumanSets((SCENARIO.human,))
+    held = hold(variants(SCENARIO.device, hands).plants(), 2e-3, [3e-4, 5e-4])
+    np.testing.assert_allclose(adversary._loops(scenario, F, hands).A, close(held, F).A, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -14,15 +14,17 @@ from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.delay import Periods, Timing, VaryingDelay
-from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.files import InputError
+from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import at_the_latch, hold
-from haptic_loop.models.scene import Plant, plant
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import HumanSets, Plant, plant, variants
 from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
-from haptic_loop.sim.run import assemble, make_engine, run
-from haptic_loop.sim.stability import close, dominant_mode, stability_of, verdict_within
+from haptic_loop.sim.run import assemble, make_engine, outside_forces, run
+from haptic_loop.sim.stability import Balance, close, dominant_mode, stability_of, verdict_within
 from tests.asked import needs
 from tests.checks import uneven
 
@@ -75,6 +77,15 @@ def test_block_sizes_do_not_change_runs():
     np.testing.assert_array_equal(again.s, trace.s[:1500])
 
 
+def test_taps_begin_at_their_time_in_uneven_ticks():
+    simulation = assemble(PAIR.replace(period=Periods(recorded=(1e-3, 2e-3, 0.5e-3))), SOFT)
+    scene, tap, t = simulation.scene, PAIR.tap, simulation.timing.times(0, 200)
+    w = outside_forces(PAIR, scene, 0, 200, voluntary=False, timing=simulation.timing)
+    expected = tap.force * ((t > tap.start - 1e-9) & (t < tap.start + tap.duration - 1e-9))
+    assert 0 < expected.sum() < 20
+    np.testing.assert_array_equal(w[:, scene.tapped[tap.channel - 1]], expected)
+
+
 def test_even_ticks_without_latency_are_plain():
     plain = run(assemble(PAIR, SOFT), "exact")
     same = run(assemble(PAIR.replace(latency=((0.0, 0.0),) * 2, period=Periods(PAIR.T, PAIR.T)), SOFT), "exact")
@@ -108,6 +119,9 @@ def test_draws_lie_in_range_and_are_seeded():
     assert one.late.min(axis=0).tolist() == [1e-4, 0.0]
     assert one.late.max(axis=0).tolist() == [1.3e-4, 5e-4]
     assert scenario.loop("I").T_max == 1.5e-3
+    assert PAIR.replace(period=Periods(recorded=(0.5e-3,))).loop("I").T_max == PAIR.T  # certificates cover T, too
+    assert scenario.usual_latency == pytest.approx([1.15e-4, 2.5e-4])
+    assert scenario.replace(duration=2.1).samples == 2000  # their mean is 1.05 ms
     assert scenario.digest != PAIR.digest == PAIR.replace(period=None).digest
 
 
@@ -184,6 +198,18 @@ def test_slow_rates_have_no_verdict():
     assert [verdict_within(rate, 20.0) for rate in (-0.19, 0.19, -0.21, 0.21)] == [None, None, "stable", "unstable"]
 
 
+def test_slow_creep_is_undecided():
+    """A hand and a spring of 0.011 N/m in all creep against 4.37 N s/m; their mass adds 3e-4 to the rate."""
+    human, spring = Human((Link(0.3, 3.0, 0.01),)), Network(("a",), (Spring(("a", GROUND), 1e-3),))
+    changes = {"device": (RigidDevice(damping=1.37),), "human": (human,), "tap": None, "environment": spring}
+    scenario = load("one-wall").replace(T=0.02, theta=(1,), period=Periods(0.018, 0.02), duration=1.0, **changes)
+    simulation = assemble(scenario, NoCoupling())
+    found = stability_of(simulation, run(simulation, "exact"))
+    assert found.verdict is None
+    assert "not decidable" in found.reason
+    assert found.growth_rate_per_s == pytest.approx(-0.011 / 4.37, rel=1e-3)
+
+
 def test_periods_vary_beside_delays():
     scenario = PAIR.replace(period=DRAWN, varying_delay=VaryingDelay((1, 2), (2, 3)), theta=(1, 2))
     simulation = assemble(scenario, SOFT)
@@ -243,6 +269,23 @@ def test_counted_dissipation_is_a_lower_bound():
         xi = after
     assert (np.array(lost) >= np.array(counted) * (1 - 1e-9) - 1e-13).all()
     assert np.median(np.array(lost) / counted) < 1.01
+
+
+def test_late_balances_count_the_longest_spans():
+    """A span of at most `most` [s] dissipates at least delta |dx|^2/most."""
+    loop = PAIR.replace(latency=LATE, T_max=2e-3).loop("I")
+    balance = Balance.of(variants(PAIR.device, HumanSets((PAIR.human,))), loop, [1.1e-4, 2e-4])
+    np.testing.assert_allclose(balance.before[:, 0] * [1.3e-4, 5e-4], loop.delta)
+    np.testing.assert_allclose(balance.damping[:, 0] * [2e-3 - 1e-4, 2e-3], loop.delta)
+
+
+def test_both_engines_trace_late_forces():
+    wall = Network(("a",), (Spring(("a", GROUND), 900.0),))
+    late = load("one-wall").replace(environment=wall, latency=((3e-4, 3e-4),), tap=None)
+    found = _examine(Validation(late, NoCoupling(), 0, 2, 1, "both", 0.25), range(2))
+    assert found.witnessed.all()
+    np.testing.assert_allclose(found.trace, found.exact, atol=1e-6)
+    np.testing.assert_allclose(found.mujoco, found.exact, atol=1e-3)  # RK4
 
 
 def test_the_energy_audit_sees_late_forces():
