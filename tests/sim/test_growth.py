@@ -146,6 +146,11 @@ def test_a_trace_that_names_no_stretch_is_one():
     assert found.growth_rate_per_s == pytest.approx(1.0, abs=1e-2)
 
 
+def test_parts_keep_the_ticks_of_their_trace():
+    (found,) = growths(made(motion(4.0, (2e-3, 84.0, 1.0)), {"run": {"steady_ticks": [[300, 3300]]}}))
+    assert (found.first, found.stop) == (1800, 3300)  # the second half of the part
+
+
 def test_an_empty_trace_or_none_is_one_line(tmp_path):
     made(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="has no ticks"):

@@ -5,14 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as change
 from scipy.linalg import expm
 
 from haptic_loop.cli.design import main as design_command
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.design.result import DesignFailed
+from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import HumanSets, variants
 from haptic_loop.sim.couplings import read_coupling
-from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, load, parse
 from haptic_loop.sim.stability import (
     _NOT_EXCITED,
@@ -20,9 +23,12 @@ from haptic_loop.sim.stability import (
     _left_eigenvector,
     _measured_growth,
     close,
+    disagree,
     dominant_mode,
+    impulse_growth,
     mujoco_plants,
     ringing,
+    stability_of,
     verdict,
 )
 
@@ -71,16 +77,68 @@ def test_a_trace_that_says_nothing_gives_a_reason():
     assert _measured_growth(loop, still, limit) == (None, _NOT_EXCITED)
 
 
+def test_fits_end_before_a_limiter_acts():
+    """A limiter acts `ahead` ticks before its force arrives."""
+    simulation = assemble(load().replace(duration=0.2), PUBLISHED["I"])
+    trace, loop = run(simulation), close(simulation.plant, simulation.F)
+    first = int(np.argmax(np.abs(trace.f[:, 0])))
+    limit = np.array([np.abs(trace.f[first, 0]), np.inf])
+    assert _measured_growth(loop, trace, limit, 3)[1].startswith(f"only {first - 3} ticks before the first clipped one")
+
+
+def test_short_traces_do_not_contradict_eigenvalues():
+    """A mode that decays by 0.94 1/s, but grows by 1 1/s in a trace of 0.5 s, may be noise."""
+    simulation = assemble(load().replace(duration=0.5), PUBLISHED["I"])
+    trace, loop = run(simulation, "exact"), close(simulation.plant, simulation.F)
+    values, vectors = np.linalg.eig(loop.A)
+    lead = np.argmax(np.abs(values))
+    grown = (values[lead] / np.abs(values[lead])) ** np.arange(len(trace.t)) * np.exp(trace.t)
+    s, z = np.split((grown[:, None] * vectors[:, lead]).real, [trace.s.shape[1]], axis=1)
+    told = stability_of(simulation, replace(trace, s=s, z=z, w=0 * trace.w))
+    assert told.growth_rate_per_s == pytest.approx(1.0, abs=1e-6)
+    assert told.verdict == told.exact_verdict == "stable"
+    assert told.reason.startswith("not decidable in 0.5")
+
+
+def test_free_hands_settle_by_their_speed():
+    """Without a spring the position stays away from zero, and the speed decays."""
+    hand, damper = Human((Link(0.3, 3.0, 0.0),)), Network(("a",), (Spring(("a", GROUND), 0.0, 0.5),))
+    scenario = load("one-wall").replace(environment=damper, human=(hand,), tap=None)
+    simulation = assemble(scenario, NoCoupling())
+    states, loop = simulation.plant.A.shape[0], close(simulation.plant, simulation.F)
+    ((growth,), _) = impulse_growth(simulation.process, make_engine(simulation, "exact"), simulation.scene, states, 600)
+    rates = np.sort(np.log(np.abs(loop.eigenvalues) + 1e-300) / loop.T)
+    assert rates[-1] == pytest.approx(0, abs=1e-9)
+    assert growth == pytest.approx(rates[-2], rel=1e-3)
+
+
+def test_diverged_runs_are_unstable():
+    simulation = assemble(load().replace(duration=0.3), PUBLISHED["I"])
+    trace = run(simulation, "exact")
+    assert stability_of(simulation, trace).verdict == "stable"
+    told = stability_of(simulation, replace(trace, diverged=True))
+    assert told.verdict == "unstable"
+    assert "left the range of finite numbers" in told.reason
+
+
+def test_contact_at_the_beginning_is_counted():
+    scenario = load("one-wall").replace(duration=0.05)
+    wall = change(scenario.environment.walls[0], gap=-0.02)
+    inside = scenario.replace(environment=change(scenario.environment, walls=(wall,)))
+    simulation = assemble(inside, NoCoupling())
+    contact = stability_of(simulation, run(simulation, "exact")).contact
+    assert (contact.made, contact.ticks) == (1, inside.samples - 1)
+
+
 def test_verdicts():
     assert verdict(Mode(np.array(1.0), 1e-3).growth) == "stable"
     assert verdict(Mode(np.array(1.001), 1e-3).growth) == "unstable"
     assert Mode(np.array(0.0), 1e-3).growth == -np.inf
+    other = np.array([-1.0, -1.0, 1.0, np.nan])
+    assert disagree([0.5, 1e-4, 0.5, 0.5], other).tolist() == [True, False, False, False]  # below 1e-3 engines err
 
 
-def test_knocks_die_away_as_the_held_plant():
-    """Device and hand are one body before a spring; the poles come from matrices that are written out here."""
-    T, K = 2e-3, 900.0
-    text = """
+KNOCK = """
 name = "knock"
 T = 2e-3
 theta = [1]
@@ -88,20 +146,39 @@ device = [{ kind = "rigid", mass = 0.2, damping = 1.5 }]
 human = [{ links = [{ mass = 0.3, damping = 2.0, stiffness = 150.0 }] }]
 [environment]
 contacts = ["a"]
-springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
 """
-    mass, damping, stiffness = 0.2 + 0.3, 1.5 + 2.0, 150.0
+SPRING = ' = [{ between = ["a", "ground"], stiffness = 900.0 }]'
+
+
+def knocked(K):
+    """Return the slowest pole [1/s] of the loop of KNOCK around a spring of K [N/m]."""
+    T, mass, damping, stiffness = 2e-3, 0.2 + 0.3, 1.5 + 2.0, 150.0
     plant = np.array([[0, 1, 0], [-stiffness / mass, -damping / mass, -1 / mass], [0, 0, 0]])
     held = expm(plant * T)
     loop = np.array([[*held[0, :2], held[0, 2]], [*held[1, :2], held[1, 2]], [K, 0, 0]])  # the force is a tick late
-    poles = np.log(np.linalg.eigvals(loop).astype(complex)) / T
-    pair = poles[np.argmax(poles.real)]
-    said = ringing(assemble(parse(text), NoCoupling()))
+    values = np.linalg.eigvals(loop).astype(complex)
+    poles = np.log(values[np.abs(values) > 1e-9]) / T
+    return poles[np.argmax(poles.real)]
+
+
+def test_knocks_die_away_as_the_held_plant():
+    """Device and hand are one body before a spring; the poles come from matrices that are written out here."""
+    pair = knocked(900.0)
+    said = ringing(assemble(parse(KNOCK + "springs" + SPRING), NoCoupling()))
     assert said.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
     assert said.frequency_hz == pytest.approx(abs(pair.imag) / (2 * np.pi), rel=1e-9)
     assert said.words.startswith("decays ")
     assert replace(said, decay_per_s=-1.5).words.startswith("grows 1.5 1/s at ")
     assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
+
+
+def test_knocks_die_away_slowest_in_some_contact():
+    """A wall is a spring or nothing; here the touching wall decays more slowly and has the least damping ratio."""
+    away, held = knocked(0.0), knocked(900.0)
+    assert away.real < held.real
+    said = ringing(assemble(parse(KNOCK + "walls" + SPRING), NoCoupling()))
+    assert said.decay_per_s == pytest.approx(-held.real, rel=1e-9)
+    assert said.least_damping_ratio == pytest.approx(-held.real / abs(held), rel=1e-9)
 
 
 @pytest.mark.slow
