@@ -69,7 +69,7 @@ def main() -> None:
         found = design(loop)
         seconds = time.process_time() - started
         reached = 20 * np.log10(max(found.figures.rms_mismatch, 1e-9))
-        least = 20 * np.log10(max(bound(loop).value, 1e-9)) if args.bound else np.nan
+        least = bound(loop).rms_db if args.bound else np.nan
         missed += not found.proved
         delays = f"{','.join(map(str, loop.theta))}/{','.join(map(str, loop.psi))}"
         kind, told = type(found.coupling).__name__, found.reason or "proved"

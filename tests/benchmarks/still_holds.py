@@ -40,10 +40,9 @@ def still_holds(holds: int, seed: int = 0) -> tuple[int, int]:
         counts[k] = np.round(x / step + origin)
         for i in range(SUBSTEPS):
             shake = tremor * np.sin(2 * np.pi * tremor_hz * (k * T + i * h))
-            dry = friction * np.tanh(v / 1e-4)
-            v += (
-                h * (applied[k] * FORCE_STEP + shake - dry - damping * v - stiffness * x) / (mass + h * friction / 1e-4)
-            )
+            dry = friction * np.tanh(v / SLIP)
+            push = applied[k] * FORCE_STEP + shake - dry - damping * v - stiffness * x
+            v += h * push / (mass + h * friction / SLIP)
             x += h * v
     changing = int((np.ptp(applied * FORCE_STEP, axis=0) > 1.0).sum())
     stopped = (_stopped(counts[:, i].tolist(), applied[:, i].tolist(), step[i]) for i in range(holds))

@@ -59,5 +59,7 @@ def test_without_a_second_process_this_one_draws(program, monkeypatch, tmp_path)
 
 def test_an_unwanted_painter_starts_no_process(monkeypatch):
     monkeypatch.delitem(sys.modules, "matplotlib")
-    monkeypatch.setattr(subprocess, "Popen", None)
+    started = []
+    monkeypatch.setattr(subprocess, "Popen", lambda *command, **options: started.append(command))
     Painter(wanted=False)
+    assert not started
