@@ -6,13 +6,14 @@ The coupling may have any order. The bound uses only one property of a certified
 analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the
 circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
 no force has arrived yet).
-Let <X, Y> be the mean of Re tr X*Y over the circle, and w the weight of the mean square relative mismatch
-J = <M, w M>, M = F - Lambda E. Any H(z) with its support in the band has |M|^2 w >= 2 Re tr H*M - |H|^2/w, so that
-    J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/w>.
+Let <X, Y> be the mean of Re tr X*Y over the circle, and rho the weight of the mean square relative
+mismatch J = <M, rho M>, M = F - Lambda E. Any H(z) that vanishes outside the band has
+|M|^2 rho >= 2 Re tr H*M - |H|^2/rho, so that
+    J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/rho>.
 F's coefficients are differences of the s_k. Choose C_k that weigh only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
-Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h
-this bound is
+Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With
+H = rho |E| h this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
@@ -123,10 +124,10 @@ class _Dual:
         import scipy
 
         E = loop.E()
-        low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, 0.999 * np.pi)
-        span = np.log(high / low)
-        knots = _knots(E, low, high, count)
-        grid = np.union1d(knots, frequencies(E, low=low, high=high, points=_GRID))
+        low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)
+        span, end = np.log(high / low), min(high, 0.999 * np.pi)  # H is zero above `end`.
+        knots = _knots(E, low, end, count)
+        grid = np.union1d(knots, frequencies(E, low=low, high=end, points=_GRID))
         x = np.log(knots)
         spline = np.concatenate([[x[0]] * _DEGREE, x, [x[-1]] * _DEGREE])
         hats = scipy.interpolate.BSpline.design_matrix(np.clip(np.log(grid), x[0], x[-1]), spline, _DEGREE).toarray()
@@ -163,7 +164,7 @@ class _Dual:
         return np.concatenate([np.zeros(m * m * len(self.target)), each, np.zeros(len(self.forbidden))])
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """Return A, b, c with -2 <H, Lambda E> - <H, H/w> = |b|^2 - |A x - b|^2; c is `cost`."""
+        """Return A, b, c with -2 <H, Lambda E> - <H, H/rho> = |b|^2 - |A x - b|^2; c is `cost`."""
         return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.cost
 
     def imposed(self) -> Array:

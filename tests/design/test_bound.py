@@ -104,14 +104,17 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
     assert 0 < found.rms <= found.sampled_rms
 
 
-@pytest.mark.parametrize("name", ["n1-omega-II", "o12-free-mass-late"])
-def test_the_integral_errs_by_less_than_its_bound(name):
-    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/rho>."""
+@pytest.mark.parametrize(("name", "high"), [("n1-omega-II", 1e4), ("o12-free-mass-late", 100.0)])
+def test_the_integral_errs_by_less_than_its_bound(name, high):
+    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/rho>.
+
+    The weight rho holds the width of the band up to the Nyquist frequency at most, as in the rms mismatch.
+    """
     loop = loop_of(name)
-    dual = module._Dual.of(loop, (1.0, 100.0), 16)
+    dual = module._Dual.of(loop, (1.0, high), 16)
     x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)
     found, error = dual.objective_again(x)
-    E, H, span = loop.E(), dual.h(x), np.log(dual.band[1] / dual.band[0])
+    E, H, span = loop.E(), dual.h(x), np.log(min(high, 0.5 / loop.T))
     total, wrong = 0.0, 0.0
     for a, b, left, right in zip(dual.grid[:-1], dual.grid[1:], H[:-1], H[1:], strict=True):
         share = np.linspace(0, 1, 401)[:, None, None]

@@ -259,6 +259,31 @@ def test_any_environment_requirements_follow_from_chi():
     assert required_damping(loop, coupling, ANY_ENVIRONMENT).required[0] == pytest.approx(needs, rel=1e-7)
 
 
+def test_periods_latency_and_switching_follow_from_chi():
+    """He[V/(1-z)] > c* Q^-1 c/4 + h^2/(2 alpha) with Q = delta diag(1/tau, 1/(T_max - tau)) - alpha d* d/2, d = (z, 1).
+
+    c holds the mean windows of lo + 1 and hi + 1 ticks, and of lo and hi.
+    """
+    T, longest, tau, lo, hi = 1e-3, 1.4e-3, 0.3e-3, 0, 2
+    further = {"varying_delay": DelayRange((lo,), (hi,)), "latency": ((tau, tau),), "T_max": longest}
+    loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1.0),)), T, 1, **further)
+    found = required_damping(loop, SpringDamper([900.0], [0.3]), ANY_ENVIRONMENT)
+    (delta,), (alpha,) = found.required, found.multiplier
+    z = np.exp(1j * np.append(np.linspace(1e-4, np.pi, 20001), 2 * np.pi * T * found.frequency_hz))
+    V = 1 / (900.0 + 0.3 * (1 - 1 / z) / T)
+    d = np.stack([z, np.ones_like(z)], axis=1)
+    c = np.stack([sum(sum(z**-k for k in range(n + j)) for n in (lo, hi)) / 2 for j in (2, 1)], axis=1)
+
+    def left(scale):
+        Q = np.diag([1 / tau, 1 / (longest - tau)]) * scale * delta
+        Q = Q - alpha / 2 * np.conj(d)[:, :, None] * d[:, None, :]
+        charge = np.einsum("ki,kij,kj->k", np.conj(c), np.linalg.inv(Q), c).real / 4
+        assert (np.linalg.eigvalsh(Q) > 0).all()
+        return ((V / (1 - z)).real - charge - ((hi - lo) / 2) ** 2 / (2 * alpha)).min()
+
+    assert left(1 + 1e-6) > 0 > left(1 - 1e-6)
+
+
 @pytest.mark.parametrize("further", [LATE, SWITCHED, LATE | SWITCHED], ids=["latency", "switching", "both"])
 def test_any_environment_is_proved_stored_and_verified(further):
     loop, least = anywhere(further)
