@@ -678,10 +678,11 @@ class Walls(Fact):
 class Switching(Fact):
     """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
-    A force that is late by n in [lo, hi] differs by an error w from the mean of the forces late by lo and by hi. Summed
-    over all ticks, w^2 is at most ((hi - lo)/2)^2 times the squared steps of the force. The multiplier weighs w against
-    the displacement that the force multiplies. The axes of a device share its delay, so the weight is the matrix
-    alpha_i Delta_i / mean(diag(Delta_i)).
+    A force that is late by n in [lo, hi] differs by an error from the mean of the forces late by lo and by hi. With
+    h = (hi - lo)/2 the squared errors add up to at most h^2 times the squared steps df_e of the force. So their work on
+    the displacement dq that the force multiplies is at least the sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha). The last
+    term is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes of a
+    device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:

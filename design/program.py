@@ -140,7 +140,7 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
-    # Each channel whose delay varies has a further input, the error of its force.
+    # Each channel whose delay varies has a further input, w of design.facts.Switching.
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
     (multiplier,) = SWITCHING.unknowns(switched)
     units = np.array(multiplier.units)  # (devices,), 0 where the delay is constant
