@@ -123,7 +123,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
     engine.start(buffer)
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
     sent, age = np.zeros((depth, m, nsim)), np.broadcast_to(hi, (m, nsim))
-    candidate = np.arange(depth)[:, None, None]
+    candidate, row, column = np.arange(depth)[:, None, None], np.arange(m)[:, None], np.arange(nsim)
     ages = np.empty((ticks, m, nsim), dtype=np.int64)
     for k in range(ticks):
         buffer.w[0] = pushed[k][:, None]
@@ -131,7 +131,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
         sent = np.concatenate([buffer.f[0][None], sent[:-1]])  # sent[n] left n ticks ago
         allowed = (candidate >= lo) & (candidate <= np.minimum(hi, age + 1))
         age = np.argmin(np.where(allowed, sent * buffer.s[0][nv : nv + m], np.inf), axis=0)
-        buffer.f[0] = np.take_along_axis(sent, age[None], axis=0)[0]
+        buffer.f[0] = sent[age, row, column]
         engine.advance(0)
         buffer.rewind(1)
         ages[k] = age

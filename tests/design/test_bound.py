@@ -83,7 +83,7 @@ def test_the_charged_matrix_is_nowhere_negative(name):
     assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # the charge is not much too large
 
 
-@pytest.mark.validate  # tests/design/test_limits.py computes the bound of case I in the suite
+@pytest.mark.validate
 @pytest.mark.parametrize(("name", "rms_db"), [("I", -35.137), ("II", -13.839)])
 def test_packaged_bounds_are_those_worked_out_separately(name, rms_db):
     found, _ = judged(name)

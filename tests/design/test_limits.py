@@ -9,7 +9,6 @@ from worlds import force_map
 from haptic_loop import certify, load, transparency_of
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.environment import environment
-from haptic_loop.design.bound import bound
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.program import _BASES
 
@@ -31,14 +30,11 @@ def test_more_damping_is_never_worse():
         assert max(certify(loop, design)["this-environment"].required) < loop.delta[0]
 
 
-@pytest.mark.slow
-def test_more_bases_are_never_worse_than_the_bound():
-    """The bound of -35.137 dB was computed separately."""
-    rms, least = [transparency_of(*optimum(1.37, bases)).rms_mismatch_db for bases in (1, 3)], bound(LOOP)
-    assert rms == sorted(rms, reverse=True)
-    assert rms[-1] - 1 < least.rms_db < rms[-1]
-    assert least.rms_db == pytest.approx(-35.137, abs=0.006)
-    assert 0 < least.rms < least.sampled_rms
+@pytest.mark.parametrize("most", [2, pytest.param(3, marks=pytest.mark.validate)])
+def test_more_bases_approach_the_bound(most):
+    """The bound of -35.137 dB was computed separately; `make validate` computes it in tests/design/test_bound.py."""
+    first, last = (transparency_of(*optimum(1.37, bases)).rms_mismatch_db for bases in (1, most))
+    assert -35.137 < last < min(first, -33.8 if most == 2 else -34.8)
 
 
 def test_the_printed_gains_match_hand_calculation():

@@ -92,16 +92,19 @@ def test_any_environment_designs_refuse_varying_delays():
         design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
 
 
-@pytest.mark.slow
-def test_an_optimal_coupling_for_switching_delays():
-    """The design is proved, a sweep confirms it, and no lossless hand grows under adversarial switching."""
+@pytest.mark.parametrize(
+    ("basis", "most_db"),
+    # measured: -12.85 dB and -13.37 dB; the designed spring-damper has -3.4 dB
+    [((4, 3), -12.8), pytest.param((14, 10), -13.3, marks=pytest.mark.validate)],
+)
+def test_an_optimal_coupling_for_switching_delays(basis, most_db):
+    """The design is proved and a sweep confirms it; under adversarial switching no lossless hand grows."""
     asked = load().loop("I")
-    made = design_with(asked.switching(DelayRange(*RANGE)), bases=((14, 10),))
+    made = design_with(asked.switching(DelayRange(*RANGE)), bases=(basis,))
     assert made.proved
     swept = switching_sweep(asked.sent(made.coupling), *RANGE, asked.delta)
     assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # a margin of 0.2 %; all other damping is used
-    # Measured with this basis: -13.4 dB. The designed spring-damper has -3.4 dB.
-    assert 20 * np.log10(made.objective) < -13.3
+    assert 20 * np.log10(made.objective) < most_db
     loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
     assert growing(loop) == 0
 

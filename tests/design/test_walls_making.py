@@ -1,6 +1,7 @@
 """Tests of this-environment with walls that make and break contact: block, proof step by step, certificates, hands."""
 
 import itertools
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -179,19 +180,24 @@ def test_six_facts_hold_at_every_transition():
     assert (before * dp >= -scale * 1e3 * (k + b)).all()
 
 
-def steps_of(loop, coupling, damping):
-    """Return the map G, the block, its storage P, the residue S on (x, h), and the multipliers."""
-    asked = change(loop, delta=tuple(damping))
-    multiplier = required_damping(asked, coupling, "this-environment").multiplier
-    demand = THIS_ENVIRONMENT.block(loop.walled_before_delay(coupling, exact=True), asked, multiplier)
+@cache
+def steps_of(damped):
+    """Return 1.01 of the required damping, the map G, the block, its storage P, the residue S on (x, h), and m."""
+    loop = DAMPED if damped else PAIR
+    need = required_damping(loop, BOTH, "this-environment")
+    delta = 1.01 * need.ratio * np.array(loop.delta)
+    demand = THIS_ENVIRONMENT.block(
+        loop.walled_before_delay(BOTH, exact=True), change(loop, delta=tuple(delta.tolist())), need.multiplier
+    )
     block = demand.free + demand.gain
     P, reason = find_storage(block)
     assert P is not None, reason
-    G, m = loop.walled(coupling), loop.channels
+    G, m = loop.walled(BOTH), loop.channels
     k = np.array([w.stiffness for w in loop.environment.walls])
     S1 = G.dc()
     S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
-    return G, block.floats(), P.floats() / 2, S, np.array(multiplier).reshape(4, -1)  # KYP is twice the balance of Z.
+    m_ = np.array(need.multiplier).reshape(4, -1)[3]
+    return delta, G, block.floats(), P.floats() / 2, S, m_  # KYP is twice the balance of Z.
 
 
 class Walled:
@@ -223,13 +229,11 @@ class Walled:
         return f, output[self.m :], p
 
 
-@pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
-def test_every_step_of_the_proof(loop):
+@pytest.mark.parametrize("damped", [False, True], ids=["springs", "dampers"])
+def test_every_step_of_the_proof(damped):
     """On random motions of the running law the balance of Z holds at every tick, and Z >= min(0, its first value)."""
-    rng = np.random.default_rng(0)
-    need = required_damping(loop, BOTH, "this-environment").ratio
-    delta = 1.01 * need * np.array(loop.delta)
-    _, block, P, S, (_, _, _, m_) = steps_of(loop, BOTH, delta.tolist())
+    rng, loop = np.random.default_rng(0), DAMPED if damped else PAIR
+    delta, _, block, P, S, m_ = steps_of(damped)
     there, ticks = Walled(loop, BOTH, block), 800
     x = np.cumsum(rng.standard_normal((ticks + 1, 2)) * rng.choice([1e-5, 3e-4], (ticks + 1, 1)), axis=0)
     seen, pressed, left = [], 0, 0
@@ -243,7 +247,7 @@ def test_every_step_of_the_proof(loop):
         pressed, left = pressed + (p > 0).any(), left + ((p == 0) & (there.h > 0)).any()
     start = seen[0][2]
     assert 50 < pressed < ticks
-    assert (left > 0) == (loop is DAMPED)  # Only with dampers is p = 0 at h > 0.
+    assert (left > 0) == damped  # Only with dampers is p = 0 at h > 0.
     for (x0, f, Z), (x1, _, Z1) in itertools.pairwise(seen):
         dx = x1 - x0
         size = 1e-9 * (abs(Z) + abs(Z1) + 1e-6)
@@ -307,7 +311,7 @@ def test_couplings_may_be_stiffer_than_any_environment_allows():
 # Hands that touch and leave a wall, simulated exactly.
 
 
-HANDS, TICKS = 60, 20000
+HANDS = 60
 
 
 def pressed_at_rest(damping=0.0):
@@ -316,26 +320,26 @@ def pressed_at_rest(damping=0.0):
     return Loop(1e-3, (1,), (0,), (1,), (1.37,), network)
 
 
-def swinging(loop, coupling, damping, seed=11):
+def swinging(loop, coupling, damping, ticks, seed=11):
     """Return the largest speed [m/s] of lossless hands in the last 2 % of the ticks, and the number of all contacts."""
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3, HANDS)
     A = np.zeros((HANDS, 3, 3))
     A[:, 0, 1] = 1
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
-    step, tick = expm(A * loop.T), loop.law(coupling).transition()
-    plant = rng.standard_normal((HANDS, 2)) * (1e-2, 0.1)
+    step, tick = np.ascontiguousarray(np.moveaxis(expm(A * loop.T)[:, :2], 0, 2)), loop.law(coupling).transition()
+    plant = rng.standard_normal((HANDS, 2)).T * [[1e-2], [0.1]]
     before, after = np.zeros((2, loop.walled(coupling).order + 2, HANDS))
     made, touching, fastest = 0, np.zeros(HANDS, dtype=bool), 0.0
-    for k in range(TICKS):
-        before[-1] = plant[:, 0]
+    for k in range(ticks):
+        before[-1] = plant[0]
         tick(before, after)
         before[:-1] = after[1:]
-        plant = (step @ np.column_stack([plant, after[0]])[..., None])[:, :2, 0]
+        plant = (step * [*plant, after[0]]).sum(axis=1)
         now = after[-1] > 0
         made, touching = made + int((now & ~touching).sum()), now
-        if k > 0.98 * TICKS:
-            fastest = max(fastest, float(np.abs(plant[:, 1]).max()))
+        if k > 0.98 * ticks:
+            fastest = max(fastest, float(np.abs(plant[1]).max()))
     return fastest, made
 
 
@@ -344,10 +348,11 @@ def swinging(loop, coupling, damping, seed=11):
 def test_hands_rest_at_the_requirement_not_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = required_damping(loop, coupling, "this-environment").required[0]
-    fastest, made = swinging(loop, coupling, 1.02 * need)
+    ticks = 12_000 if damping else 20_000
+    fastest, made = swinging(loop, coupling, 1.02 * need, ticks)
     assert made > (300 if damping else 500)
     assert fastest < 0.05  # Heavy hands come to rest last.
-    assert swinging(loop, coupling, short * need)[0] > 0.5  # These hands never rest.
+    assert swinging(loop, coupling, short * need, ticks // 3)[0] > 0.5  # These hands never rest.
 
 
 def test_damped_wall_designs_are_tight_and_proved():
@@ -361,34 +366,42 @@ def test_damped_wall_designs_are_tight_and_proved():
     assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified
 
 
-@pytest.mark.parametrize("loop", [PAIR, pytest.param(DAMPED, marks=pytest.mark.slow)], ids=["springs", "dampers"])
-def test_frozen_walls_fall_to_a_nonnegative_value(loop):
+@pytest.mark.parametrize("damped", [False, True], ids=["springs", "dampers"])
+def test_frozen_walls_fall_to_a_nonnegative_value(damped):
     """With x held and the touched walls kept, even where they pull, Z falls from states of the loop to a value >= 0."""
     rng = np.random.default_rng(5)
-    delta = (1.01 * required_damping(loop, BOTH, "this-environment").ratio * np.array(loop.delta)).tolist()
-    G, block, P, S, _ = steps_of(loop, BOTH, delta)
-    there, frozen = Walled(loop, BOTH, block), 0
+    _, G, block, P, S, _ = steps_of(damped)
+    there, frozen = Walled(DAMPED if damped else PAIR, BOTH, block), 0
     k, b, gap, m = there.k, there.b, there.gap, 2
     x = np.cumsum(rng.standard_normal((240, m)) * rng.choice([1e-5, 3e-4], (240, 1)), axis=0)
+    ends = [block.order, block.order + G.order]
+
+    def after(values, one=0.0):
+        """Return xi, the state of G and the depths h a tick later; with one = 0 without x and the gaps."""
+        xi, state, h = np.split(values, ends)
+        here, gaps = one * x[tick], one * gap
+        free = G.C[m:] @ state + G.D[m:, :m] @ here  # This is y without the walls' forces at this tick.
+        p = solve @ np.where(on, (k + b) * (free - gaps) - b * h, 0)
+        then = np.where(on, free + G.D[m:, m:] @ p - gaps, 0)
+        steps = zip(then - h, b, strict=True)
+        v = np.array([0.0, 0.0, *(value for u, damper in steps for value in ((u, 0.0) if damper else (u,)))])
+        return np.concatenate([block.A @ xi + block.B @ v, G.A @ state + G.B @ np.concatenate([here, p]), then])
+
     for tick in range(240):
         there.step(x[tick])
         there.xi = block.A @ there.xi + block.B @ there.v
         if tick % 80 != 79 or (there.s > 1e-12).any():
             continue
-        on, xi, state, h = there.h > 0, there.xi, there.state[: G.order], there.h
+        on, frozen = there.h > 0, frozen + 1
         solve = np.linalg.inv(np.eye(3) - np.where(on, k + b, 0)[:, None] * G.D[m:, m:])
-        last, frozen = np.inf, frozen + 1
+        path = [np.concatenate([there.xi, there.state[: G.order], there.h])]
+        linear, constant = np.array([after(unit) for unit in np.eye(path[0].size)]).T, after(0 * path[0], 1.0)
         for _ in range(3000):
-            X = np.concatenate([x[tick], h])
-            Z = xi @ P @ xi + X @ S @ X / 2 - (k * gap * h).sum()
-            assert last - Z >= -1e-9 * (abs(Z) + 1e-9)
-            free = G.C[m:] @ state + G.D[m:, :m] @ x[tick]  # This is y without the walls' forces at this tick.
-            p = solve @ np.where(on, (k + b) * (free - gap) - b * h, 0)
-            after = np.where(on, free + G.D[m:, m:] @ p - gap, 0)
-            steps = zip(after - h, b, strict=True)
-            v = np.array([0.0, 0.0, *(value for u, damper in steps for value in ((u, 0.0) if damper else (u,)))])
-            state = G.A @ state + G.B @ np.concatenate([x[tick], p])
-            xi, h, last = block.A @ xi + block.B @ v, after, Z
-        assert last >= -1e-12
-        assert np.abs(v).max() < 1e-6 * (np.abs(h).max() + 1e-9)  # the frozen motion has come to rest
+            path.append(linear @ path[-1] + constant)
+        xi, _, h = np.split(np.array(path), ends, axis=1)
+        X = np.hstack([np.broadcast_to(x[tick], (len(h), m)), h])
+        Z = (xi @ P * xi).sum(axis=1) + (X @ S * X).sum(axis=1) / 2 - h @ (k * gap)
+        assert (np.diff(Z) <= 1e-9 * (np.abs(Z[1:]) + 1e-9)).all()
+        assert Z[-1] >= -1e-12
+        assert np.abs(h[-1] - h[-2]).max() < 1e-6 * (np.abs(h[-1]).max() + 1e-9)  # the frozen motion has come to rest
     assert frozen > 1
