@@ -27,14 +27,18 @@ def test_energy_bounding_is_the_published_interval():
         before = force
 
 
-def test_the_passivity_controller_returns_what_its_observer_misses():
-    rng = np.random.default_rng(16)
-    control, observed = PassivityControl(2, T, nsim=5), np.zeros((2, 5))
+@pytest.mark.parametrize("delta", [0.0, 1.2])
+def test_the_passivity_controller_returns_what_its_observer_misses(delta):
+    """With a credit for the devices' damping, the observed energy and delta dx^2/T add up to at least 0."""
+    rng, acted = np.random.default_rng(16), 0
+    control, observed = PassivityControl(2, T, delta, nsim=5), np.zeros((2, 5))
     for _ in range(300):
         dx, wanted = 1e-4 * rng.normal(size=(2, 5)), rng.normal(size=(2, 5))
         force = control.limit(wanted, dx)
-        observed += force * dx
+        observed += force * dx + delta * dx**2 / T
+        acted += (force != wanted).sum()
         assert observed.min() > -1e-12
+    assert acted > 50
 
 
 def test_the_passivity_controller_is_the_published_one():

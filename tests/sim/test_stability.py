@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from haptic_loop.design.result import DesignFailed
 from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import HumanSets, variants
 from haptic_loop.sim.couplings import read_coupling
+from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, load, parse
 from haptic_loop.sim.stability import (
@@ -25,6 +27,7 @@ from haptic_loop.sim.stability import (
     close,
     disagree,
     dominant_mode,
+    impulse_forces,
     impulse_growth,
     mujoco_plants,
     ringing,
@@ -110,6 +113,27 @@ def test_free_hands_settle_by_their_speed():
     rates = np.sort(np.log(np.abs(loop.eigenvalues) + 1e-300) / loop.T)
     assert rates[-1] == pytest.approx(0, abs=1e-9)
     assert growth == pytest.approx(rates[-2], rel=1e-3)
+
+
+def test_figures_of_an_impulse_are_its_traces():
+    """The energy is the least sum of f'dx + dx' delta dx/T, and speeds are compared between two quarters."""
+    late = Network(("a",), (Spring(("a", GROUND), 2000.0),))
+    scenario = load("one-wall").replace(environment=late, theta=(2,), tap=None)
+    question = Validation(scenario, NoCoupling(), 0, 3, 1, "exact", 0.25)
+    found = _examine(question, range(3))
+    assert (found.energy < 0).any()
+    assert (found.trace_error > 3.99 / 0.25).all()  # four time constants decide a sign
+    for i in range(3):
+        simulation = assemble(scenario.replace(human=question.crowd(i).humans(0)), NoCoupling())
+        knock = partial(impulse_forces, simulation.scene, simulation.scenario.T)
+        trace = run(simulation, "exact", knock, question.ticks + 1)
+        dx = np.diff(trace.x, axis=0)
+        terms = trace.f[:-1] * dx + np.array(simulation.scenario.delta) / simulation.scenario.T * dx**2
+        least = terms.sum(axis=1).cumsum().min(initial=0.0)
+        assert found.energy[i] == pytest.approx(least, abs=1e-12 * found.audited[i])
+        n, speed = question.ticks, trace.v_handle
+        early, last = np.linalg.norm(speed[n // 4 : n // 2]), np.linalg.norm(speed[n - n // 4 : n])
+        assert found.settling[i] == pytest.approx(last / early, rel=1e-9)
 
 
 def test_diverged_runs_are_unstable():
