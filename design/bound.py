@@ -89,10 +89,14 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
-    T_max are replaced by even periods with less damping, as in the condition.
+    T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1 the
+    condition has the damping Delta/(T_max - t1) on the displacements after the latch alone (design.facts.Latency). So
+    it implies this-environment without latency for more damping, which counts here.
     """
-    started = time.perf_counter()
-    level = even_level(loop)
+    started, level = time.perf_counter(), even_level(loop)
+    if loop.latency:
+        longest, first = loop.T_max or loop.T, np.array([least for least, _ in loop.latency])
+        level = level * (longest / (longest - first))[:, None]
     delta = tuple(np.diag(level).tolist())
     levels = loop.levels and tuple(tuple(map(tuple, level[own, own].tolist())) for own in loop.devices)
     loop = msgspec.structs.replace(loop, delta=delta, levels=levels, T_max=None)

@@ -14,6 +14,7 @@ from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design import bound as module
 from haptic_loop.design.bound import BoundBeside, bound
+from haptic_loop.design.certificate import required_damping
 from haptic_loop.design.dual_matrix import DualMatrix
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.sim.scenario import load
@@ -206,10 +207,19 @@ def test_a_full_level_enters_the_dual_value():
     assert dual.objective()[2] @ x == pytest.approx(product - forces, rel=1e-4)
 
 
-def test_the_longest_period_scales_a_full_level(monkeypatch):
-    """Periods up to 2 T count as periods T of devices with half the level."""
+@pytest.mark.parametrize(("latency", "factor"), [(None, 1 / 2), (((5e-4, 8e-4),) * 2, 1 / 1.5)])
+def test_timing_scales_the_level_of_a_bound(monkeypatch, latency, factor):
+    """After a latency of at least t1 the level is Delta/(T_max - t1), instead of Delta/T."""
     seen = []
     monkeypatch.setattr(module._Dual, "best", lambda dual: (seen.append(dual.loop), 1.0, 1.0)[1:])
-    bound(msgspec.structs.replace(PLANE, T_max=2 * PLANE.T), knots=8)
-    np.testing.assert_array_equal(seen[0].Delta(), np.array(LEVEL) / 2)
+    bound(msgspec.structs.replace(PLANE, T_max=2 * PLANE.T, latency=latency), knots=8)
+    np.testing.assert_allclose(seen[0].Delta(), factor * np.array(LEVEL), rtol=1e-15)
     assert seen[0].T_max is None
+
+
+def test_no_bound_exceeds_a_late_certified_loop():
+    """A damper of 1.2 N s/m without coupling has no error; it is certified for 1 N s/m only if forces latch late."""
+    damper = Network(("tip",), (Spring(("tip", GROUND), 1.0, 1.2),))
+    loop = Loop(1e-3, (0,), (0,), (0,), (1.0,), damper, latency=((5e-4, 5e-4),))
+    assert required_damping(loop, NoCoupling(), "this-environment").certified
+    assert bound(loop, (1.0, 500.0), knots=8).rms == 0
