@@ -10,7 +10,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any, Self
 
@@ -76,20 +76,21 @@ class ForceDimension:
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
         self._ids: dict[str, int] = {}
-        for name in dict.fromkeys(name for name, _ in self._where):
-            sdk = self._sdk
-            ID = sdk.openSerial(int(name[2:])) if name.startswith("sn") else sdk.openID(int(name))
-            if ID < 0:
-                why = sdk.errorGetLastStr()
-                self.__exit__()
-                raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {why}")
-            self._ids[name] = ID
-        self._status = {index: self._sdk.Status() for index in self._ids}
-        first = next(iter(self._ids.values()))
-        name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
-        self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
-        self._sdk.enableExpertMode()  # the watchdog needs expert mode
-        self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
+        with ExitStack() as opened:
+            opened.push(self)  # an exception closes the devices that are open
+            for name in dict.fromkeys(name for name, _ in self._where):
+                sdk = self._sdk
+                ID = sdk.openSerial(int(name[2:])) if name.startswith("sn") else sdk.openID(int(name))
+                if ID < 0:
+                    raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {sdk.errorGetLastStr()}")
+                self._ids[name] = ID
+            self._status = {index: self._sdk.Status() for index in self._ids}
+            first = next(iter(self._ids.values()))
+            name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
+            self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
+            self._sdk.enableExpertMode()  # the watchdog needs expert mode
+            self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
+            opened.pop_all()
         self._device, self._decoder = Device(self._info), wire.Decoder()
         self._T = 1e-9 * self._info.period_ns
         self._due = clock()

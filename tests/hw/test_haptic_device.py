@@ -347,6 +347,18 @@ def test_axes_that_are_none_are_refused(scenario, axes, words):
     assert sdk.open == []
 
 
+@pytest.mark.parametrize("call", ["getSystemName", "getSerialNumber", "enableExpertMode", "setWatchdog", "Status"])
+def test_exceptions_while_opening_close_every_device(scenario, monkeypatch, call):
+    def fail(*args, **more):
+        raise OSError(call)
+
+    monkeypatch.setattr(sdk := StandIn(scenario), call, fail)
+    with pytest.raises(OSError, match=call):
+        ForceDimension(scenario, "0x,1x", sdk, sdk.clock, sdk.sleep)
+    assert sdk.open == []
+    assert sdk.enabled == {0: False, 1: False}
+
+
 def test_two_axes_of_one_device(scenario):
     sdk = StandIn(scenario)
     with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep) as device:
