@@ -253,7 +253,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """Return the range of the scenario, or that of --varying-delay. Raises InputError if the latter omits theta."""
+    """Return the range of --varying-delay, or else the scenario's. Raises InputError if the former excludes theta."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:

@@ -96,7 +96,7 @@ def touch(way, scenario, coupling, hands, seconds, seed=0):
 
 
 def scenes(folder):
-    """Return the packaged stack, and a fixed block touched by tips of 2 kg, as of robots, with contacts of 5 ms."""
+    """Return the packaged stack, and a fixed block with robot-like tips of 2 kg and contacts of time constant 5 ms."""
     stack = load("world-stack")
     (Path(folder) / "block.xml").write_text(BLOCK)
     block = Path(folder) / "block.xml"

@@ -21,7 +21,7 @@ from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.monitor import CommandMonitor
 
 _CLEARLY_FASTER = 1e-4  # relative difference of two clocks that stands out from jitter after _COMPARED ticks
-_EARLY = 1 / 16  # [periods] least lead: time by which a sample precedes the leading board's; steps need not wait for it
+_EARLY = 1 / 16  # [periods] least lead, the time by which a sample precedes the leading board's, so that no step waits
 _TOO_EARLY = 1.5  # [periods] largest lead of a sample; with a longer one, the board's force may come too late
 _SMOOTHED = 31  # number of leads whose median is used; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
