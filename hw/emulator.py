@@ -41,7 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at full cap after which the person starts to move; with encoder tests, full gain may come later
+_SETTLED = 203  # ticks at the full cap of the device before the person starts to move; the host's gain may rise later
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
@@ -159,7 +159,7 @@ class Line:
         self._held: bytes | None = None  # a frame that the next one overtakes
 
     def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
-        """Return the frames that arrive where `frame` was sent, each after its time of arrival [us]."""
+        """Return (time of arrival [us], frame) of each frame that arrives in place of `frame`."""
         frames, due = [frame], now_us + self._latency
         for fault in self._faults:
             if fault.active(since_armed):

@@ -165,7 +165,7 @@ class SafetyLimits:
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
     def check_jolt(self, path: Sequence[tuple[float, ...]], most: Sequence[float]) -> None:
-        """Raise SafetyStop where an axis gained and lost a speed within two ticks, by more than `most` (m,) [m/tick].
+        """Raise SafetyStop where an axis gained and lost more than `most` (m,) [m/tick] of speed within two ticks.
 
         `path` has the displacements (m,) [m] of four ticks in a row. A counting error leaves such a pulse of speed. No
         hand or motor makes one, and a handle that hits a stop only loses its speed.

@@ -36,11 +36,11 @@ _REMEMBERED = 64  # most forces or latches that are stored; at most the last the
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
 _PATIENCE = 5  # wrong ticks in a row at which a session stops
 _CHANGE = 1.0  # [1 N, or half of a weak motor's cap] change of force that moves any handle not at an end stop
-_IMPULSE = 0.1  # [s] times the unit of _CHANGE: largest integral of such changes without a motion; 1 N for 100 ms
+_IMPULSE = 0.1  # [s] largest time integral of such changes without a motion, in the unit of _CHANGE: 1 N for 100 ms
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
 _PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions are always mixed
-_TEST_SPEED = 0.1  # [m/s] fastest expected motion above this force; a dead direction then leaves 0.4 m/s after a block
+_TEST_SPEED = 0.1  # [m/s] expected in the last test if this takes more force; with a dead direction a block ends at 0.4
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
@@ -562,8 +562,8 @@ class EncoderTest:
     shape. A motion that comes later than expected shows a hidden delay, because friction and hands advance its phase.
     Dry friction makes weak motions small, so only the strongest force finds a motion too small. Coarse counts leave the
     delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
-    (`remarks`). A motor that is weak in one direction adds the motion under the absolute value of the force, which
-    pauses make another shape.
+    (`remarks`). A motor that is weak in one direction adds a motion as under the absolute value of the force. Pauses
+    between the pulses give this motion another shape.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
@@ -647,9 +647,9 @@ class EncoderTest:
         """Compare all motions with the expected one.
 
         Returns the relative size and the fit (m,) of all motions. For the tested axis, also returns the size at any
-        phase of the force, the delay and its error [ticks], how much its two directions differ as a share of their sum
-        (less the error of the counts, and 0 unless this explains the rest of the motion), and whether the shape is that
-        of the expected handle but not that of a handle in a heavy hand.
+        phase of the force, the delay and its error [ticks], the difference of its two directions as a share of their
+        sum (less the error of the counts; 0 unless this difference explains most of what the other shapes leave), and
+        whether the shape is that of the expected handle but not that of a handle in a heavy hand.
 
         The delay is -a/s in the fit s x + a x' + e y of the expected motion x, and of the motion y under the absolute
         value of the force; the directions differ by e/s. The row p of the pseudoinverse that yields a turns rounding

@@ -35,8 +35,8 @@ _PIECE = 100_000  # ticks whose ages are computed at a time, to save memory
 class IncidentLog:
     """A log file that is complete up to the last second, however the process ends.
 
-    Each line is a JSON object. Every entry of the session's log is written at once, its state every second. The lines
-    survive SIGKILL, but may not survive a power failure.
+    Each line is a JSON object. Every entry of the session's log is written at once, the session's state every second.
+    The lines survive SIGKILL, but may not survive a power failure.
     """
 
     def __init__(self, path: Path) -> None:
