@@ -290,7 +290,7 @@ def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Pat
     rows = [*_common_rows(report), *((f"least energy, {name}", _energy(value)) for name, value in least.items())]
     rows.append(("active parts", ", ".join(report.scene.active) or None))
     parts = [(str(part["part"]), str(part["count"]), str(part["at_the_port"])) for part in report.scene.parts]
-    heads = ("part", "count", "at the port")
+    heads = ("part", "count", "energy at the port, or its bound")
     table = render.grid(f"{report.scene.file}: {report.scene.settings}", heads, parts, (0, 2))
     _publish(args, report, report.guarantee, rows, out, tables=[table])
     return options.exit_code(report.guaranteed)

@@ -70,7 +70,7 @@ class Coupling:
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """Return an internal-model coupling with this model as a `Compliance`; None for every other coupling."""
+        """Return the `Compliance` of an internal-model coupling that contains `model`; None for other couplings."""
         return None
 
     def at_period(self, T: float) -> Coupling:

@@ -377,9 +377,9 @@ def compare_engines(
 ) -> tuple[EngineChoice, ...]:
     """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
 
-    Runs include the scenario's walls, limits, encoder steps, varying delays and net. Verdicts are for constant delays
-    without a net. With friction, the reference is refined until its error is at most `error`. Every run calls
-    `progress`.
+    Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
+    constant delays without the layer. With friction, the reference is refined until its error is at most `error`. Every
+    run calls `progress`.
 
     Raises InputError if `error` is not positive, if 256 substeps or 60 million evaluations of the dynamics do not
     suffice, or if nothing moves.
@@ -436,7 +436,7 @@ def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) 
     """Repeat the run with RK4, or with the exponential integrator if RK4 ran, and compare both.
 
     RK4 uses no matrix of the other engines, except for impedances of hands. `simulation` is the loop that ran, with its
-    net. Positions are compared up to the end of the shorter run.
+    passivity layer. Positions are compared up to the end of the shorter run.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
