@@ -65,7 +65,7 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse the options `names` as "only `where`", unless `acts` is true for the parsed arguments."""
+        """Refuse the options `names`, with an error that ends in `where`, unless `acts` is true for the arguments."""
         self._only.append((where, acts, names))
 
     def format_help(self) -> str:
@@ -222,7 +222,7 @@ class Parser(argparse.ArgumentParser):
         loss = "probability that a force is lost; the device then holds the last one"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)
         group.add_argument("--playout", action="store_true", help="a buffer that gives every force the largest delay")
-        alike = "without --playout, with which every force has the largest delay"
+        alike = "without --playout: a playout buffer gives every force the largest delay"
         self.only(alike, lambda args: not args.playout or args.pattern not in _DRAWN, "pattern")
 
     def add_output(

@@ -581,7 +581,7 @@ def _free_directions(network: Network, parts: Sequence[Spring | Wall], T: Number
 
     The position in such a direction affects no force and would be an unobservable integrator. The node of a direction
     moves by 1 in it and not at all in the others; `_realise` stores positions relative to this node. A body that no
-    spring joins to a contact or to ground may move as a whole. A body that one diagonal spring ties to ground may move
+    spring joins to a contact or to ground moves freely. A body that one diagonal spring ties to ground moves freely
     across this spring. The elimination is exact, and the result has the arithmetic of T.
     """
     inner = {name: i for i, name in enumerate(network.nodes()[len(network.contacts) :])}
