@@ -308,7 +308,7 @@ class Lti(ReadOnly):
 
     @cached_property
     def _lines(self) -> tuple[NDArray[np.intp], list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]]:
-        """Split the states into core states and delay lines, given as (index of the head among them, states, delays).
+        """Split the states into core states and delay lines, each (index of its head in the core, states, delays).
 
         The states of a delay line are delayed copies of a core state, its head. No core state reads these copies.
         """

@@ -416,7 +416,7 @@ _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the eng
 class ImpulseTest:
     """The results of an impulse test, with one entry per simulation."""
 
-    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, until a force clips; nan: short, noise, or walls
+    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode before a force clips; nan if it cannot be fitted
     error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
     clipped: NDArray[np.int64]  # (nsim,) ticks in which a force is at its limit or, with a limiter, the limiter acts
     least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick

@@ -19,7 +19,7 @@ from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
 from haptic_loop.sim.stability import unstable
 
-_SETTLING = 4  # least duration of a trace whose hands must slow down, in decay times of the slowest mode
+_SETTLING = 4  # least duration of a trace whose handles must slow down, in decay times of the slowest mode
 _ROUNDING = 1e-9  # allowed negative energy W(N) (sim.crowds), relative to the magnitudes of its terms
 
 
@@ -144,7 +144,7 @@ class WorstDrawn:
 
 @dataclass(frozen=True)
 class Traces:
-    """Figures of the traces, and whether they are long enough for hands to slow down."""
+    """Figures of the traces, and whether they are long enough for handles to slow down."""
 
     duration_s: float
     humans: int
@@ -166,7 +166,7 @@ class Traces:
         stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
         decay = largest(-1 / findings.exact[findings.exact < 0])
         decides = decay is None or duration >= _SETTLING * decay
-        slow = f"the slowest mode decays in {decay or 0:.3g} s, so hands may not have slowed down after {duration:g} s"
+        slow = f"the slowest mode decays in {decay or 0:.3g} s, so handles may not have slowed after {duration:g} s"
         return cls(
             duration_s=duration,
             humans=findings.index.size,

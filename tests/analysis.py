@@ -1,4 +1,7 @@
-"""Check Theorem 4 for a given coupling by a feasibility problem with a signed margin."""
+"""Check the paper's Theorem 4 (docs/theory.md) for a given coupling by a feasibility problem with a signed margin.
+
+Numbers in parentheses are the paper's equations.
+"""
 
 from __future__ import annotations
 

@@ -4,7 +4,9 @@ PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03
 
 `before` is the rms mismatch of version 0.1's optimal couplings for nine loops. `to beat` is the goal for the rms
 mismatch and the rendered stiffness g. The bound is computed for loops of at most --bound devices. Seconds are CPU
-seconds; `limited` is the mismatch of the coupling that also covers limited forces.
+seconds. `need` is the required over the available damping, and `at 10 %` the worst one when a parameter of the object
+changes by 10 %. `gain` is the high-frequency gain (design/transparency.py), and `limited` the mismatch of the coupling
+that also covers limited forces.
 """
 
 from __future__ import annotations
