@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from haptic_loop.controller.units import speak, spoken
 from haptic_loop.design.files import write
+
+if TYPE_CHECKING:
+    import subprocess
 
 
 class Painter:
@@ -27,6 +29,8 @@ class Painter:
     def __init__(self, wanted: bool = True) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         if wanted and "matplotlib" not in sys.modules and sys.executable:
+            import subprocess  # Commands without a picture do not need it.
+
             # The second process finds modules in the same folders as this one.
             command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
             path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,7 +26,6 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import SwitchingFigures
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE
@@ -34,6 +33,9 @@ from haptic_loop.design.necessary import LeftOver, left_over
 from haptic_loop.design.own import place_of
 from haptic_loop.design.result import CAVEATS, GUARD, ConditionName, Requirement, listed, refusal, suffices
 from haptic_loop.design.worst_member import Progress
+
+if TYPE_CHECKING:
+    from haptic_loop.design.coverage import SwitchingFigures
 
 # ----------------------------------------------------------------------------------------------------
 # The damping that a condition requires for a coupling in its loop.
@@ -405,10 +407,15 @@ def audit(
     conditions = {name: own.get(name) or named(name) for name in needs if name != "switching"}
     decisive = assessment.condition
     fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
+    switching = None
+    if loop.varying_delay:
+        from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start without it.
+
+        switching = SwitchingFigures.of(loop, coupling, needs["switching"])
     return Audit(
         assessment,
         {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
-        SwitchingFigures.of(loop, coupling, needs["switching"]) if loop.varying_delay else None,
+        switching,
         _helps(constant, coupling, conditions[fails]),
         left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from haptic_loop.controller.arithmetic import one_blas_thread
+from haptic_loop.controller.budget import START_J
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.arguments import number, of_kind, one_of, shown, whole
@@ -34,7 +35,6 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_lin
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
-from haptic_loop.sim.world import START_J, Claim, InWorld, SceneRecord, Touched, WorldRecord
 
 if TYPE_CHECKING:
     from haptic_loop.design.assessment import Assessment
@@ -190,7 +190,10 @@ def simulate(
         "remarks": outcome.remarks,
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
-    if isinstance(trace.net, InWorld):
+    if world and trace.net:
+        from haptic_loop.sim.world import Claim, InWorld, SceneRecord, WorldRecord
+
+        assert isinstance(trace.net, InWorld)
         stated, scene = Claim.of(assessment, chosen.certified_for), SceneRecord.of(trace.net.ports[0].world)
         meta |= {"world": plain(WorldRecord.of(trace.net.figures())), "scene": plain(scene)}
         meta |= {"guarantee": stated.words, "guaranteed": stated.guaranteed}
@@ -202,6 +205,8 @@ def _net(
 ) -> Wanted | None:
     """Return the shell of a world or of a function, or the energy budget of the devices, if there is any."""
     if world:
+        from haptic_loop.sim.world import Touched  # Other scenarios start without these modules.
+
         return Touched(energy_budget or 0.0)
     if environment is not None:
         return Plugged(environment, energy_budget or 0.0, claim(assessment))
