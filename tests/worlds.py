@@ -37,6 +37,26 @@ T = 1.2e-3  # [s]
 DELTA = (1.37, 1.37)  # [N s/m]
 #: the default scenario, case I
 PAIR = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
+#: a scenario of one device at a mass of 1 kg on a spring, two samples late
+ONE_MASS = """
+name = "one-mass"
+T = 1.2e-3
+theta = [2]
+psi = [0]
+device = [{ kind = "compliant", damping = 1.37, force_limit = 12.0 }]
+
+[[human]]
+links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
+voluntary = { amplitude = 0.015, frequency = 0.6 }
+
+[environment]
+contacts = ["contact 1"]
+masses = { mass = 1.0 }
+springs = [
+    { between = ["contact 1", "mass"], stiffness = 800.0, damping = 1.0 },
+    { between = ["mass", "ground"], stiffness = 700.0, damping = 1.0 },
+]
+"""
 #: certified for the default environment and the constant delays (1, 2) only
 STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
 #: certified for every passive environment; with delays that switch within [1, 2] it needs 1.078 of the 1.37 N s/m

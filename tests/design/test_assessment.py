@@ -5,6 +5,7 @@ from functools import cache
 
 import msgspec
 import pytest
+from worlds import ONE_MASS
 
 from haptic_loop.cli.audit import main as audit
 from haptic_loop.cli.compare import main as compare
@@ -24,12 +25,13 @@ from haptic_loop.design.environments import LIMITER
 from haptic_loop.design.result import HERE, NotProved
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
-from haptic_loop.sim.scenario import load
+from haptic_loop.sim.scenario import load, parse
 from tests.asked import needs, safe_with
 
-LOOP = load("omega-pair").loop("I")
+ONE = parse(ONE_MASS)
+LOOP = ONE.loop("I")
 SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified for any environment
-HERE_ONLY = SpringDamper([7000.0, 2900.0], [0.42, 1.69])  # needs 98 % of the damping in this environment
+HERE_ONLY = SpringDamper([2100.0], [1.0])  # needs 97 % of the damping in this environment
 change = msgspec.structs.replace
 
 
@@ -46,13 +48,13 @@ def proved_here():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"delta": (1.2, 1.2)},
-        {"theta": (3, 4), "lam": (1, 2)},
+        {"delta": (1.2,)},
+        {"theta": (4,)},
         {"T_max": 1.5e-3},
-        {"psi": (1, 1)},
-        {"latency": ((0.0, 1e-3),) * 2},
-        {"varying_delay": DelayRange((1, 1), (2, 3))},
-        {"environment": Network(LOOP.environment.contacts, (Spring(LOOP.environment.contacts, 9000.0),))},
+        {"psi": (1,)},
+        {"latency": ((0.0, 1e-3),)},
+        {"varying_delay": DelayRange((1,), (3,))},
+        {"environment": Network(("contact 1",), (Spring(("contact 1", GROUND), 9000.0),))},
     ],
     ids=str,
 )
@@ -102,12 +104,12 @@ def test_a_clipped_guarantee_says_where_it_ends():
 
 def test_a_sweep_of_limited_forces_is_no_proof():
     """A coefficient of 130 decimals has no exact proof: any-environment, which covers the limiter, is only swept."""
-    loop = change(LOOP, theta=(0, 0), lam=(0, 0))
+    loop = change(LOOP, theta=(0,), lam=(0,))
     for B, proof in ((0.01, "rational"), (1e-130, "sampled")):
-        assessment = assess(loop, SpringDamper([100.0] * 2, [B] * 2), force_limit=(12.0, 12.0))
+        assessment = assess(loop, SpringDamper([100.0], [B]), force_limit=(12.0,))
         limits = assessment.force_limits
         assert assessment.requirements["any-environment"].proof == assessment.guarantee.proof == proof
-        assert limits.rho == (0.0, 0.0)
+        assert limits.rho == (0.0,)
         assert limits.proved == (proof == "rational")
         assert limits.words.startswith("proved") == (proof == "rational")
         assert ("without an exact proof" in limits.words) == ("without an exact proof" in verdict(assessment))
@@ -120,7 +122,7 @@ def test_a_proof_without_the_limiter_is_partial(monkeypatch):
         raise NotProved("a proof takes long")
 
     monkeypatch.setattr(assessment_module, "prove", refuse)
-    swept = assess(LOOP, HERE_ONLY, force_limit=(12.0, 12.0))
+    swept = assess(LOOP, HERE_ONLY, force_limit=(12.0,))
     assert swept.requirements["this-environment"].proof == "rational"
     assert (swept.guarantee.proof, swept.force_limits.proved) == ("sampled", False)
     assert "without an exact proof" in verdict(swept)
@@ -158,7 +160,7 @@ def spring(u):
     ("changes", "coupling", "holds"),
     [
         ({}, SOFT, True),
-        ({}, HERE_ONLY, False),
+        ({}, SpringDamper([7000.0, 2900.0], [0.42, 1.69]), False),  # needs 98 % in this environment only
         ({"psi": (1, 1)}, SOFT, False),
         ({"theta": (3, 4)}, SOFT, False),
         ({"T_max": 3e-3}, SOFT, False),
@@ -179,8 +181,7 @@ def test_the_shell_needs_a_coupling_for_any_environment(changes, coupling, holds
 
 def test_a_budgeted_run_guarantees_its_budget():
     """The certificate does not cover forces that the budget scales, so the guarantee is that of the budget."""
-    scenario = load("omega-pair").replace(duration=0.1)
-    meta = simulate(scenario, HERE_ONLY, "exact", energy_budget=0.02).meta
+    meta = simulate(ONE.replace(duration=0.1), HERE_ONLY, "exact", energy_budget=0.02).meta
     guarantee = meta["assessment"]["guarantee"]
     assert (guarantee["condition"], guarantee["energy_J"]) == ("energy-budget", 0.02)
     assert meta["energy_budget"]["guarantee"] == guarantee["words"]
@@ -193,6 +194,7 @@ def test_a_budgeted_run_guarantees_its_budget():
 def stored(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(Stored.of(LOOP, HERE_ONLY, proved_here()), "own.json")
+    (tmp_path / "one.toml").write_text(ONE_MASS)
 
 
 _COMMANDS = {
@@ -208,7 +210,18 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
     main, words = _COMMANDS[name]
 
     def report(*more):
-        main([*words, *more, "--json", str(tmp_path / "r.json"), "--out", str(tmp_path / "out")])
+        main(
+            [
+                *words,
+                *more,
+                "--scenario",
+                "one.toml",
+                "--json",
+                str(tmp_path / "r.json"),
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
         return json.loads((tmp_path / "r.json").read_text())
 
     assert safe_with(report()) == HERE

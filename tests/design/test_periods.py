@@ -10,7 +10,7 @@ from asked import any_environment, any_environment_demand, prove_limiter, this_e
 from asked import loop as loop_of
 from driven import growing
 from scipy.linalg import expm
-from worlds import FIGURE_4
+from worlds import FIGURE_4, ONE_MASS
 
 from haptic_loop.cli.design import main as cli_design
 from haptic_loop.controller.coupling import SpringDamper
@@ -31,11 +31,13 @@ change = msgspec.structs.replace
 @pytest.mark.slow
 def test_switching_reports_use_the_longest_period(tmp_path):
     """The damping reported for a buffer, which makes every delay the largest one, counts T_max."""
+    (tmp_path / "one.toml").write_text(ONE_MASS)
     file, more = tmp_path / "r.json", ["--condition", "this-environment", "--T-max", "1.8e-3"]
+    more += ["--scenario", str(tmp_path / "one.toml")]
     cli_design(["--varying-delay", "1,2", *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
     stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
     loop = stored.loop.switching(None)
-    buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "this-environment")
+    buffered = required_damping(change(loop, theta=(2,)), stored.coupling.build(loop.T), "this-environment")
     shown = json.loads(file.read_text())["switching"]["playout"]["required_damping"]
     assert shown == pytest.approx(list(buffered.required), rel=1e-6)
 

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
-from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
+from worlds import FIGURE_4, ONE_MASS, environment_by_hand, filter_by_hand, force_map
 
 from haptic_loop.cli.audit import main as audit_main
 from haptic_loop.cli.check import main as check_main
@@ -41,26 +41,6 @@ between = ["mass", "contact 1"]
 stiffness = [640.0, 840.0]
 absent = true
 """
-#: one device at a mass of 1 kg on a spring, two samples late
-ONE_DEVICE = """
-name = "one-mass"
-T = 1.2e-3
-theta = [2]
-psi = [0]
-device = [{ kind = "compliant", damping = 1.37, force_limit = 12.0 }]
-
-[[human]]
-links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
-voluntary = { amplitude = 0.015, frequency = 0.6 }
-
-[environment]
-contacts = ["contact 1"]
-masses = { mass = 1.0 }
-springs = [
-    { between = ["contact 1", "mass"], stiffness = 800.0, damping = 1.0 },
-    { between = ["mass", "ground"], stiffness = 700.0, damping = 1.0 },
-]
-"""
 change = msgspec.structs.replace
 Z = np.exp(1j * np.geomspace(1e-3, np.pi, 3000))
 SMALLEST = Options(bases=((4, 3),))
@@ -85,7 +65,7 @@ def stored(robust):
 @pytest.fixture(scope="module")
 def scenario_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("ranges") / "small.toml"
-    path.write_text(ONE_DEVICE + RANGES_TEXT)
+    path.write_text(ONE_MASS + RANGES_TEXT)
     return path
 
 
