@@ -173,7 +173,7 @@ def _parser() -> options.Parser:
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events SECONDS:EVENT, as '{_SCRIPT}', the default of a video without world, --coupling and --case none",
+        help=f"events SECONDS:EVENT (default of a video without world, --coupling or --case none: '{_SCRIPT}')",
     )
     until = "length (default: until the window is closed, or 3 s after a video's script; in a world the scenario's)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)

@@ -62,7 +62,11 @@ FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/o
 
 
 def engines() -> Iterator[Sequence[str]]:
-    """Measure the default design with its limiter. Goals: 3 x as fast as RK4 x 4, loop / raw 1.10, growth 1e-9 1/s."""
+    """Measure the default design with its limiter.
+
+    Goals of the exponential integrator: 3 times as fast as RK4 with 4 substeps, 1.10 times the cost of MuJoCo's calls
+    alone ("raw"), and the exact growth rate within 1e-9 1/s.
+    """
     scenario = SCENES["default"]
     chosen = choose(scenario, "I", "spring-damper", "this-environment")
     simulation = assemble(scenario, chosen.coupling, assessed(scenario, "I", chosen).force_limits.rho)

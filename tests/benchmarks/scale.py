@@ -57,7 +57,10 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def devices() -> None:
-    """Measure a run of 2 s, an audit by both conditions with exact proofs, designs, and a proof for limited forces."""
+    """Measure, in the order of the columns, a run of 2 s, an audit by both conditions with exact proofs, and designs.
+
+    The designs are a clipped one, one with a limiter, its proof for limited forces, and one for any-environment.
+    """
     for n in (2, 4, 8, 16, 32):
         scenario = parse(star(n))
         loop = scenario.loop("I")

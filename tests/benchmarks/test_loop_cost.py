@@ -28,7 +28,7 @@ def test_exact_engine(benchmark):
     simulation = assemble(load(), PUBLISHED["I"])
     benchmark.pedantic(lambda: run(simulation, "exact"), rounds=9, iterations=1, warmup_rounds=1)
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
-    print(f"\nexact: {simulation.scenario.duration / median:.0f} x real time; errors are differences from this engine")
+    print(f"\nexact: {simulation.scenario.duration / median:.0f} x as fast as real time")
     assert simulation.scenario.samples == 12500
 
 

@@ -1,4 +1,4 @@
-"""sim.run reports the agreed figures, writes its files, and answers bad input with one line and exit code 2."""
+"""sim.run reports the expected figures, writes its files, and answers bad input with one line and exit code 2."""
 
 import json
 import subprocess

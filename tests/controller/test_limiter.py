@@ -139,7 +139,10 @@ def test_limits_out_of_reach_change_nothing(network):
 @pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
 @pytest.mark.parametrize("theta", [(0, 0), (1, 2)])
 def test_the_limited_loop_obeys_its_definition(network, theta):
-    """f_e is in the box and e in its normal cone; the linear loop, driven by x - e, sends f_e + rho (e - e_-)."""
+    """The force f_e is within its limits and the slip e is 0 inside them, or points outwards.
+
+    The linear loop, driven by x - e, sends f_e + rho (e - e_-), where e_- is the slip of the tick before.
+    """
     x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
     limiter = loop_of(network, theta, (0, 0)).law(STIFF, limit, rho)
     buffer = drive(closed(limiter), x)
