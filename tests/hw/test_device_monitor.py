@@ -262,7 +262,10 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
 
 
 def test_fake_device_clocks_are_found(scenario, rungs):
-    """The device's clock reports T, STATEs come every 2 T: after 20, the host's is 10 % of a block (20 T) ahead."""
+    """The device's clock advances by T per STATE, but STATEs come every 2 T.
+
+    After 20 of them the host's clock is ahead by 20 T, which is 10 % of a block.
+    """
     session, send = hand_driven(scenario, rungs)
     assert session.link.last
     begun = session.link.last.t_us

@@ -103,6 +103,7 @@ def free_pair(mass=0.25):
 
 
 def arming_test(cap=12.0, closing=False, q=1e-6, still=1, before=None, known=False):
+    """Return a test of two axes with counts of `q` [m], at arming or, with `closing` or `before`, at the end."""
     units, before = Units((q, q), (STEP, STEP), (10**6, 10**6)), () if closing else before
     return EncoderTest(SafetyLimits((cap, cap)), T, units, (still,) * 2, Expected(free_pair(), known), before=before)
 

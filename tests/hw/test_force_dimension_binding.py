@@ -1,4 +1,4 @@
-"""Run the adapter through the published package, with a C stub in place of the maker's shared library."""
+"""Run the adapter through the package forcedimension-core, with a C stub in place of the maker's shared library."""
 
 import importlib.util
 import json
