@@ -85,7 +85,7 @@ def _parser() -> options.Parser:
     parser.add_varying_delays()
     parser.add_coupling(", ".join(NAMES))
     parser.add_energy_budget()
-    add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
+    add("--engine", choices=ENGINES, default="mujoco", help="engine of the simulation (default mujoco)")
     steppers = "integrator of MuJoCo (default exponential, RK4 with friction)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: 1 with exponential without friction, else enough for the fastest motion)"

@@ -1,9 +1,10 @@
 """Conditions under which no passive human can make a loop oscillate.
 
-A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.facts) holds it
-as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
-`over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
-(an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives the conditions.
+A condition is a block that must be strictly positive real: its Hermitian part is He[block] > 0 on |z| = 1. `Demand`
+(design.facts) holds the block as free + s gain, where s multiplies the damping Delta_D that the devices guarantee.
+Poles at z = 1 are split off by `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the
+required damping), over Fractions (an exact proof), over stacks and over sampled responses (maps and designs).
+docs/theory.md derives the conditions; numbers such as (12) are equations of the paper.
 
 A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
 states whether periods vary, forces have a latency, or devices have known motors. A `Fact` is a wall, delays that

@@ -217,7 +217,8 @@ def mutated(rng: random.Random, frame: bytes) -> bytes:
 def episode(seed: int, ticks: int, silent: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
     """Play traffic to the Python device. Return info, operations, answers to the ticks, and the phases and causes seen.
 
-    The operations are those of `between_ticks` and the ticks themselves, ("T", now, counts).
+    The operations are those of `between_ticks` and the ticks themselves, ("T", now, counts). In the first `silent`
+    ticks there is no traffic.
     """
     rng = random.Random(seed)
     about = info(rng.randint(1, 8), rng.choice((100_000, 333_333, 1_200_000, 1_200_000, 2_000_001)))

@@ -1,4 +1,4 @@
-"""Test the four calls of a device over a stand-in for the Force Dimension SDK and over the serial link."""
+"""Test info, configure, exchange and stop of a device on a stand-in for Force Dimension's SDK and on a serial link."""
 
 import sys
 from contextlib import ExitStack, nullcontext
