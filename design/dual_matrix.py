@@ -1,7 +1,8 @@
 """The matrix D of the dual problem in design.bound, with a lower bound of its eigenvalues on the whole circle.
 
-D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 is scaled by root(delta) from both sides. H is piecewise
-linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and a = 1/z - 1 this gives
+D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0, with the H and C_k of design.bound, is scaled by
+root(delta) from both sides. H is piecewise linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and
+a = 1/z - 1 this gives
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 

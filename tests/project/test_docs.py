@@ -19,7 +19,7 @@ PAGES = [*regenerate.PAGES, ROOT / "CHANGELOG.md", ROOT / "NOTATION.md"]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 #: commands that take most of a minute: `make validate` runs them, and `make figures` writes what they print
 SLOW = regenerate.SLOW
-#: a command that several pages have runs once
+#: command -> the first page that has it; it runs once, although several pages may have it
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
 IN_ORDER = [command for command in IN_ORDER if not SLOW.search(command)]
