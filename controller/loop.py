@@ -6,7 +6,7 @@
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
 A `Loop` contains the damping of every device and, if guaranteed, bounds of its motor and transmission. It contains
-nothing about the humans. controller.tick computes its ticks.
+nothing about the humans. controller.tick computes its ticks. Numbers such as (6) are equations of the paper.
 """
 
 from __future__ import annotations
