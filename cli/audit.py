@@ -99,7 +99,7 @@ def main(argv: list[str]) -> int:
         _CatalogueDevice(args.device, CATALOGUE[args.device]) if args.device else None,
         args.source if args.device else None,
         audited,
-        None if args.rigid else encoder_steps(scenario, args.case, coupling),
+        None if args.rigid else encoder_steps(scenario, args.case, audited.assessment),
         notes,
         time.perf_counter() - begin,
     )

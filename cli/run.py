@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
-    encoder = encoder_steps(scenario, args.case, chosen.coupling)
+    encoder = encoder_steps(scenario, args.case, assessment)
     render.announce(args, verdicts.verdict(assessment, encoder=encoder))
     nearby = _nearby(scenario.loop(args.case), chosen, assessment)
     if lost := verdicts.lost(assessment, nearby):

@@ -609,12 +609,12 @@ def _l1_gain(F: Lti) -> Array:
 
 
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
-    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m], whatever the condition.
+    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m].
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
-    a limiter or walls. Friction of a device with several `axes` opposes its velocity in space. It must be at least
-    |W|_2 of these axes, because the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for
-    a wrong number of steps or a negative one.
+    a limiter or walls, nor for known devices, where the errors also multiply beta (v+ - v). Friction of a device with
+    several `axes` opposes its velocity in space. It must be at least |W|_2 of these axes, because the power of the
+    errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for a wrong number of steps or a negative one.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

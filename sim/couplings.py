@@ -22,6 +22,7 @@ from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
 from haptic_loop.design.result import (
     CONDITIONS,
+    KNOWN_CONDITIONS,
     Chosen,
     Design,
     DesignFailed,
@@ -264,7 +265,7 @@ class EncoderSteps:
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, where nothing is proved
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls or known devices, where nothing is proved
     covered: bool
     words: str
 
@@ -276,18 +277,22 @@ class EncoderSteps:
         steps: Sequence[float],
         friction: Sequence[float],
         friction_max: Sequence[float | None] | None = None,
+        condition: str | None = None,
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing.
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` gives the guarantee.
         """
         if not any(steps):
             return None
         widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
         published = tuple(friction_max or [None] * len(steps))
         values = tuple(steps), tuple(friction), published
-        if loop.environment.walls:
-            return cls(*values, None, False, f"encoder steps of {widths} um: with walls no friction is proved enough")
+        if loop.environment.walls or condition in KNOWN_CONDITIONS:
+            obstacle = "walls" if loop.environment.walls else condition
+            return cls(
+                *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved enough"
+            )
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
@@ -301,13 +306,14 @@ class EncoderSteps:
         return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
 
 
-def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
+def encoder_steps(scenario: Scenario, case: str, assessment: Assessment) -> EncoderSteps | None:
     """Compare the devices' friction with that needed for encoder steps; None without steps, or for a singular loop."""
+    condition = assessment.guarantee and assessment.guarantee.condition
     fields = ("encoder_step", "friction", "friction_max")
     steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
     try:
-        return EncoderSteps.of(scenario.loop(case), coupling, steps, friction, most)
+        return EncoderSteps.of(scenario.loop(case), assessment.coupling, steps, friction, most, condition)
     except ValueError:  # The algebraic loop has no solution, which the conditions report.
         return None
 

@@ -140,7 +140,7 @@ def run_report(
         kind=chosen.kind,
         chosen=chosen,
         assessment=assessment,
-        encoder=encoder_steps(scenario, case, chosen.coupling),
+        encoder=encoder_steps(scenario, case, assessment),
         stability=stability,
         ringing=None if grows is not None else ringing(simulation),
         varying_delay=delays,

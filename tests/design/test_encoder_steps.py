@@ -36,6 +36,22 @@ def test_a_published_bound_covers_no_encoder_step():
     assert declared.covered
 
 
+def test_friction_covers_no_steps_of_known_devices():
+    """Speeds alternate in triangular spikes of height v0 at the ticks, where the errors do work -W on dx + beta dv.
+
+    Within a period dx = 0 and dv = 2 v0, so friction W and the motor's c2 v'^2 and c0 v^2 dissipate less than they do.
+    """
+    beta, mass, delta, W = 5e-5, 0.06, 1.37, 0.05
+    v0, width = 0.1 * beta * W / mass, beta
+    area, square, slope = v0 * width / 2, v0**2 * width / 3, 4 * v0**2 / width  # integrals of |v|, v^2 and v'^2
+    assert W * area + delta * square + beta * mass * slope < W * beta * 2 * v0
+    coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
+    assert EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], condition="this-environment").covered
+    known = EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], condition="known-device")
+    assert not known.covered
+    assert known.friction_needed is None
+
+
 def test_the_bound_is_above_and_close():
     total, X = np.abs(F.D), F.B
     for _ in range(60_000):
