@@ -761,15 +761,15 @@ class EncoderTest:
         if self._pushed < _PUSHED * most:
             tested = f"motor and encoder of axis {axis} are not tested"
             return f"the energy left allows {self._pushed:.2g} of {most:g} N: {tested}. Raise --energy-budget"
+        count, expected = self._units.encoder_step[self._axis], np.ptp([row[1] for row in self._rows])
+        if expected < 2 * count:  # rounding alone can hide such a motion
+            faint = f"{at} moves axis {axis} by {1e3 * expected:.2g} mm, less than 2 counts of {1e3 * count:.3g} mm"
+            return f"{faint}: its encoder is not tested. Raise --force-cap"
         if self._unknown_hands and self._swings:
             free = f"axis {axis} did not move as a free handle does at the end of the session"
             return f"{free}: a hand held it, or its motor or encoder is wrong"
         if self._closing:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
-        count, expected = self._units.encoder_step[self._axis], np.ptp([row[1] for row in self._rows])
-        if expected < 2 * count:  # rounding alone can hide such a motion
-            faint = f"{at} moves axis {axis} by {1e3 * expected:.2g} mm, less than 2 counts of {1e3 * count:.3g} mm"
-            return f"{faint}: its encoder is not tested. Raise --force-cap"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
             return f"axis {axis} does not follow {at} as a free handle does: let go of it while arming"
         return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"

@@ -494,10 +494,12 @@ def test_the_impulse_decides(axis, sign, newton, after):
     return None
 
 
-def test_motions_below_two_counts_test_nothing():
+@pytest.mark.parametrize(("cap", "far"), [(0.05, "0.039"), (0.15, "0.12")])
+@pytest.mark.parametrize("closing", [False, True])
+def test_motions_below_two_counts_test_nothing(cap, far, closing):
     """At 0.05 N the free mass swings by 0.039 mm, which an encoder with counts of 0.1 mm hardly shows."""
-    with pytest.raises(SafetyStop, match=r"axis 1 by 0\.039 mm, less than 2 counts of 0\.1 mm"):
-        played(arming_test(cap=0.05, q=1e-4), masses(q=1e-4))
+    with pytest.raises(SafetyStop, match=rf"axis 1 by {far} mm, less than 2 counts of 0\.1 mm: .* Raise --force-cap"):
+        played(arming_test(cap=cap, q=1e-4, closing=closing), masses(q=1e-4))
 
 
 def test_forces_that_return_stop_nothing():
