@@ -167,6 +167,26 @@ def test_the_host_delays_forces_beyond_the_link():
     sent = [world.later((k, 10 * k), 1) for k in range(1, 6)]
     assert sent == [(1, 0), (2, 0), (3, 0), (4, 10), (5, 20)]
     assert world.later((9, 90), 3) == (9, 50)  # two ticks had no answer: the force before is held
+    assert world.later((9, 100), 1) == (9, 50)
+
+
+def test_ticks_without_an_answer_are_booked():
+    """The device holds its force in every third tick, which the energy of the shell counts like the others."""
+    coupling, unit, T = SpringDamper([800.0, 800.0], [0.4, 0.4]), np.array([4e-4, 4e-4]), 1e-3
+    scenario = load("world-ball").replace(T=T)
+    world = WorldController(scenario, coupling, 0.1, [2.0, 2.0], [0, 0])
+    V, total, f, before = coupling.compliance(T), 0.0, np.zeros(2), np.zeros(2)
+    state = np.zeros(V.order)
+    for k in range(61):
+        x = 0.02 * np.sin(k / 10) * np.array([1.0, -1.0])
+        asked = world.step(x)
+        if k % 3 < 2:
+            f = -unit * world.limit([round(-force / 4e-4) for force in asked], unit)
+        u = x - V.C @ state - V.D @ f
+        state, total, before = V.A @ state + V.B @ f, total + f @ (u - before), u
+        if k % 3 < 2:
+            assert world.shell.energy[0] == pytest.approx(0.1 + total + world.port.released, abs=1e-12)
+    assert abs(total) > 1e-3
 
 
 def test_a_force_in_steps_never_overdraws_the_shell():

@@ -22,7 +22,7 @@ from haptic_loop.models import world as world_of
 from haptic_loop.sim.couplings import choose, read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, Touched, _contacts_of, linearise, scene_of, thrown
+from haptic_loop.sim.world import START_J, InWorld, Touched, _contacts_of, linearise, scene_of, thrown
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -493,3 +493,46 @@ def test_a_scene_that_changed_is_refused(tmp_path):
     (tmp_path / "scene.xml").write_text(TRAY.replace('mass="0.3"', 'mass="0.4"'))
     with pytest.raises(InputError, match=r"scene\.xml has changed since the scenario was loaded"):
         scene_of(loaded, coupling)
+
+
+class _Random:
+    """A port that asks for random forces."""
+
+    created, unsettled, warnings = 0.0, 0, ()
+
+    def __init__(self, rng, released):
+        self.rng, self.released = rng, released
+
+    def step(self, u0):
+        return self.rng.normal(size=u0.shape)
+
+
+def test_figures_at_a_port_are_its_sums():
+    """The acting force differs from the sent one, as behind a delay."""
+    rng, V = np.random.default_rng(0), SpringDamper([500.0, 700.0], [0.5, 0.4]).compliance(T)
+    ports, damping = [_Random(rng, 0.03), _Random(rng, 0.01)], np.array([[1.4, 0.2], [0.2, 1.1]]) / T
+    world = InWorld(Shell(V, start=0.02, nsim=2), ports, damping)
+    x, acting, u, state = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((V.order, 2))
+    given, at_port = [np.zeros(2)], [np.zeros(2)]
+    for k in range(200):
+        dx = 1e-4 * rng.normal(size=(2, 2)) * (k > 0)
+        given.append(given[-1] - (dx * acting).sum(axis=0) - [v @ damping @ v for v in dx.T])
+        x, force = x + dx, np.zeros((2, 2))
+        world.send(x, force)
+        before, u = u, x - V.C @ state - V.D @ force
+        state = V.A @ state + V.B @ force
+        at_port.append(at_port[-1] + (force * (u - before)).sum(axis=0))
+        acting = 0.5 * force
+        world.apply(k, acting)
+    figures = world.figures()
+    assert figures.given_J == pytest.approx(np.max(given), rel=1e-9)
+    assert figures.port_least_J == pytest.approx(np.min(at_port), rel=1e-9)
+    assert figures.released_J == 0.03
+    assert min(figures.given_J, -figures.port_least_J) > 1e-4
+
+
+def test_worlds_dissipate_in_the_longest_period():
+    scenario = load("world-ball").replace(T_max=2e-3)
+    simulation = assemble(scenario, SpringDamper([800.0, 800.0], [0.4, 0.4]))
+    world = Touched().net(simulation, simulation.process, 1)
+    np.testing.assert_allclose(world._damping, simulation.loop.Delta() / 2e-3)
