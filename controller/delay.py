@@ -15,7 +15,8 @@ from haptic_loop.controller.arithmetic import Number
 from haptic_loop.controller.lti import Array, Lti, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
-# Constant delays are linear blocks, Theta (4), Psi (5) and Lambda (7). Varying delays are simulated by `HeldLine`:
+# Constant delays are linear blocks, Theta, Psi and Lambda, equations (4), (5) and (7) of the paper. Varying delays are
+# simulated by `HeldLine`:
 #
 #         tick k     packet k is sent with the force g[k]; it arrives after delays[k] ticks, or is LOST
 #                    the device applies the newest packet that has arrived: f[k] = g[j], j = max{j : j + delays[j] <= k}
