@@ -4,8 +4,8 @@ make bench    (or: python -m pytest tests/benchmarks/test_engine_cost.py --bench
 
 Times are CPU times. A loop's time is divided by that of the raw calls, which move the same plant with the recorded
 inputs. Raw calls make MjData once, and per tick write the controls and call mj_step; for the exponential engine they
-write the controls, call mj_forward, multiply by h phi1(h J), and write the state back. Only the loop has the process,
-its limiter, outside forces and the record.
+write the controls, call mj_forward, multiply by the matrix h phi1(h J) of its step, and write the state back. Only the
+loop has the process, its limiter, outside forces and the record.
 """
 
 import time
