@@ -89,6 +89,8 @@ def verdict(
         words.append("By a refined sweep, without an exact proof.")
     if encoder and not encoder.covered:
         words.append("Not covered: the encoder steps of the devices.")
+    elif encoder and guarantee.environments in (ANY, RANGES):
+        words.append("Encoder steps are covered with the nominal object only.")
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
 
 

@@ -296,7 +296,9 @@ class EncoderSteps:
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
-        verdict = "are covered while forces stay below the limits" if covered else "are not covered"
+        verdict = (
+            "are covered with the nominal object while forces stay below the limits" if covered else "are not covered"
+        )
         if any(most is not None for most in published):
             bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
             has = f"at least {has} N (published: at most {bounds} N)"

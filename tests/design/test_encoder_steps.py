@@ -5,10 +5,12 @@ import pytest
 from asked import this_environment
 from worlds import FIGURE_4
 
+from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
 from haptic_loop.sim.couplings import EncoderSteps
 
@@ -50,6 +52,15 @@ def test_friction_covers_no_steps_of_known_devices():
     known = EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], condition="known-device")
     assert not known.covered
     assert known.friction_needed is None
+
+
+def test_steps_are_covered_with_one_object_only():
+    """The friction needed depends on F of the nominal environment, although the guarantee covers every one."""
+    coupling = SpringDamper([879.0, 552.0], [0.39, 0.52])
+    covered = EncoderSteps.of(LOOP, coupling, [STEP, STEP], [0.26, 0.26])
+    words = verdict(assess(LOOP, coupling), encoder=covered)
+    assert "any passive object" in words
+    assert "nominal object only" in words
 
 
 def test_the_bound_is_above_and_close():
