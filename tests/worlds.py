@@ -114,6 +114,64 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
     return R
 
 
+def contact_by_hand(z, T, mass=0.0, stiffness=0.0, damping=0.0, coupling=None):
+    """Return F, J, H and Y (k,) of a tip with this mass, spring and damper to ground, behind a spring-damper.
+
+    They map a device's displacement and a wall's force at the tip to the sent force and the tip's displacement.
+    """
+    s = (1 - 1 / z) / T
+    E = mass * s**2 + damping * s + stiffness
+    V = 0 * z if coupling is None else 1 / (coupling.K[0] + coupling.B[0] * s)
+    through = 1 / (1 + E * V)
+    return E * through, through, through, -V * through
+
+
+def block_by_hand(z, T, theta, contact, cost, beta=0.0, wall=None, limiter=None):
+    """Return the Hermitian block (k, n, n) of one device, as docs/theory.md states its quadratic form.
+
+    Args:
+        z: Points of the unit circle, (k,).
+        T: Period [s].
+        theta: Delay [samples].
+        contact: The responses of `contact_by_hand`.
+        cost: The least dissipated energy, as a matrix on dx (k, 1, 1), or on dx and the speed v (k, 2, 2).
+        beta: Theorem B's beta [s]; 0 without v.
+        wall: Stiffness k and damping of a damped wall, and its multipliers a, a + c, d and m.
+        limiter: The limiter's rho and its multiplier c.
+    """
+    names = ["dx", *(["v"] if cost.shape[1] == 2 else []), *(["de"] if limiter else []), *(["u", "s"] if wall else [])]
+    rows = np.eye(len(names))[:, None] + 0j * z[:, None]  # (n, k, n)
+    of = {"de": 0j * rows[0]} | dict(zip(names, rows, strict=True))
+    z = z[:, None]
+    F, J, H, Y = (part[:, None] for part in contact)
+    dx = of["dx"] + of["de"]  # The first input is the displacement less the limiter's slip.
+    sent, terms = F * of["dx"] / (z - 1), []
+    if wall:
+        k, b = wall[0], wall[1] / T
+        a, both, d, m = wall[2:]
+        W = k + b * (1 - 1 / z)
+        sent = sent + J * (W * of["u"] / (z - 1) + b / z * of["s"])
+        apart = H * of["dx"] + Y * (W * of["u"] + (W - k) * of["s"]) - of["u"]  # steps of y less those of the depth
+        terms.append((of["u"], (k / (z - 1) - a) * apart - m * ((k + b) / z - b) * of["s"]))
+        terms.append((of["s"], (both - a) * apart + d * of["u"] + (d + m * b * (1 - 1 / z)) * of["s"]))
+    if limiter:
+        rho, c = limiter
+        sent = sent - rho / z * of["de"]
+        terms.append((-of["de"], (z + c * (z - 1)) * sent))
+    moved = dx + (beta * (z - 1) * of["v"] if "v" in of else 0)
+    terms.append((moved, z**-theta * sent))
+    inputs = np.stack([dx, of["v"]] if "v" in of else [dx], axis=1)
+    whole = sum(np.conj(one)[:, :, None] * other[:, None] for one, other in terms)
+    whole = (whole + np.conj(np.swapaxes(whole, 1, 2))) / 2
+    return whole + np.conj(np.swapaxes(inputs, 1, 2)) @ cost @ inputs
+
+
+def least_scaled(block: np.ndarray) -> float:
+    """Return the least eigenvalue of matrices (k, n, n), each scaled to a diagonal of ones."""
+    size = np.sqrt(np.abs(np.diagonal(block, axis1=1, axis2=2)))
+    return float(np.linalg.eigvalsh(block / size[:, :, None] / size[:, None])[:, 0].min())
+
+
 class FakePort:
     """The host's end of a serial line: `coming` will be read, `sent` was written, `now` is its clock [us]."""
 

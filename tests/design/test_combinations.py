@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from worlds import block_by_hand, contact_by_hand, least_scaled
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
@@ -126,6 +127,22 @@ def test_every_combination_is_proved_stored_and_verified(names):
         fewer = {known: values for known, values in certificate.multipliers.items() if known != name}
         assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=fewer)))).proved
     assert not required_damping(change(loop, delta=(0.999 * least,)), COUPLING, condition).certified
+
+
+def test_limited_wall_requirements_are_those_of_the_block():
+    """With the multipliers found, the block written out is positive at 1.001 of the requirement, not at 0.999."""
+    loop, rho = combined(("walls", "limiter"))
+    needs = required_damping(loop, COUPLING, LimitedForces(held=(rho,)))
+    binding = max(2 * np.pi * loop.T * needs.frequency_hz, 1e-3)
+    z = np.exp(1j * np.sort(np.append(np.geomspace(1e-3, np.pi, 2000), binding)))
+    *of_wall, c = needs.multiplier
+    contact = contact_by_hand(z, loop.T, 0.05, 20.0, 0.3, COUPLING)
+
+    def least(share):
+        cost = np.full((z.size, 1, 1), share * needs.required[0] / loop.T)
+        return least_scaled(block_by_hand(z, loop.T, 1, contact, cost, wall=(3000.0, 2.0, *of_wall), limiter=(rho, c)))
+
+    assert least(1.001) > 0 > least(0.999)
 
 
 HANDS, TICKS = 60, 12000

@@ -13,8 +13,8 @@ from asked import loop as loop_of
 from asked import this_environment
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solveh_banded
-from scipy.optimize import minimize, minimize_scalar
-from worlds import PAIR
+from scipy.optimize import brentq, minimize, minimize_scalar
+from worlds import PAIR, block_by_hand, contact_by_hand, least_scaled
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall
@@ -810,13 +810,60 @@ def random_walls(rng, T):
     return Network(("tip",), springs[which], masses if which else {})
 
 
+@cache
+def any_needs(K, B, theta):
+    return required_damping(one(1e-3, 1.0, theta), SpringDamper([K], [B]), "known-device-any").ratio
+
+
+def needs_by_hand(room, loop, near):
+    """Return the least damping [N s/m] at which some beta has room(damping, beta) >= 0, within a factor of 2 of `near`.
+
+    The errors are 1e-5 of the damping, and 1e-4 of the largest beta.
+    """
+    (device,) = loop.known_devices
+    P = device.transmission_stiffness_max**2 / device.transmission_damping_min
+
+    def most(damping):
+        top = min(2 * np.sqrt(damping / P), 4 * device.motor_mass_min / device.transmission_damping_max)
+        best = minimize_scalar(
+            lambda share: -room(damping, share * top), bounds=(0.01, 0.999), method="bounded", options=accuracy
+        )
+        return -best.fun
+
+    accuracy = {"xatol": 1e-4}
+    return brentq(most, near / 2, 2 * near, rtol=1e-5)
+
+
+#: The search settles within 1e-4 of the best beta; between points of these grids a smooth peak rises by 1e-5 at most.
+SETTLED = 3e-4
+
+
+@pytest.mark.parametrize(
+    ("K", "B", "theta"),
+    [
+        (2500.0, 4.0, 0),
+        *(pytest.param(*gains, marks=pytest.mark.slow) for gains in ((1200.0, 1.5, 1), (3500.0, 5.0, 0))),
+    ],
+)
+def test_any_environment_requirements_are_those_of_chi(K, B, theta):
+    """He[V/(1-z)] >= chi at every frequency; the best beta and the least damping come from a dense sweep."""
+    loop, z = one(1e-3, 1.0, theta), np.exp(1j * np.linspace(2e-3, np.pi, 600))
+    have = (1 / (K + B * (1 - 1 / z) / loop.T) / (1 - z)).real
+
+    def room(damping, beta):
+        return 1 - (chi_by_hand(z, theta + 1, change(loop, delta=(damping,)), beta) / have).max()
+
+    needed = any_needs(K, B, theta)
+    assert needed == pytest.approx(needs_by_hand(room, loop, needed), rel=SETTLED)
+
+
 @pytest.mark.parametrize("theta", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_pair_grows_above_the_requirement(theta):
     """With a lossless environment no lossless hand grows at 1.01 of the required damping; far below it some grow."""
     T, rng = 1e-3, np.random.default_rng(theta)
     loop = one(T, 1.0, theta)
-    coupling = SpringDamper([(2500.0, 1200.0)[theta]], [(4.0, 1.5)[theta]])
-    needed = required_damping(loop, coupling, "known-device-any").ratio
+    gains = ((2500.0, 4.0), (1200.0, 1.5))[theta]
+    coupling, needed = SpringDamper(*([gain] for gain in gains)), any_needs(*gains, theta)
     assert needed < 0.9 * required_damping(loop, coupling, "any-environment").ratio
     short = (0.1, 0.6)[theta]
     worst = {1.01: 0.0, short: 0.0}
@@ -894,7 +941,7 @@ def test_any_environment_covers_walls_and_limiter():
     """At 1.01 of the need of known-device-any no lossless hand gains energy at a limited wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)
     loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])
-    needed = required_damping(loop, coupling, "known-device-any").ratio
+    needed = any_needs(3500.0, 5.0, 0)
     assert needed < 0.5 * required_damping(loop, coupling, "any-environment").ratio
     drawn, walls = ladders(rng, 300, 1, T), np.repeat([1e3, 1e4, 1e6], 100)
     grown = {}
@@ -906,12 +953,32 @@ def test_any_environment_covers_walls_and_limiter():
     assert grown[0.1] > 0
 
 
+BOUNDS = DeviceBounds(0.05, 12000.0, 0.4, 1.5)
+
+
+@cache
+def bounded_needs():
+    F, loop = wall(800.0, 0.6, 1, 1e-3), one(1e-3, 1.0, 1, BOUNDS)
+    return required(F, loop, this_environment(F, loop.delta).ratio)
+
+
+def test_unequal_bounds_need_what_a_dense_sweep_needs():
+    """The block written out is positive for some beta; P has the least damping of the transmission, c2 the largest."""
+    loop, z = one(1e-3, 1.0, 1, BOUNDS), np.exp(1j * np.linspace(2e-3, np.pi, 600))
+    contact = contact_by_hand(z, loop.T, stiffness=800.0, damping=0.6)
+
+    def room(damping, beta):
+        block = block_by_hand(z, loop.T, 1, contact, cost_by_hand(z, change(loop, delta=(damping,)), beta), beta)
+        left = block[:, 0, 0].real - np.abs(block[:, 0, 1]) ** 2 / block[:, 1, 1].real
+        return left.min() * loop.T / damping
+
+    assert bounded_needs() == pytest.approx(needs_by_hand(room, loop, bounded_needs()), rel=SETTLED)
+
+
 def test_every_device_within_the_bounds_is_covered():
     """No lossless hand grows with heavier motors, softer transmissions of any permitted damping, and more damping."""
     T, rng = 1e-3, np.random.default_rng(11)
-    bounds = DeviceBounds(0.05, 12000.0, 0.4, 1.5)
-    loop, F = one(T, 1.0, 1, bounds), wall(800.0, 0.6, 1, T)
-    needed = required(F, loop, this_environment(F, loop.delta).ratio)
+    F, needed = wall(800.0, 0.6, 1, T), bounded_needs()
     for _ in range(20):
         mass, k = 0.05 * np.exp(rng.uniform(0, 3)), 12000.0 * np.exp(-rng.uniform(0, 3))
         b, more = np.exp(rng.uniform(np.log(0.4), np.log(1.5))), np.exp(rng.uniform(0, 1))
@@ -930,8 +997,12 @@ def on_a_wall(k, damping, theta, delta=1.37):
 
 
 @cache
+def wall_requirement(k, damping, theta):
+    return required_damping(on_a_wall(k, damping, theta), NoCoupling(), "known-device")
+
+
 def wall_needs(k, damping, theta):
-    return required_damping(on_a_wall(k, damping, theta), NoCoupling(), "known-device").required[0]
+    return wall_requirement(k, damping, theta).required[0]
 
 
 WALLS = [
@@ -945,6 +1016,29 @@ def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, pla
     """Separate code with a coarse sweep and the multiplier m = 0 gives `known`; permanent contact needs less."""
     touched = sweep_of(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
+
+
+def at_its_multipliers(loop, needs, contact_of, walls=(), rho=None):
+    """Return the least eigenvalues of the block written out at 1.001 and 0.999 of a requirement, with its multipliers.
+
+    The frequencies are dense, and one of them is where the requirement binds.
+    """
+    binding = 2 * np.pi * loop.T * needs.frequency_hz
+    z = np.exp(1j * np.sort(np.append(np.geomspace(1e-3, np.pi, 2000), max(binding, 1e-3))))
+    beta, _, _, *values = needs.multiplier
+    found = []
+    for share in (1.001, 0.999):
+        cost = cost_by_hand(z, change(loop, delta=(share * needs.required[0],)), beta)
+        facts = {"wall": (*walls, *values[:4])} if walls else {}
+        facts |= {} if rho is None else {"limiter": (rho, values[-1])}
+        found.append(least_scaled(block_by_hand(z, loop.T, loop.theta[0], contact_of(z), cost, beta, **facts)))
+    return found
+
+
+def test_wall_requirements_are_those_of_the_block():
+    loop, needs = on_a_wall(3000.0, 2.0, 0), wall_requirement(3000.0, 2.0, 0)
+    enough, short = at_its_multipliers(loop, needs, lambda z: contact_by_hand(z, loop.T), (3000.0, 2.0))
+    assert enough > 0 > short
 
 
 def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
@@ -1043,11 +1137,25 @@ LIMITED_LOOPS = {"linear": limited(1), "wall": limited(1, Wall(("tip", GROUND), 
 
 
 @cache
+def limited_requirement(name):
+    return required_damping(LIMITED_LOOPS[name], COUPLING, LIMITED)
+
+
 def limited_needs(name):
-    return required_damping(LIMITED_LOOPS[name], COUPLING, LIMITED).required[0]
+    return limited_requirement(name).required[0]
 
 
 LINEAR_OR_WALL = pytest.mark.parametrize("name", ["linear", pytest.param("wall", marks=pytest.mark.validate)])
+
+
+@LINEAR_OR_WALL
+def test_limited_requirements_are_those_of_the_block(name):
+    loop, needs = LIMITED_LOOPS[name], limited_requirement(name)
+    walls = (3000.0, 2.0) if name == "wall" else ()
+    enough, short = at_its_multipliers(
+        loop, needs, lambda z: contact_by_hand(z, loop.T, 0.05, 20.0, 0.3, COUPLING), walls, RHO
+    )
+    assert enough > 0 > short
 
 
 @LINEAR_OR_WALL
