@@ -40,7 +40,7 @@ def load() -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
-    for name in ("matplotlib.pyplot", "clarabel", "numpy.random"):
+    for name in ("matplotlib.pyplot", "clarabel", "numpy.fft", "numpy.random", "scipy.linalg", "scipy.optimize"):
         import_module(name)
     for folder in ("cli", "controller", "design", "hw", "models", "sim"):
         package = import_module(f"haptic_loop.{folder}")

@@ -160,10 +160,10 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
     return out
 
 
-def excitation() -> Array:
-    """Return the excitation of the command (ticks,) [N], in whole force steps."""
+def excitation(seconds: float = 2.5) -> Array:
+    """Return the excitation of the command with these `--seconds` (ticks,) [N], in whole force steps."""
     swing = Swing.of(scenario_of(), 0.5, 0.03)
-    signal = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5, Swing(swing.force[:1], swing.hz)).signal[:, 0]
+    signal = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds, Swing(swing.force[:1], swing.hz)).signal[:, 0]
     return FORCE_STEP * np.round(signal / FORCE_STEP)
 
 

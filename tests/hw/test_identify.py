@@ -192,9 +192,12 @@ NOT_VISCOUS = {
 
 @pytest.fixture(scope="module")
 def records():
-    """Return {name: (rig, positions [m])}, forces (ticks,) [N] and the benchmark, whose plant is not our emulator's."""
+    """Return {name: (rig, positions [m])}, forces (ticks,) [N] and the benchmark, whose plant is not our emulator's.
+
+    Records are a third shorter than those of the command, which has `--seconds 2.5`.
+    """
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
-    rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"]()
+    rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"](1.5)
     rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in (HANDS | DASHPOTS).items()]
     rigs += [bench["Rig"](name, **more) for name, (more, _) in NOT_VISCOUS.items()]
     rigs += [bench["Rig"]("behind a lag", memory=1.5, relax=4e-3, lag=0.45, mass=0.308, step=2e-6)]
@@ -289,7 +292,7 @@ def test_damping_hands_are_detected_by_two_sittings(odd):
     assert odd["firm"].delta == pytest.approx(1.29, abs=0.01)
     for sittings in ([("firm", "ideal"), ("ideal", "ideal")], [("ideal", "ideal"), ("firm", "ideal")]):
         with pytest.raises(
-            ValueError, match=r"axis 1: 1(\.3)?, 1(\.3)? N s/m in sittings 1 to 2, a hand damped it in one"
+            ValueError, match=r"axis 1: (1.3, 0.9998|0.9998, 1.3) N s/m in sittings 1 to 2, a hand damped it in one"
         ):
             settled([sitting(odd, *names) for names in sittings])
     with pytest.raises(ValueError, match=r"axis 2: 1.3, 1.08, 1.3 N s/m .* one at least\. The two lowest must agree"):
@@ -297,8 +300,8 @@ def test_damping_hands_are_detected_by_two_sittings(odd):
     three = [sitting(odd, *names) for names in (("firm", "ideal"), ("ideal", "ideal"), ("late 0.3", "firm"))]
     (first, second), words = settled(three)
     assert words == [
-        "axis 1: 1.3, 1, 0.9996 N s/m in sittings 1 to 3, a hand damped it in 1, which did not count",
-        "axis 2: 1, 1, 1.3 N s/m in sittings 1 to 3, a hand damped it in 3, which did not count",
+        "axis 1: 1.3, 0.9998, 0.9999 N s/m in sittings 1 to 3, a hand damped it in 1, which did not count",
+        "axis 2: 0.9998, 0.9998, 1.3 N s/m in sittings 1 to 3, a hand damped it in 3, which did not count",
     ]
     assert (first.viscous, second.viscous) == (min(odd["ideal"].viscous, odd["late 0.3"].viscous), odd["ideal"].viscous)
     assert first.delta == min(odd["ideal"].delta, odd["late 0.3"].delta) <= 1
@@ -364,8 +367,16 @@ def test_a_device_of_three_axes_is_one_table():
         assert read.credible_speed == pytest.approx(0.6 - 0.1 * (len(axes) - 1), abs=1e-3)
 
 
-def test_fast_swings_of_unknown_masses_are_no_jumps(tmp_path):
-    """A compliant device swings at 84 Hz by 1 mm, more than the forces would move the declared mass."""
+def test_fast_swings_of_unknown_masses_are_no_jumps(tmp_path, monkeypatch):
+    """A compliant device swings at 84 Hz by 1 mm, more than the forces would move the declared mass.
+
+    The session ends before the estimation, which is left out.
+    """
+
+    def no_estimates(*record):
+        raise ValueError("left out")
+
+    monkeypatch.setattr("haptic_loop.cli.identify.estimate", no_estimates)
     options = "--rehearse --measure 60 --seconds 0.5 --travel 10 --sittings 1"
     identify_command([*options.split(), "--out", str(tmp_path)])
     report = json.loads((tmp_path / "report.json").read_text())
@@ -405,7 +416,7 @@ def test_an_axis_that_does_not_move_gives_nothing():
 @pytest.mark.slow
 def test_a_record_with_gaps_gives_no_bound():
     scenario = load()
-    recorder, session = record_of(scenario, "up:drop=0.01@0.4")
+    recorder, session = record_of(scenario, "up:drop=0.01@0.4", seconds=0.3)
     with pytest.raises(ValueError, match="ticks came without a STATE"):
         estimate(recorder, session, scenario)
 
