@@ -1,10 +1,12 @@
 """Lines, marks and legends of every picture show the reported numbers."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from haptic_loop.controller.units import in_unit
@@ -33,6 +35,13 @@ def drawn(monkeypatch, tmp_path):
         return seen[-1]
 
     return draw
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Return a function that makes a picture without drawing its pixels, and returns its figure."""
+    monkeypatch.setattr(plots, "save", lambda figure, path, dpi=130: figure)
+    return lambda function, *arguments: function(*arguments, path=Path("a.png"))
 
 
 def legend(figure):
@@ -139,12 +148,12 @@ def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
     assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom shows the credible part only
 
 
-def test_wrong_verdicts_are_crossed(drawn):
+def test_wrong_verdicts_are_crossed(undrawn):
     names = "integrator", "substeps", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error"
     rows = [("RK4", 1, 0.1, 1e-6, -1e-3), ("RK4", 4, 0.3, 1e-8, 1e-5), ("Euler", 1, 0.05, 0.0, 2.0)]
     rows = [SimpleNamespace(**dict(zip(names, row, strict=True)), verdict_correct=row[0] == "RK4") for row in rows]
     rows.append(SimpleNamespace(integrator=None, position_relative_rms=0.0, growth_rate_error=0.0))
-    position, growth = drawn(plots.plot_accuracy, rows).axes
+    position, growth = undrawn(plots.plot_accuracy, rows).axes
     np.testing.assert_array_equal(lines(growth)["RK4"], [(0.1, 1e-3), (0.3, 1e-5)])
     assert not lines(position)["Euler"].size  # an error of 0 has no place on a logarithmic axis
     assert [line.get_xydata().tolist() for line in growth.lines if line.get_marker() == "x"] == [[[0.05, 2.0]]]
@@ -183,8 +192,8 @@ def report(available=(1.37, 1.37), psi=(0, 0)):
     return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=names)
 
 
-def test_binding_frequencies_are_marked(drawn):
-    here, anywhere = drawn(plots.plot_required_damping, report()).axes
+def test_binding_frequencies_are_marked(undrawn):
+    here, anywhere = undrawn(plots.plot_required_damping, report()).axes
     np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
     marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
     np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37))
@@ -192,18 +201,19 @@ def test_binding_frequencies_are_marked(drawn):
     assert here.get_title() == "this environment"
     assert here.get_ylabel() == "required damping [N s/m]"
     assert "soft (no curve: see the printed remarks)" in lines(anywhere)
-    here, anywhere = drawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
+    here, anywhere = undrawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
     assert here.get_ylabel() == "required damping over available damping"
     assert anywhere.get_title() == "any passive environment (with a multiplier for this environment)"
 
 
-def test_drawn_singular_values_are_the_reported_ones(drawn):
-    figure = drawn(plots.plot_singular_values, report())
+def test_drawn_singular_values_are_the_reported_ones(undrawn):
+    figure = undrawn(plots.plot_singular_values, report())
     assert [axis.get_title() for axis in figure.axes] == ["soft", "stiff"]
     assert legend(figure) == ["E, the environment", "F, felt at the devices", "M, the mismatch"]
     assert [text.get_text() for text in figure.axes[0].texts] == ["M = 0"]
     np.testing.assert_array_equal(lines(figure.axes[0])["E, the environment"], np.transpose([HZ, [4.0] * 3]))
-    figure = drawn(plots.plot_perceived, report())
+    np.testing.assert_array_equal(lines(figure.axes[0])["F, felt at the devices"], np.transpose([HZ, [3.0] * 3]))
+    figure = undrawn(plots.plot_perceived, report())
     np.testing.assert_array_equal(lines(figure.axes[0])["soft"], np.transpose([HZ, [1.0, -5.0, 7.0]]))
     np.testing.assert_array_equal(lines(figure.axes[3])["stiff"], np.transpose([HZ, [2.0] * 3]))
     assert legend(figure) == ["ideal: E itself", "soft", "stiff"]
@@ -254,8 +264,31 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
         f"MuJoCo: {map_plot.UNDECIDED} (1)",
         "unlike the linear loop (1)",
     ]
+    drawn_at = [(line.get_marker(), line.get_xydata().tolist()) for line in axis.lines]  # damping across, stiffness up
+    circles = [("o", [[0, 10]]), ("X", [[2, 20]]), ("D", [[1, 20]]), ("o", [[2, 20]])]
+    assert drawn_at == [*circles, ("*", [[0.5, 15]])]
     title = "rigid wall: theta 1, T 1 ms, delta 1.37, 2 N s/m\npsi 0, 1, encoder step 10 um"
     assert figure.get_suptitle() == title
+
+
+def test_cells_meet_halfway():
+    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 2.0, 4.0]), "linear"), [1, 1.5, 3, 4])
+    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 100.0, 1e4]), "log"), [1, 10, 1e3, 1e4])
+
+
+def test_panels_show_forces_beside_ideal_ones(undrawn):
+    """The panels' range is 1.5 times the largest ideal force of the credible run."""
+    f, t = np.array([[0.0], [1.0], [3.0]]), T * np.arange(3)
+    panels = [plots.Panel("calm", trace(f), 2 * f), plots.Panel("wild", trace(5 * f), 9 * f, 1.5e-3)]
+    figure = undrawn(plots.plot_side_by_side, panels)
+    for axis, panel in zip(figure.axes, panels, strict=True):
+        ideal, own = axis.lines[:2]
+        np.testing.assert_array_equal(ideal.get_xydata(), np.column_stack([t, panel.ideal]))
+        np.testing.assert_array_equal(own.get_xydata(), np.column_stack([t, panel.trace.f]))
+        assert axis.get_ylim() == (-9.0, 9.0)
+    (veil,) = figure.axes[1].patches
+    assert (veil.get_x(), veil.get_x() + veil.get_width()) == (1.5e-3, t[-1])
+    assert not figure.axes[0].patches
 
 
 def test_environment_maps_mark_their_design_point(drawn):
@@ -299,7 +332,7 @@ def test_a_picture_has_the_format_of_its_suffix(suffix, begin, tmp_path):
 @pytest.mark.parametrize("name", ["a", "a.jpg", "a.pn"])
 def test_other_suffixes_of_pictures_are_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"the suffix is .*allowed are \.png, \.pdf, \.svg"):
-        plots.save(plots.draw_run(trace(np.zeros((2000, 1))), "t", 8.0), tmp_path / name)
+        plots.save(Figure(), tmp_path / name)
     with pytest.raises(InputError, match="no null byte"):
-        plots.save(plots.draw_run(trace(np.zeros((2000, 1))), "t", 8.0), tmp_path / f"{name}\0.png")
+        plots.save(Figure(), tmp_path / f"{name}\0.png")
     assert not list(tmp_path.iterdir())

@@ -541,6 +541,28 @@ def test_the_window_s_loop_without_the_window(none):
     assert drawn.max() == pytest.approx(running.frame(0).history[:, 0].max(), rel=1e-6)  # single precision
 
 
+def arrows(stage, frame):
+    """Return the directions (arrows, 3) of the drawn arrows, and the places of the bars."""
+    picture = mujoco.MjvScene(stage.model, 50)
+    stage.show(frame)
+    stage.draw(picture, frame)
+    drawn = [picture.geoms[i] for i in range(picture.ngeom)]
+    ways = [np.array(geom.mat)[:, 2] for geom in drawn if geom.type == mujoco.mjtGeom.mjGEOM_ARROW]
+    return ways, [np.array(geom.pos) for geom in drawn if geom.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
+
+
+def test_arrows_show_what_devices_feel(none):
+    """A device feels -f, and the bar shows the range of -f since the last frame."""
+    scene, limit = none.simulation.scene, none.simulation.process.force_limit
+    stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
+    told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
+    ways, bars = arrows(stage, replace(session(none).frame(0.0), **told))
+    np.testing.assert_allclose([way[0] for way in ways], [-1, 1, 1], atol=1e-6)  # the last one is the push
+    for bar, handle, f, most in zip(bars, scene.handles, (2.0, -2.0), limit, strict=True):
+        at = stage.data.xpos[stage.model.jnt_bodyid[handle]]
+        assert bar[0] - at[0] == pytest.approx(-f / most * drawing._LONGEST, abs=1e-6)
+
+
 def test_the_window_s_loop_ends_when_it_should(none):
     stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(1000, stage), [0.0]
@@ -600,6 +622,24 @@ def test_flat_pictures_show_where_things_are(none):
 
     # 520 pixels show 0.42 m: 0.09 m on each side of the handle and two arrows; both ends of a motion are rounded.
     assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
+
+
+def test_flat_pictures_show_the_force_that_is_felt(none):
+    """A device feels -f: a positive f draws a line to the left of its handle, and a curve above the plot's middle."""
+    painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
+    frame = session(none).frame(0.05)
+
+    def first_device(f):
+        both = np.array([f, 0.0])
+        told = {"mean": both, "low": both, "high": both, "history": np.tile(both, (400, 1)), "push": 0 * both}
+        picture = painter.picture(replace(frame, **told))
+        return np.nonzero((picture == (0, 115, 178)).all(axis=2))
+
+    (rows, columns), (_, still) = first_device(6.0), first_device(0.0)
+    body, plot = rows < 480, rows > 490
+    assert columns[body].min() < still.min() - 20
+    assert columns[body].max() == still[still < 500].max()
+    assert rows[plot].max() < (498 + 622) / 2
 
 
 def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
@@ -746,6 +786,15 @@ def test_the_window_shows_scene_and_devices(ball):
     assert window.user_scn.ngeom >= 4  # two styluses of two shapes
     np.testing.assert_array_equal(stage.data.qpos, running.frame(0).pose)
     assert stage.grip(window.perturb) == Grip(1, (pytest.approx(0.03),))
+
+
+def test_arrows_in_worlds_show_what_devices_feel(ball):
+    running = LiveLoop(ball, Inline())
+    told = {"mean": np.array([1.0, -1.0]), "push": np.array([0.0, 2.0])}
+    stage = stage_for(running)
+    ways, _ = arrows(stage, replace(running.frame(0.0), **told))
+    along = [stage._along[i][0] for i in (0, 1, 1)]
+    np.testing.assert_allclose([w @ a for w, a in zip(ways, along, strict=True)], [-1, 1, 1], atol=1e-6)
 
 
 @pytest.mark.slow
