@@ -11,7 +11,7 @@ from worlds import block_by_hand, contact_by_hand, least_scaled
 
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design.api import design_coupling
 from haptic_loop.design.assessment import assess
@@ -19,6 +19,8 @@ from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT, LimitedForces
+from haptic_loop.design.facts import KnownMotor, Limited, Switching, Walls, compose
+from haptic_loop.design.known_device import period_cost
 
 change = msgspec.structs.replace
 BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])
@@ -358,3 +360,70 @@ def test_the_stiffest_coupling_counts_the_exact_latency(theta, tau):
     limit = 2 / ((theta + 1) * 1.2e-3 + tau)
     assert 0.999 * limit < 1 / found.coupling.compliance(1.2e-3).dc()[0, 0] < limit
     assert prove(loop, found.coupling, "any-environment").proof == "rational"
+
+
+# The block of each hands' side with any facts is the quadratic form of docs/theory.md, in phasors at one frequency.
+
+GRIP, KNOWN = DeviceBounds(0.06, 14500.0, 0.5, 0.5), 6e-5  # bounds of the device, and beta [s]
+MULTIPLIERS = {"a": (2000.0,), "a + c": (900.0,), "d": (700.0,), "m": (0.3,), "alpha": (350.0,), "c": (0.4, 0.7)}
+
+
+def work(first, second):
+    """Return Re(first* second)."""
+    return np.vdot(first, second).real
+
+
+def of_hands(hands, f, z, x, delta, T):
+    """Return the terms of a hands' side, and the displacement dq that f[k] multiplies; x holds its inputs."""
+    if hands == "periods":
+        return work(f, x["dx"]) + delta / 1.4e-3 * abs(x["dx"]) ** 2, x["dx"]
+    if hands == "latency":
+        heat = delta * (abs(x["xa"]) ** 2 / 3e-4 + abs(x["xb"]) ** 2 / (1.4e-3 - 3e-4))
+        return work(f / z, x["xa"]) + work(f, x["xb"]) + heat, x["xb"] + z * x["xa"]
+    dx, v, last = x["dx"], x["v"], z * x["v"]
+    c0, c2 = delta - KNOWN**2 * 14500.0**2 / 0.5 / 4, KNOWN * 0.06 - KNOWN**2 * 0.5 / 4
+    q = 2 * np.sqrt(c2 / c0) * np.tanh(np.sqrt(c0 / c2) * T / 2)
+    mean, dq = (v + last) / 2, dx + KNOWN * (last - v)
+    L = c0 * q * abs(mean) ** 2 + c0 * abs(dx - q * mean) ** 2 / (T - q) + c2 * abs(last - v) ** 2 / q
+    return work(f, dq) + L, dq
+
+
+@pytest.mark.parametrize("names", [(), ("walls",), ("switching",), ("limiter",), ("walls", "switching", "limiter")])
+@pytest.mark.parametrize("hands", ["periods", "latency", "known"])
+def test_every_block_is_the_form_of_the_theory(hands, names):
+    rng, T, rho, alpha = np.random.default_rng(1), 1e-3, 13.0, MULTIPLIERS["alpha"][0]
+    lo, hi = (0, 2) if "switching" in names else (1, 1)
+    more = {"known_devices": (GRIP,)} if hands == "known" else {"T_max": 1.4e-3}
+    more |= {"latency": ((3e-4, 3e-4),)} if hands == "latency" else {}
+    network = held(wall(3000.0, 2.0)) if "walls" in names else held()
+    loop = loop_of(network, T, 1, 1.3, varying_delay=DelayRange((lo,), (hi,)), **more)
+    G = loop.walled_before_delay(COUPLING) if "walls" in names else loop.sent(COUPLING)
+    facts = {"walls": Walls(), "switching": Switching(), "limiter": Limited((rho,), 2)}
+    motor = KnownMotor(period_cost(loop, 1.0, np.array([KNOWN])), np.array([KNOWN])) if hands == "known" else None
+    demand = compose(G, loop, [facts[name] for name in names], MULTIPLIERS, hands=motor)
+    inputs = {"periods": ["dx"], "latency": ["xa", "xb"], "known": ["dx", "v"]}[hands]
+    inputs += ["de"] * ("limiter" in names) + ["u", "s"] * ("walls" in names) + ["w"] * ("switching" in names)
+    z = np.exp(1j * rng.uniform(0.05, 3.1))
+    y = rng.normal(size=(len(inputs), 2)) @ [1, 1j]
+    x = {"de": 0, "u": 0, "s": 0, "w": 0} | dict(zip(inputs, y, strict=True))
+    responds = x["dx"] if "dx" in x else x["xa"] + x["xb"]
+    x["xb" if hands == "latency" else "dx"] += x["de"]  # The slip is taken off these inputs of the block.
+    k, b, u, s = 3000.0, 2.0 / T, x["u"], x["s"]
+    W = k + b * (1 - 1 / z)
+    dp = W * u + (W - k) * s
+    df_e, *dy = G.at(np.array([z]))[0] @ ([responds, dp] if "walls" in names else [responds])
+    df_e = df_e - rho * (1 - 1 / z) * x["de"]
+    f_e = df_e / (z - 1)
+    form, dq = of_hands(hands, (z**-lo + z**-hi) / 2 * f_e, z, x, 1.3, T)
+    if "walls" in names:
+        (a,), (both,), (d,), (m,) = (MULTIPLIERS[name] for name in ("a", "a + c", "d", "m"))
+        dr = dy[0] - u
+        form += k * work(u, dr / (z - 1)) - a * work(u, dr) + (both - a) * work(s, dr)
+        form += d * work(s, u + s) - m * work(s / z, dp)
+    if "limiter" in names:
+        M = z + sum(c * sum(z - z**-n for n in range(j)) for j, c in enumerate(MULTIPLIERS["c"], start=1))
+        form -= work(M * f_e, x["de"])
+    if "switching" in names:
+        form += work(x["w"], (hi - lo) * df_e + 2 * alpha * x["w"]) - alpha / 2 * abs(dq) ** 2
+    block = (demand.free + demand.gain).at(np.array([z]))[0]
+    assert work(y, block @ y) == pytest.approx(form, rel=1e-10)
