@@ -39,7 +39,7 @@ class Certificate(Strict, frozen=True):
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
     multipliers: dict[str, tuple[float, ...]]  # by name, exact decimals; "rho" is the limiter's stiffness [N/m]
-    matrices: dict[str, Rows]  # P; P1, P2, .. of further environments; P_E of a delayed environment
+    matrices: dict[str, Rows]  # of KYP inequalities: P; P1, P2, .. of further environments; P_E of a delayed one
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields

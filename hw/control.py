@@ -40,7 +40,7 @@ from haptic_loop.sim.world import START_J, scene_of
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
-_JOLT = 20.0  # [N] no motor and hand apply this force for a tick, and its opposite for the next tick
+_JOLT = 20.0  # [N] motor and hand together never apply this force for one tick and its opposite for the next
 _FALLBACK = ("spring-damper", "any-environment")  # designs of softer couplings, if the requested kind gives none
 
 
@@ -612,7 +612,7 @@ _EQUAL = 1e-6  # relative difference of static stiffnesses that counts as none: 
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
-    """Return whether `reserve` needs less damping than `than`, is nowhere stiffer, and softer at longer delays.
+    """Return whether `reserve` needs less damping than `than`, is softer where its delay is longer, nowhere stiffer.
 
     The damping is that of the loop with the reserve's delays. The stiffness is K, or, if one of the couplings has no K,
     the static stiffness that the devices feel.

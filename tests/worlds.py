@@ -67,7 +67,7 @@ SOFT_NETWORK = Network(
     (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
     {"mass": 1.0},
 )
-#: a coupling of version 0.1: a diagonal Q of eight basis functions, designed for the vertices of omega-pair-ranges only
+#: an internal-model coupling: a diagonal Q of eight coefficients, designed for the vertices of omega-pair-ranges only
 POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
 DIAGONAL = (
     (-3.6184269801e-05, -2.9144270496e-05),

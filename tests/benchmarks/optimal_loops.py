@@ -2,7 +2,7 @@
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
-`before` is the rms mismatch of version 0.1's optimal couplings for nine loops. `to beat` is the goal for the rms
+`before` is the rms mismatch of an older version's optimal couplings for nine loops. `to beat` is the goal for the rms
 mismatch and the rendered stiffness g. The bound is computed for loops of at most --bound devices. Seconds are CPU
 seconds. `need` is the required over the available damping, and `at 10 %` the worst one when a parameter of the object
 changes by 10 %. `gain` is the high-frequency gain (design/transparency.py), and `limited` the mismatch of the coupling
@@ -30,7 +30,7 @@ T = TypeVar("T")
 PATIENT = Options(seconds=600)  # so that a busy machine tries as many bases as an idle one
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
-#: by loop: rms mismatch [dB] of version 0.1 (or why there was none), mismatch [dB] and stiffness to beat
+#: by loop: rms mismatch [dB] of an older version (or why there was none), mismatch [dB] and stiffness to beat
 BEFORE = {
     "n0": ("-29.50", "-33.69, .996"),
     "n1": ("-11.19", "-13.13, .88"),

@@ -4,7 +4,8 @@ PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (
 
 Every tool gets the default scenario with the published coupling of case I: same process, force limits, outside forces
 and plant. The tools take turns in every round, and the median of a tool's CPU times counts. Growth is measured on the
-tool's trace, projected on the exact loop's dominant mode. A tool that is not installed is listed as not measured.
+tool's trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1". A
+tool that is not installed is listed as not measured.
 
 Drake gets a MultibodyPlant of prismatic joints, springs as bushings, and the forces of a period as an applied
 generalised force, since its discrete controllers are Python systems, which cost more. python-control gets the sampled

@@ -132,7 +132,7 @@ def test_no_narrow_resonance_hides_from_passivity(width):
 
 @pytest.mark.parametrize("count", [12, pytest.param(30, marks=pytest.mark.validate)])
 def test_the_bound_is_below_every_sample(count):
-    """The bound of random stable blocks is below the minimum of a dense sweep around every pole, by at most 0.2 %."""
+    """`hermitian_floor` of random stable blocks is below a dense sweep around all poles, by at most 0.2 %."""
     rng = np.random.default_rng(11)
     for _ in range(count):
         n, m = int(rng.integers(1, 7)), int(rng.integers(1, 4))
@@ -151,7 +151,7 @@ def test_the_bound_is_below_every_sample(count):
 
 
 def test_a_block_is_bounded_away_from_its_poles():
-    """Bounds of random, sharply resonant blocks hold on circles of complex frequencies, or are inf near a pole."""
+    """`sizes_around` bounds sharply resonant random blocks on circles of complex frequencies, or is inf near poles."""
     rng = np.random.default_rng(12)
     for _ in range(20):
         n, m = int(rng.integers(1, 7)), int(rng.integers(1, 4))

@@ -1,4 +1,4 @@
-"""Bounds of motor and transmission contain the truth of rigs that are simulated here, or are refused."""
+"""Bounds of motor and transmission contain the true values of simulated rigs; other records are refused."""
 
 import json
 from contextlib import suppress

@@ -1,7 +1,7 @@
 """Optimal couplings of each form run wherever a coupling can run.
 
 The forms are a filter that covers limited forces, a filter behind a delayed environment (psi = 1) with a free mass, and
-a pair: Q and a model of the environment, as in version 0.1."""
+a pair: Q and a model of the environment."""
 
 import json
 import shutil

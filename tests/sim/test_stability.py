@@ -1,4 +1,4 @@
-"""Growth rates equal the agreed figures; a trace that cannot give one gives a reason."""
+"""Growth rates equal the expected figures; a trace that cannot give one gives a reason."""
 
 import json
 from dataclasses import replace
