@@ -1,4 +1,4 @@
-"""Adversaries attack guarantees beyond the linear loop at their edge, as `make validate` does at length."""
+"""Adversaries attack guarantees for limits, budgets, walls and encoder steps, as `make validate` does at length."""
 
 import pytest
 
