@@ -303,14 +303,18 @@ class Drive:
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
         self._path = deque[tuple[float, ...]](maxlen=4)  # [m] displacements since the last gap
         self._uneven = deque[float](maxlen=3)  # [s] differences of the last ticks from T
-        axes = zip(expected.mass, still, units.encoder_step, settings.behind or (0,) * config.axes, strict=True)
-        #: (m,) [m] displacement by such a force, by noise and rounding of four counts, and by a repeated sample. The
-        #: mass of a device that is being identified is unknown, so that any displacement up to `jump` is possible.
+        late = settings.behind or (0,) * config.axes
+        axes = zip(expected.mass, expected.mode, still, units.encoder_step, late, strict=True)
+        #: (m,) [m] displacement by such a force, or of a motor that swings on its transmission at the speed limit; by
+        #: noise and rounding of four counts, and by a repeated sample. The mass of a device that is being identified
+        #: is unknown, so that any displacement up to `jump` is possible.
         self._jolts = [
-            _JOLT * limits.lever * T**2 / mass + 2 * n * q + limits.speed * T * (late > 0)
+            max(_JOLT * limits.lever * T**2 / mass, 4 * limits.speed / w * math.sin(min(w * T, math.pi) / 2) ** 3)
+            + 2 * n * q
+            + limits.speed * T * (behind > 0)
             if settings.test_encoders
             else limits.jump
-            for mass, n, q, late in axes
+            for mass, w, n, q, behind in axes
         ]
         self._clock_us = 0  # the device's clock at the last STATE
         self.world = self.controller if isinstance(self.controller, WorldController) else None

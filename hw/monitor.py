@@ -532,7 +532,11 @@ class Expected:
         plants = [hold(scene.plant, scenario.T) for scene in scenes]
         #: A and B of each plant, with B for the motors' force -f
         self._plants = [(p.A, -p.B[:, scene.outside :]) for p, scene in zip(plants, scenes, strict=True)]
-        self.mass = [sum(device.bodies.values()) for device in scenario.axis_devices]  # (m,) [kg]
+        stiffness = [(device.transmission or (0.0, math.inf))[1] for device in scenario.axis_devices]
+        bodies = [device.bodies.values() for device in scenario.axis_devices]
+        self.mass = [sum(own) for own in bodies]  # (m,) [kg]
+        #: (m,) [rad/s] at which a motor swings against its handle; infinite for rigid devices
+        self.mode = [math.sqrt(k * sum(1 / m for m in own)) for k, own in zip(stiffness, bodies, strict=True)]
         self.rest()
 
     def rest(self) -> None:

@@ -174,7 +174,7 @@ CASES = (
     Fault("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
     Fault("encoder jumps by 0.05 mm", A, faults=at("jump=0.05")),
     *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
-    *_signed("jump of {} mm, encoder {}", "jump", 0.15, "encoder {axis} jumped by", _STOP + _T_MS),
+    *_signed("jump of {} mm, encoder {}", "jump", 0.2, "encoder {axis} jumped by", _STOP + _T_MS),
     *_signed("shaking by {} mm, encoder {}", "shake", 0.5, "encoder {axis} jumped by", _STOP + 2 * _T_MS),
     *(
         Fault(

@@ -536,6 +536,22 @@ def test_no_still_hold_is_stopped():
     assert still_holds(300, seed=1)[0] == 0
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
+    """0.14 N s move 0.25 kg at 0.56 m/s, and the motor swings at 90 Hz by 1 mm against the handle of 0.19 kg."""
+    free = nobody(scenario)
+    session = Session(free, SafetyLimits((1.3, 1.3)), LinkSettings(measure=60, held=False))
+    emulator = Emulator(free)
+
+    def knock(session, now):
+        emulator.plant.s[6 + axis] += 0.14 / 0.19  # the state has four positions, two motors' and two handles' speeds
+        return ()
+
+    Rehearsal(session, emulator, lambda ages: rungs, actions=[(0.7, knock)]).run_until_armed(0.9)
+    assert session.stage == Stage.ARMED, session.cause
+    assert emulator.plant.fastest > 1.0  # [m/s] mean speed and swing of the motor
+
+
 # positions count from where the handles are
 
 
