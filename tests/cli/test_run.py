@@ -63,7 +63,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
-    """The paper's condition would render half the stiffness; the first run should show what is possible."""
+    """A design for the paper's condition has half the stiffness; the first run should show what is possible."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"
@@ -112,7 +112,7 @@ def test_published_gains_are_refused_by_their_own_condition(tmp_path):
      ("validate", "--environments ranges")],
 )  # fmt: skip
 def test_impossible_settings_are_refused_before_designs(command, words, monkeypatch):
-    """A design may take minutes."""
+    """Settings are checked before the design, which may take minutes."""
     module = import_module(f"haptic_loop.cli.{command}")
     monkeypatch.setattr(module, "chosen_by", lambda *asked: pytest.fail("a coupling was designed"))
     with pytest.raises(InputError, match=words.split()[-2]):

@@ -88,7 +88,7 @@ class Line:
 
 
 def test_no_hand_is_given_more_than_the_budget():
-    """Each controller meets twenty hands with and without losses, which start at 1 mm/s and at 0.3 m/s."""
+    """Each controller meets twenty hands of each kind: with or without losses, starting at 1 mm/s or at 0.3 m/s."""
     rng, n = np.random.default_rng(7), np.arange(240)
     lossless, start = n // 3 % 2 == 0, np.where(n // 6 % 2 == 0, 1e-3, 0.3)
     hands = Hands(rng, n.size, lossless, start)

@@ -214,7 +214,7 @@ def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
             np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-9, atol=1e-9)
 
 
-def test_a_slip_bends_the_tick_that_computes_the_force():
+def test_a_slip_bends_the_tick_computing_the_force():
     """The tick of a slip is not linear; the limited force acts theta ticks later."""
     limiter = loop_of(FIGURE_4, (2, 3), (0, 0)).law(STIFF, (3.0, 1.5), (5.0, 2.0))
     buffer = drive(closed(limiter), wander(60, 2, 11))

@@ -518,7 +518,7 @@ def test_a_delay_beyond_all_files_is_refused(psi):
         DelayRange((1, 1), (psi, psi))
 
 
-def test_a_loop_that_no_file_holds_names_its_field(tmp_path):
+def test_a_loop_unfit_for_files_names_its_field(tmp_path):
     """`replace` accepts a negative damping. Saving that loop is refused."""
     stored = Stored(msgspec.structs.replace(PAIR, delta=(1.0, -1.0)), SOFT.form())
     with pytest.raises(InputError, match=r"bad.json: .* > 0.0 - at `\$.loop.delta"):

@@ -260,7 +260,7 @@ def test_the_margin_is_time_before_the_latch():
     slow.receive(encode(CONFIG._replace(theta=15, hold=2)), 0)
     slow.tick(3000, (0, 0))
     slow.receive(encode(Force(Command.IDLE, 16, 1, (0, 0))), 3000)
-    assert slow.margin == 32_767  # the margin is 45,000; the wire carries no more
+    assert slow.margin == 32_767  # the margin is 45,000 us, but the wire carries at most 32,767
     rig = Rig()
     rig.tick()
     rig.answer(command=Command.IDLE, back=1, after=100)  # the tick of this FORCE began 100 us ago

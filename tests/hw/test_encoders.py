@@ -212,7 +212,7 @@ def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
 
 @pytest.mark.parametrize(("most", "mass"), [(0.6, 0.25), (0.9, 0.15), (9.0, 0.15)])
 def test_a_saturated_motor_fails_the_last_test(most, mass):
-    """Light handles hide that a motor makes 0.9 of 1.3 N: they move as far as 1.5 times the force predicts."""
+    """A handle of 0.15 kg instead of 0.25 kg moves farther, which hides at first that a motor makes 0.9 of 1.3 N."""
     limited, first = masses(mass=mass, motor=lambda force: np.clip(force, -most, most)), arming_test(cap=1.3)
     played(first, limited)
     last = arming_test(cap=1.3, before=first.sizes, known=True)
@@ -345,7 +345,7 @@ def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
 
 
 @pytest.mark.parametrize("at", [0.05, 0.3])
-def test_a_stop_before_the_end_test_is_no_finish(scenario, rungs, at):
+def test_a_stop_before_the_end_test_finishes_nothing(scenario, rungs, at):
     """At 0.05 s the encoders are tested and the gain is still 0; at 0.3 s it has risen."""
     session, _ = session_with(scenario, rungs, stop=at, seconds=1.5)
     assert (session.stage == Stage.FINISHED) == (at == 0.3), session.cause
@@ -456,7 +456,7 @@ def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
 
 @pytest.mark.parametrize(("axis", "kind", "sign"), checkered([1, 2], ["freeze", "toggle"], [1, -1]))
 def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
-    """Whichever way people begin, the axis with the dead encoder is named, within 0.7 s of the log's previous entry."""
+    """In whichever direction people begin, the dead encoder is named within 0.7 s of the log's previous entry."""
     turned = tuple(
         replace(h, voluntary=replace(h.voluntary, phase=h.voluntary.phase + np.pi * (sign < 0))) for h in scenario.human
     )

@@ -365,7 +365,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 @needs_gcc
 def test_the_headers_need_no_library_or_heap(tmp_path):
-    """The headers include standard C99 headers only; the compiled harness calls memcpy, memset and strncpy only."""
+    """Both headers include no library beyond C99; the compiled harness calls memcpy, memset and strncpy only."""
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
         '#include "haptic_frame.h"',
@@ -599,9 +599,9 @@ def test_emergency_stops_replace_earlier_causes(device):
 
 
 def test_late_double_and_mistimed_forces_are_counted(device):
-    """A late FORCE sets only echo and a negative margin. None of the three kinds counts as a CRC error.
+    """A late FORCE sets only echo and a negative margin.
 
-    A second FORCE for the same tick sets nothing, nor does one with a wrong theta.
+    A second FORCE for the same tick sets nothing, nor does one with a wrong theta. None of them counts as a CRC error.
     """
     device.armed(theta=2)
     before = device.state()

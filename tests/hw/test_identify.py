@@ -233,7 +233,7 @@ def judged(records):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(NOT_VISCOUS))
 def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
-    """Neither truth nor bound includes dry friction, also where it depends on speed."""
+    """Neither truth nor bound includes dry friction, even if it depends on speed."""
     found, least = judged[name], NOT_VISCOUS[name][1]
     if isinstance(found, str):
         assert re.search("energy of a stroke does not grow|damping falls with frequency", found)
@@ -258,7 +258,7 @@ def test_a_lag_hides_no_memory(odd, records):
 
 @pytest.mark.parametrize(("name", "share"), [("viscous", 0.85), ("viscous, half the mass", 0.93)])
 def test_viscous_friction_keeps_most_of_its_bound(judged, name, share):
-    """The bound lacks what encoder steps of 5 um may hide of a memory of 2 ms. A lighter device hides less."""
+    """The bound excludes a memory of 2 ms that encoder steps of 5 um might hide. A lighter device hides less."""
     assert share < judged[name].delta <= 1.0
 
 

@@ -337,7 +337,7 @@ def test_invalid_forces_are_found_on_both_channels(channel, value):
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
 def test_motor_heat_grows_with_squared_force(channel, sign):
-    """At twice its continuous force a motor is hot after tau ln(4/3), at 0.99 times that force never.
+    """At twice its continuous force a motor is hot after tau ln(4/3), at 0.99 times its continuous force never.
 
     Missed ticks heat the motor, too.
     """

@@ -191,9 +191,9 @@ def test_damaged_traces_are_one_line(trace, tmp_path):
 
 @pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
 def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
-    """Steady ticks end at the first force that the cap or the slew rate changed, as the counters saw it.
+    """Steady ticks end within two ticks of the first cut that the session's counters saw, by cap or by slew rate.
 
-    Both agree to two ticks, since a force that is cut by less than a step is sent unchanged.
+    The two may differ, since a force that is cut by less than a step is sent unchanged.
     """
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((cap, cap), slew), FAST)

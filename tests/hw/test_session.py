@@ -94,7 +94,7 @@ def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
 
 
 def test_free_handles_arm_in_the_table(scenario, rungs):
-    """A session whose faulty device nobody holds arms, so the table's speeds of free handles mean something."""
+    """A session with a faulty device arms if nobody holds it, so the table's speeds of free handles mean something."""
     session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 

@@ -1,4 +1,4 @@
-"""Matrices that are read from MuJoCo equal the equations of motion, and are passive."""
+"""Matrices that are read from MuJoCo equal those of the equations of motion, and are passive."""
 
 import mujoco
 import numpy as np

@@ -267,7 +267,7 @@ def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
 
 
 def test_linear_scenes_linearise_to_their_network(tmp_path):
-    """E(z) agrees from 0.1 to 100 Hz to 1e-12 of its largest value, for two steps of the differences."""
+    """E(z) agrees from 0.1 to 100 Hz to 1e-12 of its largest value, for two steps of the finite differences."""
     scene, z = world(tmp_path, LINE), np.exp(2j * np.pi * np.geomspace(0.1, 100, 60) * T)
     E = environment_by_hand(NETWORK, z, T)
     for step in (1e-4, 1e-2):
@@ -324,7 +324,7 @@ def test_soft_bodies_lose_energy_and_are_listed(tmp_path):
     assert [part.what for part in port.world.parts() if "bodies" in part.what] == ["soft bodies"]
 
 
-# ---- refusals
+# ---- masses and refusals
 
 
 @pytest.mark.parametrize("gravity", ['<option><flag gravity="disable"/></option>', '<option gravity="0 0 0"/>', ""])

@@ -375,7 +375,7 @@ print(sorted({name.partition(".")[0] for name in sys.modules} & set(sys.argv[1:]
 
 
 def test_a_grounded_inerter_is_a_mass():
-    """Both networks require the same damping, and it is proved."""
+    """A mass of 1 kg with a grounded inerter of 0.25 kg requires the same damping as 1.25 kg, with a proof."""
     loop = load("omega-pair").loop("I")
     own = (*loop.network.springs, Spring(("mass", "ground"), 1.0, inertance=0.25))
     same = (*loop.network.springs, Spring(("mass", "ground"), 1.0))

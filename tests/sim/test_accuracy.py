@@ -85,7 +85,7 @@ def test_runs_say_when_they_stop_being_credible():
     assert (part.transmission_force_n, part.until_s) == ([None] * 2, None)
 
 
-def test_a_run_that_clips_at_once_has_no_error():
+def test_a_run_clipping_at_once_has_no_error():
     """The tip begins 20 mm inside a stiff wall, so the first force is beyond the limit."""
     scenario = load("one-wall")
     wall = msgspec.structs.replace(scenario.environment.walls[0], gap=-0.02, stiffness=3e4)

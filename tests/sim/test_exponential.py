@@ -167,7 +167,7 @@ def _one_period(process: Process, engine: Engine, outside: int):
 
 
 def test_of_first_order_where_devices_rub():
-    """Coulomb friction switches within a step, so the error against RK4 x 64 only halves with the step."""
+    """Coulomb friction switches within a step, so the error against RK4 x 32 only halves with the step."""
     loop = assemble(RUBBING, PUBLISHED["I"])
 
     def positions(integrator, substeps):
@@ -322,7 +322,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """The chosen setting keeps the error allowed against RK4 x 64; RK4 with half the substeps exceeds a quarter."""
+    """The chosen setting keeps the error allowed against RK4 x 64; RK4 with half its substeps exceeds a quarter."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -336,7 +336,7 @@ def test_friction_keeps_the_error_with_fewest_steps():
         choices = compare_engines(loop, asked, ticks)
         assert all(choice.position_relative_rms > 0 for choice in choices)  # the reference has an error, too
         found = pick(choices, asked)
-        assert found.integrator in expected  # one evaluation each
+        assert found.integrator in expected  # exponential and Euler steps need one evaluation each
         assert missed(found.integrator, found.substeps) <= found.position_relative_rms <= asked
         if found.substeps > 1:
             assert missed("RK4", found.substeps // 2) > asked / 4

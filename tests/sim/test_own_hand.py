@@ -153,7 +153,7 @@ class Muscles:
 
 
 def test_own_hand_populations_agree_in_both_engines():
-    """Uncoupled, some hands make the loop unstable; the engines agree which, and a repetition gives equal numbers."""
+    """Without coupling some hands make the loop unstable; both engines name the same ones, as does a repetition."""
     scenario = SCENARIO.replace(population=Muscles())
     found = validate(scenario, None, humans=40, duration=0.5)
     assert 0 < (found.exact > 0).sum() < 40
@@ -171,7 +171,7 @@ def test_own_hand_populations_agree_in_both_engines():
 
 
 def test_the_adversary_searches_what_the_population_draws():
-    """The search finds hands that grow faster than those of a quarter as many draws, and reports their true growth."""
+    """The search finds more growth than a quarter as many random draws, and reports the true growth of its hands."""
     population = Muscles()
     scenario = SCENARIO.replace(population=population)
     F = assemble(scenario, NoCoupling()).F

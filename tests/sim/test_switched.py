@@ -271,7 +271,7 @@ def held_alike(*links):
 
 
 def test_delays_depend_on_the_hands_number():
-    """Equal hands grow alike if they have the same number, in any place of a batch."""
+    """Equal hands with the same number have the same growth, at any place of a batch."""
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     held_by = variants(scenario.device, held_alike(*[(1.0, 20.0, 500.0)] * 3))
     growth = switched_crowd(assemble(scenario, SOFT), held_by, np.array([8, 3, 8]), 0, 2.0, None).exact

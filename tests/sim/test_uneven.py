@@ -121,7 +121,7 @@ def test_draws_lie_in_range_and_are_seeded():
     assert scenario.loop("I").T_max == 1.5e-3
     assert PAIR.replace(period=Periods(recorded=(0.5e-3,))).loop("I").T_max == PAIR.T  # certificates cover T, too
     assert scenario.usual_latency == pytest.approx([1.15e-4, 2.5e-4])
-    assert scenario.replace(duration=2.1).samples == 2000  # their mean is 1.05 ms
+    assert scenario.replace(duration=2.1).samples == 2000  # the periods' mean is 1.05 ms
     assert scenario.digest != PAIR.digest == PAIR.replace(period=None).digest
 
 
@@ -218,7 +218,7 @@ def test_periods_vary_beside_delays():
 
 @pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
-    """This is a short form of the check in `make validate`, which must fail with half the required damping."""
+    """This is a short form of the check in `make validate`; it must fail with half the required damping."""
     rows = list(uneven.uneven_ticks(0, 3, 500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)

@@ -165,7 +165,7 @@ def test_switching_keeps_the_plant_state(none):
 
 
 def test_the_oscillation_starts_and_dies(none):
-    """Without coupling and with more delay forces grow to their limits; published gains with less delay end this."""
+    """With more delay and no coupling, forces grow to their limits; published gains with less delay end this."""
     running = session(none, "0:theta+2 2.5:theta-3 2.5:published")
     grown = running.frame(2.5 - 1e-3)
     assert grown.prepared.mode.growth > 3
@@ -429,7 +429,7 @@ def followed(name, coupling, **changes):
 
 @pytest.mark.parametrize(("psi", "K", "B"), [((0, 0), 700.0, 0.5), ((0, 1), 50000.0, 20.0)])
 def test_the_drawn_springs_carry_the_forces(psi, K, B):
-    """Forces are those of the drawn springs, 800 and 700 N/m with 1 N s/m, by backward differences and delayed."""
+    """Forces equal those of the drawn springs (800 and 700 N/m, 1 N s/m, backward differences), theta + psi later."""
     scenario, trace, q = followed("omega-pair", SpringDamper([K, K / 2], [B, B]), psi=psi)
     for i, stiffness in enumerate((800.0, 700.0)):
         stretch = q[:, i] - q[:, 2]
@@ -727,7 +727,7 @@ def test_mp4_without_ffmpeg_is_refused(monkeypatch, tmp_path):
         run("--video", str(tmp_path / "a.mp4"))
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="on other systems no variable tells of a display")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="on other systems no variable names the display")
 def test_without_a_display_there_is_a_line(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -744,7 +744,7 @@ def ball():
 
 
 def test_live_worlds_feel_as_in_a_run(ball):
-    """The live loop delays forces itself, and sim.run by packets; the forces are equal."""
+    """The live loop delays forces itself, and sim.run delays them as packets; the forces are equal."""
     running = LiveLoop(ball, Inline(), (), math.inf)
     trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")
     frame = running.frame(0.5)

@@ -81,7 +81,7 @@ class Touch:
 
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
-    """Hands are thrown at each scene with delays of 0 and 2 samples; with damped hands the shell never acts."""
+    """Hands are thrown at each scene with delays of 0 and 2 samples, and the shell never acts."""
     rng, acted, ticks = np.random.default_rng(3), 0, 0
     for run in (0, 2):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
@@ -195,7 +195,7 @@ UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
 def test_the_shell_credits_released_gravity(tmp_path):
-    """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy the shell limits most forces."""
+    """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy, the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
     acted = {}
     for credit in (True, False):

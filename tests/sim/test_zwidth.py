@@ -1,4 +1,4 @@
-"""The K-B map has the figures of closed forms and design.conditions, and the verdicts of single loops."""
+"""Values of the K-B map equal closed forms and design.conditions; its verdicts equal those of single loops."""
 
 import csv
 import json
@@ -111,7 +111,7 @@ def test_maps_of_the_widest_plane_match_sweeps(scenario):
     ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
 )
 def test_maps_at_walls_match_single_sweeps(theta, least):
-    """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; with delay frozen contact needs less."""
+    """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; permanent contact needs less if delayed."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
@@ -184,7 +184,7 @@ def test_suprema_find_what_a_dense_sweep_finds():
     # every point occurs twice, as in a grid around a pair of poles
     common, own = np.linspace(0, np.pi, 60), np.broadcast_to(np.linspace(0, np.pi, 60), (3, 60))
     found = suprema(peaks, common, own)
-    # the sweep's points are 8e-6 apart, a peak bends by at most 800 per rad^2: 1e-8 between them
+    # Points are 8e-6 rad apart and second derivatives at most 800 per rad^2: a maximum between points is 1e-8 higher.
     np.testing.assert_allclose(found, dense, atol=2e-8)
     assert suprema(lambda w: np.where(w > 3, np.nan, w), common, own).tolist() == [np.inf] * 3
 
@@ -304,7 +304,7 @@ def test_sustained_oscillations_are_told_from_decays():
 def test_a_slow_swing_that_decays_is_no_oscillation():
     """A hand swings back with 4 mm at 0.6 to 1.2 Hz, at any phase, 400 times the threshold.
 
-    A Hann window of 0.75 s leaves 2e-3 of the swing in the lowest octave; the removed trend takes this out.
+    A Hann window of 0.75 s leaves 2e-3 of the swing in the lowest octave, unless its trend is subtracted first.
     """
     t, phases = (np.arange(1500) * T)[:, None, None], np.linspace(0, np.pi, 24, endpoint=False)
     for hz in (0.6, 1.0, 1.12, 1.2):
@@ -323,7 +323,7 @@ def walled(count):
 
 @pytest.mark.parametrize("walls", [0, 1, 2])
 def test_many_processes_are_each_as_alone(walls):
-    """Processes in one buffer equal single ones up to rounding, because their sums are in another order."""
+    """Processes in one buffer equal single ones but for rounding, since sums are in another order."""
     rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
     if walls:
         contacts = [walled(walls), walled(walls)]
@@ -361,7 +361,7 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
     held = float(data.qpos[0])
     data.ctrl[:] = 0.5 * force, 0.0
     mujoco.mj_step(model, data, 4 * 500)
-    assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # half the friction does not move the device
+    assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # a force of half the friction does not move the device
 
 
 @pytest.mark.parametrize("between", [("tip", GROUND), (GROUND, "tip")])
@@ -493,7 +493,7 @@ def test_the_parts_of_a_map_agree(audit):
 
 
 def test_a_failing_mark_or_cell_is_reported():
-    """A map holds if all its marks are certified, and no hand and no simulation contradicts a linear loop."""
+    """A map holds if its marks are certified, no hand contradicts a certificate, and no linear simulation differs."""
     sweep, grid = rigid(0), _Grid(np.array([1.0, 2.0]), np.array([0.0, 1.0]), "linear")
     good, bad = (
         Mark(K, 0.0, {name: sweep.requirement(name, K, 0.0) for name in sweep.conditions}, -1.0, 0, {})
