@@ -153,7 +153,8 @@ HANDS, TICKS = 60, 12000
 def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     """Return how many lossless hands have 2 % more energy at the end than in the middle.
 
-    Each tick tries the force of every age at both ends of the latency, and applies the one that gives most energy.
+    Each tick tries the force of every age at both ends of the latency and of the periods T to T_max. It applies the one
+    that gives most energy.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)
@@ -161,8 +162,9 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     A[:, 0, 1] = 1
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
     late = sorted(set(loop.latency[0])) if loop.latency else [0.0]
-    parts = [(expm(A * (loop.T - tau))[:, :2], expm(A * tau)[:, :2]) for tau in late]
-    # (latencies, 2, 4, hands): map from the plant, the last force and the new force to the plant after a period
+    ends = [*itertools.product(sorted({loop.T, loop.T_max or loop.T}), late)]
+    parts = [(expm(A * (period - tau))[:, :2], expm(A * tau)[:, :2]) for period, tau in ends]
+    # (ends, 2, 4, hands): map from the plant, the last force and the new force to the plant after a period
     step = np.stack([np.concatenate([second[..., :2] @ first, second[..., 2:]], axis=2) for second, first in parts])
     step = np.ascontiguousarray(np.moveaxis(step, 1, -1))
     bound = {} if rho is None else {"limit": [limit], "rho": [rho]}
@@ -179,7 +181,7 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
         before[:-1] = after[1:]
         forces = [after[0].copy(), *forces[:-1]]
         held = (step[:, :, :3] * [*plant, applied]).sum(axis=2)
-        acting = np.repeat(forces[lo:], len(late), axis=0)  # one row per age and latency
+        acting = np.repeat(forces[lo:], len(ends), axis=0)  # one row per age, period and latency
         now = np.tile(held, (hi + 1 - lo, 1, 1)) + np.tile(step[:, :, 3], (hi + 1 - lo, 1, 1)) * acting[:, None]
         gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
         best = np.argmax(gained, axis=0), every
@@ -198,6 +200,13 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
 def test_no_hand_gains_energy_at_the_requirement(names, ticks):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 1.01 * least_of(names), rho, ticks=ticks) == 0
+
+
+@pytest.mark.parametrize(("share", "some"), [(1.01, False), (0.3, True)])
+def test_periods_latency_and_switching_bound_the_energy(share, some):
+    """With the worst period, latency and age at every tick no hand gains energy at the requirement; below, some do."""
+    loop = change(combined(("latency", "switching"))[0], T_max=1.5e-3)
+    assert (growing(loop, COUPLING, share * need(loop, COUPLING), None, ticks=TICKS // 8) > 0) == some
 
 
 @pytest.mark.parametrize("names", [("latency", "walls"), ("latency", "switching")], ids="-".join)
