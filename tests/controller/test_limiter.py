@@ -265,8 +265,8 @@ def test_the_first_limited_tick_is_found(channel, sign):
 
 def test_limiter_and_environment_are_passive_without_lag():
     """The sum of f_e (x_k - x_{k-1}) is never negative, with walls, limits and V = 0."""
-    x = wander(2000, 2, 10)
-    f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:2000]
+    x = wander(1200, 2, 10)
+    f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:1200]
     energy = np.cumsum((f * np.diff(x, axis=0, prepend=0.0)).sum(axis=1), axis=0)
     assert energy.min() >= -1e-9
     assert energy.max() > 0.5

@@ -140,8 +140,8 @@ def test_the_bound_is_below_every_sample(count):
         A *= (1 - 10 ** rng.uniform(-6, -0.5)) / np.abs(np.linalg.eigvals(A)).max()
         G = Lti(A, rng.normal(size=(n, m)), rng.normal(size=(m, n)), rng.normal(size=(m, m)) + 3 * np.eye(m), T)
         poles = np.linalg.eigvals(A)
-        near = np.abs(np.angle(poles))[:, None] + (1 - np.abs(poles))[:, None] * np.linspace(-30, 30, 6001)
-        w = np.concatenate([np.linspace(0, np.pi, 20001), near.ravel()])
+        near = np.abs(np.angle(poles))[:, None] + (1 - np.abs(poles))[:, None] * np.linspace(-30, 30, 2001)
+        w = np.concatenate([np.linspace(0, np.pi, 5001), near.ravel()])
         response = G.at(np.exp(1j * w))
         sampled = np.linalg.eigvalsh((response + response.conj().swapaxes(1, 2)) / 2)[:, 0].min()
         floor, least, _ = hermitian_floor(G, sampled - 1e-3 * abs(sampled), -np.inf)
@@ -164,7 +164,7 @@ def test_a_block_is_bounded_away_from_its_poles():
         bounds, errors = sizes_around(G, w, radius)
         for middle, r, bound, error in zip(w, radius, bounds, errors, strict=True):
             z = np.exp(1j * (middle + r * np.exp(2j * np.pi * np.arange(24) / 24)))
-            sizes = np.linalg.norm([G.C @ np.linalg.solve(v * np.eye(n) - A, G.B) + G.D for v in z], axis=(1, 2))
+            sizes = np.linalg.norm(G.C @ np.linalg.solve(z[:, None, None] * np.eye(n) - A, G.B) + G.D, axis=(1, 2))
             assert (sizes <= bound).all()
             assert np.isinf(bound) or np.abs(poles - np.exp(1j * middle)).min() > np.expm1(r)
             assert 0 < error < 1e-6 * bound or np.isinf(bound)
@@ -204,7 +204,7 @@ def test_maxwell_elements_are_passive_despite_rounding():
         a, D = b / (b + k * period), k * b / period / (k + b / period)
         return Lti([[a]], [[1, -1]], [[D * (a - 1)], [D * (1 - a)]], (D - less) * np.array([[1, -1], [-1, 1]]), period)
 
-    for i in range(300):
+    for i in range(120):
         E = maxwell(np.exp(rng.uniform(3, 9)), np.exp(rng.uniform(-2, 4)), rng.choice([1e-3, 5e-4, 1.2e-3]))
         block = Block.of(E)
         below += E.dc()[0, 0] < 0
@@ -213,7 +213,7 @@ def test_maxwell_elements_are_passive_despite_rounding():
             assert (static == static.T).all()
             assert definiteness(Matrix.of(static)).semidefinite
             np.testing.assert_allclose(static.astype(float), 0, atol=2e-6 * np.abs(E.D).max())  # largest correction
-    assert below > 30
+    assert below > 12
     with pytest.raises(ValueError, match=r"static stiffness E\(1\) is \[\[-1e-05, 1e-05\], \[1e-05, -1e-05\]\]"):
         Block.of(maxwell(500.0, 6.0, T, less=1e-5))
 

@@ -468,10 +468,10 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
 
 
 def test_proof_and_sweep_agree_on_any_network():
-    """Proof and sweep agree on 20 random networks."""
-    found = list(proofs(11, 20))
+    """Proof and sweep agree on 12 random networks."""
+    found = list(proofs(11, 12))
     assert [row for row in found if not row.holds] == []
-    assert 6 < sum(row.proved for row in found) < 14
+    assert 3 < sum(row.proved for row in found) < 9
 
 
 def test_every_block_is_measured_before_it_is_proved(monkeypatch):

@@ -140,7 +140,7 @@ def random_pairs(links, count):
 def test_certified_loops_rest_with_random_humans(coupling, links):
     base = load()
     for devices in (base.device, (RigidDevice(), RigidDevice())):
-        for pair in random_pairs(links, 20):  # tests/sim/test_validate.py has more
+        for pair in random_pairs(links, 12):  # tests/sim/test_validate.py has more
             simulation = assemble(base.replace(human=pair, device=devices), coupling)
             assert dominant_mode(close(simulation.plant, simulation.F)).spectral_radius < 1
 

@@ -159,7 +159,12 @@ def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
 def test_definiteness_is_proved_beyond_double_precision():
     """Hilbert's matrices of condition 5e5 to 2e28 are shifted to both sides of a bisected least eigenvalue."""
     for n in (5, 12, 20):
-        low, high = Fraction(0), Fraction(1, n)
+        below, above = -120, 0  # powers of two; the least eigenvalue is at least 1e-30
+        while above - below > 1:
+            middle = (below + above) // 2
+            definite = definiteness(hilbert(n, Fraction(1, 2**-middle))).definite
+            below, above = (middle, above) if definite else (below, middle)
+        low, high = Fraction(1, 2**-below), Fraction(1, 2**-above)
         while high - low > high / 30:
             middle = (low + high) / 2
             low, high = (middle, high) if definiteness(hilbert(n, middle)).definite else (low, middle)

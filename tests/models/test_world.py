@@ -72,7 +72,7 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
     text = f'<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody></mujoco>'
     port, limit = world(tmp_path, text).port([3.0, 5.0]), np.array([3.0, 5.0])
     v, u, hit = np.zeros(2), np.zeros(2), np.zeros(2, int)
-    for k in range(2000):
+    for k in range(1000):
         goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 30.0]) * k * T)
         force = port.step(goal)
         stiff = np.array([1500.0, 900.0])
@@ -105,7 +105,7 @@ def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
         return inside
 
     v, u, hit, inner = np.zeros(3), np.zeros(3), 0, 0
-    for k in range(1500):
+    for k in range(800):
         goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 17.0, 30.0]) * k * T)
         force = port.step(goal)
         v = v + T * force / 0.03
