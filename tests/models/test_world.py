@@ -105,7 +105,7 @@ def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
         return inside
 
     v, u, hit, inner = np.zeros(3), np.zeros(3), 0, 0
-    for k in range(800):
+    for k in range(1500):
         goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 17.0, 30.0]) * k * T)
         force = port.step(goal)
         v = v + T * force / 0.03
