@@ -1,11 +1,14 @@
 """design.compare reports required damping and errors of several couplings for the same devices and hands."""
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
 
 from haptic_loop.cli.compare import _nearest, main
 from haptic_loop.cli.run import main as run_once
+from haptic_loop.design.result import Requirement
 from haptic_loop.sim.comparison import Alternative
 from haptic_loop.sim.scenario import InputError
 
@@ -67,3 +70,9 @@ def test_the_stiffest_coupling_is_nearest_without_force_errors():
     rows = [Alternative("soft", None, "g", dc_ratio=0.3), Alternative("stiff", None, "g", dc_ratio=0.9)]
     assert "stiff, 90 % of the stiffness" in _nearest(rows)
     assert _nearest([Alternative("soft", None, "g")]).startswith("No force error was measured")
+
+
+def test_a_row_shows_its_worst_channel():
+    needs = Requirement("own", (1.0, 3.0), (2.0, 2.0), None)
+    row = Alternative("soft", None, requirements={"own": needs, "never": replace(needs, required=(math.inf, 1.0))})
+    assert [row.needs(name) for name in ("own", "never", "absent")] == [1.5, None, None]

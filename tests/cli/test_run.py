@@ -135,7 +135,9 @@ def test_a_zero_damping_device_is_reported_not_certified(tmp_path):
 
 def test_running_twice_gives_the_same_files(tmp_path):
     for _ in range(2):
-        run(tmp_path, "--duration", "0.5", "--coupling", "published")
+        _, report = run(tmp_path, "--duration", "0.5", "--coupling", "published")
+    ran = report["run"]
+    assert ran["real_time_factor"] == pytest.approx(ran["duration_s"] / ran["wall_s"])
     names = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert names == ["figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"]
     table = np.genfromtxt(tmp_path / "out" / "trace.csv", delimiter=",", names=True)

@@ -193,6 +193,10 @@ def test_an_own_fact_is_proved_and_mapped(repeats):
     gain = np.array([400.0]), np.array([0.1])
     needs = required_damping(PAIR, SpringDamper([400.0] * 2, [0.1] * 2), own)
     assert sweep.ratios(own.name, *gain)[0] == pytest.approx(needs.ratio, rel=1e-6)
+    judged = compare.judge(PAIR, SOFT, own=[own])
+    binding = judged.requirements[own.name]
+    w = 2 * np.pi * PAIR.T * np.array([binding.frequency_hz])
+    assert judged.demands[own.name](w)[0] == pytest.approx(binding.ratio, rel=1e-9)  # at the multiplier that was found
     nearby, plain = robustness(PAIR, SOFT, condition=own), robustness(PAIR, SOFT)
     assert nearby.required_over_available > plain.required_over_available
 

@@ -159,6 +159,24 @@ def test_validate_is_the_commands_verdict(tmp_path):
     assert report["worst"]["spectral_radius"] == findings.radius.max()
 
 
+def test_validate_passes_its_arguments_on(monkeypatch):
+    asked = []
+    monkeypatch.setattr("haptic_loop.sim.crowds.validate", lambda question, *rest: asked.append(question))
+    validate(SHORT, SOFT)
+    validate(SHORT, SOFT, limiter=False, traces="all")
+    rho = assess(SHORT.loop("I"), SOFT).force_limits.rho
+    assert [(question.lag, question.all_traces) for question in asked] == [(rho, False), (None, True)]
+    assert rho is not None
+
+
+def test_own_environments_start_without_energy():
+    """A passive spring is never limited, although W0 is 0; no eigenvalue decides its loop."""
+    meta = simulate(SHORT, SOFT, "exact", environment=lambda u: 300.0 * u).meta
+    assert meta["stability"] is None
+    assert (meta["energy_budget"]["start_J"], meta["energy_budget"]["limited_ticks"]) == (0.0, 0)
+    assert meta["assessment"]["guarantee"]["environments"] == "whatever computes the force"
+
+
 def test_designs_are_certified_and_act_as_couplings():
     loop = load().loop("I")
     found = design_coupling(loop, condition="any-environment")

@@ -239,6 +239,7 @@ def test_population_verdicts_equal_those_of_single_hands():
         hands = Validation(scenario, PUBLISHED["I"], 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
         simulation = assemble(scenario.replace(human=hands), PUBLISHED["I"])
         assert found.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
+        assert found.mass[i] == pytest.approx(np.sqrt(hands[0].mass * hands[1].mass))
 
 
 def test_a_person_may_hold_with_such_hands():

@@ -10,9 +10,11 @@ from worlds import checkered
 
 from haptic_loop import design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command
+from haptic_loop.controller.budget import EnergyBudget, Packets
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.controller.delay import packet_delays
-from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, netted
+from haptic_loop.design.result import Requirement
+from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, idle, netted
 from haptic_loop.sim.run import assemble, run
 
 SHORT = load().replace(duration=1.5)
@@ -30,6 +32,19 @@ def given(simulation, trace):
     assert len(s) == len(trace.f)
     lost = (dx**2 * np.array(simulation.scenario.delta)).sum(axis=1) / simulation.scenario.T
     return float(np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max(initial=0.0))
+
+
+def test_budgets_are_idle_with_damping_to_spare():
+    """A budget uses 95 % of the damping, so any-environment must need at most as much on every channel."""
+    simulation, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
+
+    def reason(*shares, guarantee="any passive environment", budget=budget):
+        required = tuple(share * d for share, d in zip(shares, SHORT.delta, strict=True))
+        return idle(simulation, [Requirement("own", required, SHORT.delta, None, guarantee=guarantee)], budget)
+
+    assert reason(0.94, 0.94).startswith("it never acts")
+    assert reason(0.94, 0.96) is reason(0.94, 0.94, guarantee="this environment") is None
+    assert reason(0.94, 0.94, budget=replace(budget, cap_J=1.0)) is None
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
@@ -123,7 +138,9 @@ def test_reports_say_what_the_budget_did(tmp_path):
         str(tmp_path),
     ]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
-    part = json.loads((tmp_path / "r.json").read_text())["energy_budget"]
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["error"]["position_relative_rms"] < 1e-6  # the exact engine runs with the budget, too
+    part = report["energy_budget"]
     assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)
     assert part["limited_ticks"] > 100
     assert part["guarantee"].startswith("no passive hand is given any energy beyond")
