@@ -236,9 +236,9 @@ _MOST_LOST = 1e-4  # largest difference of float and exact response, relative to
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
-    On the circle the difference of the responses, plus the rounding errors, may be at most _MOST_LOST of the largest
-    response or, except in a world, of the least delta/T. Terms that cancel and are far larger than the forces increase
-    the rounding errors.
+    At the frequencies of a sweep the difference of the responses, plus the rounding errors, may be at most _MOST_LOST
+    of the largest response or, except in a world, of the least delta/T. Terms that cancel and are far larger than the
+    forces increase the rounding errors.
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
