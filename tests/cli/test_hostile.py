@@ -24,5 +24,5 @@ def driven(*options: str) -> int:
 
 @pytest.mark.slow
 def test_hostile_cases_are_answered_well():
-    """A short run has every second or third pair of a field and a value, so that each of both occurs."""
+    """A short run has every second or third pair of field and value, so that every field and every value occurs."""
     assert driven("--short") >= 500

@@ -1,4 +1,4 @@
-"""After Ctrl-C, and for a reader that closes the pipe, a command has the right exit code and no traceback."""
+"""After Ctrl-C, or if a reader closes the pipe, a command has the right exit code and no traceback."""
 
 import os
 import signal
@@ -140,12 +140,12 @@ def test_ctrl_c_while_a_command_is_imported(module, tmp_path):
 
 @pytest.mark.parametrize("code", [INTERRUPT, IN_EXEC, IN_C], ids=["signal", "exec", "compiled"])
 def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
-    command = "sim.run --case none --duration 0.05 --no-plot"  # designs nothing before MuJoCo is imported
+    command = "sim.run --case none --duration 0.05 --no-plot"  # this imports MuJoCo without a design before
     assert interrupted_at(command, "mujoco", code, tmp_path) == (130, "interrupted\n")
 
 
 def interrupted_at(command, module, code, folder):
-    """Run a command that imports a file with this code in the place of the module."""
+    """Run a command that imports a file with this code in place of the module."""
     (folder / f"{module}.py").write_text(code)
     environment = ENVIRONMENT | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     words = [sys.executable, "-m", *command.split()]

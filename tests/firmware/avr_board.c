@@ -1,7 +1,7 @@
 /* Runs a sketch on a simulated ATmega328P: avr_board FILE.elf [TICKS]. Without TICKS it ends when the sketch stops the processor
  * and returns GPIOR0. Otherwise every line of standard input orders one tick, "MILLIVOLTS KEY SWITCH", and every line of standard
- * output tells of one: cycles of ha_tick, cycles from the period's begin to the tick's end, PWM, direction. The sketch marks
- * its progress by writing 1 to 4 to GPIOR0. The sketch's serial output goes to standard error. */
+ * output reports one: cycles of ha_tick, cycles from the start of the period to the end of the tick, PWM, direction. The sketch
+ * marks its progress by writing 1 to 4 to GPIOR0. The sketch's serial output goes to standard error. */
 #include <simavr/avr_adc.h>
 #include <simavr/avr_ioport.h>
 #include <simavr/avr_uart.h>

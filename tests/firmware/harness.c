@@ -1,4 +1,4 @@
-/* haptic_link.h behind plain functions for ctypes, and behind a script on standard input for a sanitized executable. */
+/* Plain functions around haptic_link.h for ctypes, and a sanitized executable for scripts on standard input. */
 #include "haptic_link.h"
 
 #include <stdio.h>

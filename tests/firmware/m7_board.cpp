@@ -1,7 +1,7 @@
 /* A board with a Cortex-M7 for qemu's mps2-an500: start-up code, and what teensy.ino needs of an Arduino board.
  *
  * Every line of standard input (by semihosting) orders one period, "COUNTS1 COUNTS2 KEY SWITCH"; every line of standard output
- * tells of it: PWM and direction of both axes, the enable line, and what the sketch has sent. Compiled with VECTOR, it runs the
+ * reports it: PWM and direction of both axes, the enable line, and what the sketch has sent. Compiled with VECTOR, it runs the
  * exported file's own test instead. */
 #include <stdio.h>
 

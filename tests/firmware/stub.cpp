@@ -1,4 +1,4 @@
-/* What example.ino needs of an Arduino board, driven from a test: pins, a clock and a serial port in memory. */
+/* The parts of an Arduino board that example.ino needs, driven by a test: pins, a clock and a serial port in memory. */
 #include <Arduino.h>
 
 #include <deque>

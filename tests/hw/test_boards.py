@@ -124,7 +124,7 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
             key = "h" if k == 5 else "a" if k == 230 else "."
             told.append([int(word) for word in board.tick(millivolts, key, int(held(k)))])
             *_, pwm, negative = told[-1]
-            if 5 < k < 220:  # the hand moves it from the stop to the middle
+            if 5 < k < 220:  # the hand moves the paddle from the stop to the middle
                 handle.x = 0.045 * min(1, k / 200)
             handle.push(motor * (-1) ** negative * pwm / 255 * 0.03 / float(PER_RADIAN) + hand(k))
     causes = re.findall(r"^(\d)(\d) ", (folder / "said.txt").read_text(), re.MULTILINE)
@@ -138,11 +138,11 @@ def swing(k):
 
 def test_the_hapkit_repeats_the_test_vector(hapkit):
     folder, _ = hapkit
-    assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10  # 0 ticks differ
+    assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10  # 10 + wrong ticks
 
 
 def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
-    """The steps of the PWM equal those of Python's tick, also while the limiter is at work."""
+    """The steps of the PWM equal those of Python's tick, even while the limiter acts."""
     folder, block = hapkit
     counts, told, state = paddle(folder, 1900, swing)
     start = int(np.argmax(told[:, 0] > 10_000))  # the coupling's first tick takes longer than those of the motor test

@@ -75,7 +75,7 @@ def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf)
 
 @pytest.mark.slow
 def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
-    """Through a slip, forces are 1 and 2 ticks old, and the host's energies are exactly those at the devices."""
+    """Across a slip of the clocks forces stay 1 and 2 ticks old, and the host's energies equal those at the devices."""
     rehearsal = rehearsal_of(scenario, alone, made, 1.0001, begin_us=SLIP_SOON)
     session, rows = rehearsal.session, []
     session.record = lambda row: (rows.append(row), recorder(row))

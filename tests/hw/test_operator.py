@@ -23,7 +23,7 @@ def stages(session):
 
 @pytest.mark.parametrize("start", [0, 0.05, 0.2, 0.2496, 0.26, 0.5])
 def test_a_session_arms_by_itself_once(scenario, rungs, start):
-    """Late answers, in ramp-in or after it, end a session where nobody arms the softer coupling."""
+    """Late answers, in ramp-in or after it, end a session if nobody arms the softer coupling."""
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
     session = rehearsal.run_until_armed(2.0)
     assert session.stage == Stage.REFUSED

@@ -59,7 +59,7 @@ SAYS = {
 #: examples that users search for; each has under 60 lines and saves a picture
 SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall", "wheel")
 
-#: a word of an example, and the word that makes the example shorter; `make validate` runs these examples unchanged
+#: a part of each long example and its quicker replacement; `make validate` runs these examples unchanged
 SHORTER = {
     "limits_of_any_coupling": ("(0.7, 1.0, 1.4)", "(1.0, 1.4)"),
     "mujoco_two_fingers": ("duration = 4.0", "duration = 1.0"),

@@ -45,7 +45,7 @@ def test_the_limiter_follows_from_the_requirements():
 
 
 def test_the_proved_limiter_is_what_runs(tmp_path):
-    """A run uses the limiter of the file, with beta = 0.03 instead of 0.01, also if the devices have more damping."""
+    """A run uses the limiter of the file, with beta = 0.03 instead of 0.01, even if the devices have more damping."""
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
@@ -79,7 +79,7 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
 @pytest.mark.parametrize("limit", [0.69, 1e3])
 def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
-    """Runs in blocks equal runs tick by tick up to rounding, also if a block must be undone from a limited tick on."""
+    """Runs in blocks equal runs tick by tick up to rounding, even if a block must be undone from a limited tick on."""
     simulation = assemble(weak(limit, limit).replace(duration=3.0), BUILT, (11.4167, 11.4167))
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
     fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))

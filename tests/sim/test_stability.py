@@ -90,7 +90,7 @@ def test_fits_end_before_a_limiter_acts():
 
 
 def test_short_traces_do_not_contradict_eigenvalues():
-    """A mode that decays by 0.94 1/s, but grows by 1 1/s in a trace of 0.5 s, may be noise."""
+    """A growth of 1 1/s in a trace of 0.5 s decides nothing about a mode that decays by 0.94 1/s."""
     simulation = assemble(load().replace(duration=0.5), PUBLISHED["I"])
     trace, loop = run(simulation, "exact"), close(simulation.plant, simulation.F)
     values, vectors = np.linalg.eig(loop.A)
@@ -186,7 +186,7 @@ def knocked(K):
 
 
 def test_knocks_die_away_as_the_held_plant():
-    """Device and hand are one body before a spring; the poles come from matrices that are written out here."""
+    """Device and hand are one body on a spring; the poles come from matrices that are written out here."""
     pair = knocked(900.0)
     said = ringing(assemble(parse(KNOCK + "springs" + SPRING), NoCoupling()))
     assert said.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
