@@ -517,13 +517,6 @@ def test_bodies_are_counted_by_how_they_move(tmp_path):
     assert (counts["bodies that translate"], counts["bodies that turn"]) == (1, 2)
 
 
-if __name__ == "__main__":
-    from tempfile import TemporaryDirectory
-
-    with TemporaryDirectory() as place:
-        print(sum(count_of_the_lemma(Path(place), scene, 6000) for scene in SCENES), "constraints within their bounds")
-
-
 def test_compensation_by_actuators_releases_nothing_itself(tmp_path):
     """Raising a body stores m g z even if a motor compensates its weight, since the motor may be limited."""
     text = f"""<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body>
@@ -557,3 +550,10 @@ def test_springs_that_yield_are_not_in_the_lemma(tmp_path):
     yields = LINE.replace('axis="1 0 0"/>', 'axis="1 0 0" stiffness="100" springyield="0.004"/>')
     parts = {part.what: part.at_the_port for part in world(tmp_path, yields).parts()}
     assert "shell" in parts["springs that yield"]
+
+
+if __name__ == "__main__":
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as place:
+        print(sum(count_of_the_lemma(Path(place), scene, 6000) for scene in SCENES), "constraints within their bounds")
