@@ -135,9 +135,9 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
     assert session.counters.unlike == 0
 
 
-def hand_driven(scenario, rungs, tested=False):
+def hand_driven(scenario, rungs, tested=False, behind=()):
     """Return a session that has begun to arm, and a function that sends it a STATE; `lie` is the device's clock."""
-    settings = LinkSettings(measure=50, test_encoders=tested)
+    settings = LinkSettings(measure=50, test_encoders=tested, behind=behind)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)
     session.met(info_of(scenario), t)
@@ -174,6 +174,17 @@ def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
         send(Phase.ARMED, counts=(jumped, 0))
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith("encoder 1 jumped by 0.3 mm: no force can move it by 0.1")
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_repeated_samples_of_slower_boards_are_no_jumps(scenario, rungs, axis):
+    """At 0.6 m/s a repeated sample removes 0.72 mm from one displacement; the board that leads repeats none."""
+    session, send = hand_driven(scenario, rungs, tested=True, behind=(0, 1))
+    for k in range(10):
+        place = 720 * (k - (k > 5))
+        send(Phase.ARMED, counts=(place, 0) if axis == 0 else (0, place))
+    assert session.stage == (Stage.ARMING if axis else Stage.STOPPED), session.cause
+    assert axis or session.cause.startswith("encoder 1 jumped by 0.72 mm")
 
 
 def test_tick_leaps_skip_no_check(scenario, rungs):
