@@ -787,7 +787,8 @@ class EncoderMonitor:
     of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
     of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. The
-    tremor shows where noise and counts hide less than 30 um.
+    tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because it
+    holds them while the force changes by 2 F_c (1 N covers 0.5 N), and hides a tremor below F_c.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:

@@ -1,5 +1,6 @@
 """Encoders that do not follow are found on every axis, at arming and under force; still hands stop no session."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from runpy import run_path
 
@@ -522,6 +523,17 @@ def test_coarse_encoders_get_more_time():
     stand_still(47)
     with pytest.raises(SafetyStop, match="axis 1 does not follow"):
         stand_still(1)
+
+
+@pytest.mark.parametrize(("friction", "stops"), [(0.45, False), (0.7, True)])
+def test_friction_hides_twice_its_force(friction, stops):
+    """A hand of 500 N/m holds a handle with dry friction F, which rests while a slow force turns round by 2 F."""
+    monitor, x = monitor_of(1e-5), 0.0
+    with pytest.raises(SafetyStop, match="stands still while the force") if stops else nullcontext():
+        for k in range(round(5.0 / T)):
+            force = 3.0 * np.sin(2 * np.pi * 0.3 * k * T)
+            x = min(max(x, (force - friction) / 500), (force + friction) / 500)
+            monitor.check((round(x / 1e-5),), (round(force / STEP),), 1)
 
 
 def test_a_motion_of_two_counts_begins_anew():
