@@ -149,9 +149,7 @@ def test_the_stiffest_gains_of_late_forces_are_certified(B):
     loop, coupling = wall(100, B, theta=1, delta=0.9)
     loop = msgspec.structs.replace(loop, latency=((0.0, 9e-4),))
     margin = stiffest(loop, coupling, "any-environment")
-    certified = [
-        K for K in (1.0, 10.0, 100.0) if requirement(loop, SpringDamper([K], [B]), "any-environment").certified
-    ]
+    certified = [K for K in (1.0, 100.0) if requirement(loop, SpringDamper([K], [B]), "any-environment").certified]
     assert (margin.K[0] is None) == (not certified)
     if certified:
         assert margin.K[0] >= certified[-1]

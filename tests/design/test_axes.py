@@ -764,7 +764,7 @@ def test_phi_is_below_the_level_with_many_states(stiffness: float, c: float) -> 
     phi = np.array(needs.multiplier)
     assert (phi >= 0).all()
     assert np.linalg.eigvalsh(loop.Delta() - np.diag(phi))[0] > 0.01
-    z = np.exp(1j * np.linspace(1e-3, np.pi, 20000))
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 5000))
     network = loop.environment
     E = Networks(network.contacts, network.matrices()).sampled(z, loop.T).G
     hat = E * (loop.T / (z - 1))[:, None, None]  # T z/(z-1) times the delay 1/z

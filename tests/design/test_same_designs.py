@@ -35,7 +35,7 @@ def test_a_racing_clock_changes_no_byte(monkeypatch):
     loop = load(LOOPS / "o01-wall-light-device.toml").loop("I")
 
     def stored():
-        made = design(loop, Options(bases=((4, 3), (8, 6))))
+        made = design(loop, Options(bases=((2, 1), (4, 3))))
         return len(made.bases), msgspec.json.encode(Stored.of(loop, made.coupling, made.certificate))
 
     plain = stored()
