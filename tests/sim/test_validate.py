@@ -23,6 +23,7 @@ from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Human, Person
 from haptic_loop.models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
 from haptic_loop.sim import crowds as examine_module
+from haptic_loop.sim.adversary import Worst
 from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.crowds import Findings, Validation, validate
 from haptic_loop.sim.engines import ExactEngine
@@ -37,7 +38,7 @@ from haptic_loop.sim.stability import (
     mujoco_plants,
     unstable,
 )
-from haptic_loop.sim.verdicts import Traces, disagreement_words
+from haptic_loop.sim.verdicts import Attacked, EnergyAudit, Growing, Traces, WorstDrawn, disagreement_words
 from tests.checks.random_loops import slow
 
 SCENARIO = load()
@@ -387,14 +388,58 @@ def test_ctrl_c_ends_other_processes_batches():
     assert set(multiprocessing.active_children()) <= before
 
 
-@pytest.mark.parametrize("duration", [0.5, 40.0])
-def test_restless_short_traces_give_no_verdict(duration):
+def test_restless_short_traces_give_no_verdict():
     """Settling decides only on traces that are long compared with the slowest decay of the same humans."""
-    question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
+    question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", 0.5)
     found = validate(question)
-    traces = Traces.of(question, found)
-    assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
-    assert traces.settling_decides == (traces.reason is None) == (duration > 30)
+    for duration in (0.5, 40.0):
+        traces = Traces.of(replace(question, duration=duration), found)
+        assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
+        assert traces.settling_decides == (traces.reason is None) == (duration > 30)
+
+
+@pytest.fixture(scope="module")
+def four():
+    """Return a question and findings with made-up figures of four hands, of which the second clips its forces."""
+    question = Validation(SCENARIO, NoCoupling(), 0, 4, 1, "both", 2.0)
+    columns = {
+        "exact": [-1.0, -0.5, 2.0, -3.0],
+        "radius": [0.9, 0.95, 1.1, 0.8],
+        "clipped": [0, 7, 0, 0],
+        "energy": [-1.0, -4.0, 5.0, 0.0],
+        "audited": [9.0] * 4,
+        "settling": [0.5, 1.5, 0.4, 0.2],
+        "switching": [-1.0, 3.0, 2.0, np.nan],
+        "switching_mujoco": [np.nan, 1.0, -1.0, np.nan],
+    }
+    found = validate(replace(question, engine="exact", duration=0.0))
+    return question, replace(found, **{name: np.array(values) for name, values in columns.items()})
+
+
+def test_energy_audits_leave_out_clipped_traces(four):
+    question, found = four
+    audit = EnergyAudit.of(question, found)
+    assert (audit.audited, audit.clipped, audit.violated, audit.least_J, audit.holds) == (3, 1, 1, -1.0, False)
+    limited = EnergyAudit.of(replace(question, lag=(0.0, 0.0)), found)  # the account covers a limiter
+    assert (limited.audited, limited.violated, limited.least_J) == (4, 2, -4.0)
+
+
+def test_verdicts_name_the_worst_hands(four):
+    question, found = four
+    worst, traces = WorstDrawn.of(question, found), Traces.of(question, found)
+    assert (worst.growth_rate_per_s, worst.who.index) == (2.0, 2)
+    assert (traces.stable, traces.stable_and_settling, traces.slowest_settling) == (3, 2, 1.5)
+    assert (traces.clipped_runs, traces.slowest_decay_s) == (1, 2.0)
+    covered, not_covered = (Growing.of(question, found, None, covered) for covered in (True, False))
+    assert (covered.unstable.exact, covered.unstable.mujoco, covered.humans, covered.mujoco_unclipped) == (2, 1, 3, 2)
+    assert (covered.largest_growth_per_s, covered.worst_index) == (3.0, 1)
+    assert (covered.holds, not_covered.holds) == (False, True)
+
+
+def test_adversaries_contradict_certificates_only():
+    found, none = (Worst((), (), 1.0, growth, 80.0, 7) for growth in (1e-3, -1e-3))
+    holds = [Attacked.of(worst, 0.9, certified).holds for worst in (found, none) for certified in (True, False)]
+    assert holds == [False, True, True, True]
 
 
 @pytest.mark.parametrize(
