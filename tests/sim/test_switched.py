@@ -20,6 +20,7 @@ from haptic_loop.models.hold import HeldPlant
 from haptic_loop.models.scene import Crowd, plant, variants
 from haptic_loop.sim.crowds import _batch
 from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.report import DelaySpan, VaryingDelays, _DelaysMet, _PeriodGrowth, switched_stability
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
@@ -277,6 +278,24 @@ def test_delays_depend_on_the_hands_number():
     growth = switched_crowd(assemble(scenario, SOFT), held_by, np.array([8, 3, 8]), 0, 2.0, None).exact
     assert growth[0] == pytest.approx(growth[2], rel=1e-9)
     assert growth[0] != pytest.approx(growth[1], rel=1e-3)
+
+
+def test_a_lost_packet_is_held_for_a_tick():
+    """Ages count from the first tick in which every channel has a force."""
+    delays = np.tile(np.array([1, 2])[None, :, None], (30, 1, 1))
+    delays[9, 0] = -1
+    met = _DelaysMet.of(with_delays(ASSEMBLY, delays), None, 30)
+    assert (met.lost_packets, met.held_ticks) == ([1, 0], [1, 0])
+    assert (met.age.least, met.age.largest) == ([1, 2], [2, 2])
+    assert met.age.mean == pytest.approx([1 + 1 / 28, 2])
+
+
+@pytest.mark.parametrize(("own", "worst"), [("unstable", "stable"), ("stable", "unstable"), ("stable", "stable")])
+def test_runs_grow_by_their_own_or_worst_delays(own, worst):
+    met = _DelaysMet(None, [0, 0], [0, 0], 0.5, own, 4.0, _PeriodGrowth(3, -0.5, 0.9, worst))
+    trace = close_loop(ASSEMBLY, "exact", ticks=20)
+    told = switched_stability(ASSEMBLY, trace, VaryingDelays(DelaySpan((1,), (2,), "", 0, False, False), met, None))
+    assert told.verdict == ("unstable" if "unstable" in (own, worst) else "stable")
 
 
 def test_constant_delays_of_uncertified_loops_are_uncovered():
