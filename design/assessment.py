@@ -690,6 +690,8 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     if shelled(assessment.environment):
         return _shell(assessment)
     if limits.energy_budget is not None:
+        if loop.latency:
+            return None, "latency: the energy budget counts forces that latch at ticks; add a sample to theta instead"
         return _account(assessment, "whatever computes the forces"), None
     if loop.varying_delay:
         anywhere = () if any(loop.psi) else (ANY_ENVIRONMENT.name, KNOWN_DEVICE_ANY.name)
