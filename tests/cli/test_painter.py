@@ -1,4 +1,4 @@
-"""A second process draws the same picture, and this process draws where there is no second one."""
+"""A second process draws the same picture, and this process draws if there is no second one."""
 
 import pickle
 import subprocess

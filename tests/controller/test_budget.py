@@ -177,7 +177,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(hold, loss, told):
         assert (hands.energy() - given).max() <= W0 + 1e-9
         assert (budget.energy - budget.reserved > -1e-9).all()
     assert budget.surprises == 0
-    # The budget of some hands stays empty where it never learns which forces acted; most hands get forces.
+    # If the budget never learns which forces acted, it stays empty for some hands; most hands get forces.
     assert (np.abs(acted).sum(axis=(0, 1)) > 0.1).mean() > 0.6
 
 

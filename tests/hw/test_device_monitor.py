@@ -161,7 +161,7 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
 
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
-    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; a jump that 20 N cannot cause is 0.12 mm."""
+    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement, although 20 N cause jumps of 0.12 mm at most."""
     session, send = hand_driven(scenario, rungs, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0
@@ -438,7 +438,7 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
 
 
 def test_ages_while_forces_act_count_skipped_answers(scenario):
-    """Bursts of 4 ms bring four answers, of which a STATE tells the youngest."""
+    """A burst every 4 ms brings four answers, of which a STATE reports the youngest only."""
     scenario, faults = scenario.replace(T=1e-3), (FaultInjection.parse("burst=0.004"),)
     session, recorder = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), Recorder(2)
     session.record = recorder

@@ -205,7 +205,7 @@ def test_friction_and_weight_are_no_weak_direction():
 @pytest.mark.parametrize("share", [0.0, 0.15])
 @pytest.mark.parametrize("q", [1e-6, 1e-5])
 def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
-    """The axis moves 0.5 to 0.575 times as far as expected, which the limit of a half for wrong masses hardly finds."""
+    """The axis moves 0.5 to 0.575 times as far as expected, which the limit of 0.5 for wrong masses allows."""
     weak = masses(q=q, motor=lambda force: np.where(sign * force > 0, force, share * force))
     with pytest.raises(SafetyStop, match="axis 1 moves much farther in one direction than in the other"):
         played(arming_test(q=q), weak)
@@ -550,7 +550,7 @@ def test_no_still_hold_is_stopped():
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
-    """0.14 N s move 0.25 kg at 0.56 m/s, and the motor swings at 90 Hz by 1 mm against the handle of 0.19 kg."""
+    """A knock of 0.14 N s moves 0.25 kg at 0.56 m/s, and the motor swings by 1 mm at 90 Hz against the handle."""
     free = nobody(scenario)
     session = Session(free, SafetyLimits((1.3, 1.3)), LinkSettings(measure=60, held=False))
     emulator = Emulator(free)

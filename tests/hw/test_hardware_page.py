@@ -23,7 +23,7 @@ CALLED = {
     "e-stop at the device, at the host": ("e-stop at the device", "e-stop at the host"),
     "10 % of answers late": ("answers get late",),
 }
-IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # causes that the page tells in its own words
+IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # rows that do not quote the message
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])

@@ -123,7 +123,7 @@ def test_limits_cannot_be_loosened(field, least, most):
 
 
 def test_devices_are_sent_limited_forces():
-    """CONFIG has 0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN, a hold of 4 ticks and a ramp of 5."""
+    """CONFIG gives a ramp-in of 0.25 s and a slew rate of 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN."""
     config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
     assert (config.cap, config.slew) == ((30_000, 7500), (6000, 6000))

@@ -105,7 +105,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 @pytest.mark.slow
 def test_designs_named_in_sentences_exist(place):
-    """IN_TEXT may be empty, since no page need name a design in a sentence."""
+    """IN_TEXT may be empty, since no page needs to name a design in a sentence."""
     for command in IN_TEXT:
         done = run(command, place)
         assert done.returncode == 0, f"{command}: {done.stderr}"

@@ -371,7 +371,7 @@ def test_unreachable_errors_are_refused(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """The first two runs predict that 100 ticks need 512 steps of 4 evaluations each, so that no third run begins."""
+    """The first two runs predict 512 steps of 4 evaluations in each of 100 ticks for all runs: no third run begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"

@@ -167,7 +167,7 @@ def test_own_hand_populations_agree_in_both_engines():
     again = validate(scenario, None, humans=10, duration=0.0, engine="exact")
     np.testing.assert_array_equal(again.exact, found.exact[:10])
     assert found.mass.shape == (40,)
-    assert (found.damping == 0).all()  # the series spring has none
+    assert (found.damping == 0).all()  # the series spring has no damper
 
 
 def test_the_adversary_searches_what_the_population_draws():

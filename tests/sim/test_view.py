@@ -431,7 +431,7 @@ def followed(name, coupling, **changes):
 
 @pytest.mark.parametrize(("psi", "K", "B"), [((0, 0), 700.0, 0.5), ((0, 1), 50000.0, 20.0)])
 def test_the_drawn_springs_carry_the_forces(psi, K, B):
-    """Forces equal those of the drawn springs (800 and 700 N/m, 1 N s/m, backward differences), theta + psi later."""
+    """Forces are those of the drawn springs (800, 700 N/m; 1 N s/m) by backward differences, theta + psi ticks late."""
     scenario, trace, q = followed("omega-pair", SpringDamper([K, K / 2], [B, B]), psi=psi)
     for i, stiffness in enumerate((800.0, 700.0)):
         stretch = q[:, i] - q[:, 2]

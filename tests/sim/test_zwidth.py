@@ -84,7 +84,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_the_map_is_that_of_design_margin(name):
-    """Maps begin at 1e-5 rad/sample; the error that this causes grows with the square of the delay, here up to 2e-9."""
+    """Maps begin at 1e-6 rad/sample; the error that this causes grows with the square of the delay, here to 1e-11."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
@@ -100,7 +100,7 @@ def test_the_map_is_that_of_design_margin(name):
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_maps_of_the_widest_plane_match_sweeps(scenario):
-    """A free mass on K = 1e-3 N/m swings near 1e-5 rad/sample, so the value for F(1) must be taken far below that."""
+    """A free mass on K = 1e-3 N/m swings at 5e-5 rad/sample; the frequency that replaces 0 must be far below that."""
     sweep = of(scenario, scenario.theta)
     K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
     true = [sweep.requirement("this-environment", k, b).ratio for k, b in zip(K, B, strict=True)]
@@ -134,7 +134,7 @@ def test_undelayed_walls_match_colgates_condition():
 
 def test_a_late_spring_needs_the_closed_form():
     K = np.geomspace(10, 5000, 9)
-    # The supremum is at w -> 0; the map begins at 1e-5 rad/sample.
+    # The supremum is at w -> 0; the map begins at 1e-6 rad/sample.
     for needed, share in zip(wall(1, K, 0 * K), (1.5, 2), strict=True):
         np.testing.assert_allclose(needed, share * K * T, rtol=1e-9)
 
@@ -184,7 +184,7 @@ def test_suprema_find_what_a_dense_sweep_finds():
     # every point occurs twice, as in a grid around a pair of poles
     common, own = np.linspace(0, np.pi, 60), np.broadcast_to(np.linspace(0, np.pi, 60), (3, 60))
     found = suprema(peaks, common, own)
-    # Points are 8e-6 rad apart and second derivatives at most 800 per rad^2: a maximum between points is 1e-8 higher.
+    # Points are 8e-6 rad apart and second derivatives at most 800 per rad^2: maxima exceed the points by under 1e-8.
     np.testing.assert_allclose(found, dense, atol=2e-8)
     assert suprema(lambda w: np.where(w > 3, np.nan, w), common, own).tolist() == [np.inf] * 3
 
@@ -478,7 +478,7 @@ def test_the_parts_of_a_map_agree(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
     ratio = np.array(report["this-environment"]["required_over_available"], float)
-    # At B = 0 the requirement is constant over frequency; rounding at the lowest frequency is 1e-8.
+    # Without delay the requirement is K T/2 + B; when measured, maps had errors of 4e-16.
     np.testing.assert_allclose(ratio * DELTA, K * T / 2 + B, rtol=3e-8)
     growth = np.array(report["population"]["growth_rate_per_s"], float)
     assert (growth[ratio < 1] <= 1e-9).all()
