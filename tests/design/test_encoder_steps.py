@@ -1,8 +1,11 @@
 """Coulomb friction that covers encoder steps: the bound on the impulse response, the energy of quantised loops."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from asked import this_environment
+from msgspec.structs import replace as change
 from worlds import FIGURE_4
 
 from haptic_loop.cli.verdict import verdict
@@ -12,7 +15,8 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
-from haptic_loop.sim.couplings import EncoderSteps
+from haptic_loop.sim.couplings import EncoderSteps, encoder_steps
+from haptic_loop.sim.scenario import load
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
@@ -36,6 +40,16 @@ def test_a_published_bound_covers_no_encoder_step():
     assert not bounded.covered
     assert "published: at most 0.26, 0.26 N" in bounded.words
     assert declared.covered
+    assert not EncoderSteps.of(LOOP, coupling, steps, needed * [1.01, 0.99]).covered  # every axis needs its friction
+
+
+def test_axes_share_the_friction_of_their_device():
+    """Friction of 0.3 N against the velocity in space may act with only 0.3/sqrt(3) N on each axis."""
+    space = load("omega-space")
+    devices = [change(device, friction=0.3, encoder_step=STEP) for device in space.device]
+    assessment = SimpleNamespace(guarantee=None, coupling=SpringDamper([400.0] * 6, [0.1] * 6))
+    found = encoder_steps(space.replace(device=devices), "I", assessment)
+    assert found.friction == pytest.approx([0.3 / 3**0.5] * 6)
 
 
 def test_friction_covers_no_steps_of_known_devices():

@@ -18,6 +18,7 @@ from haptic_loop.design import coupling_file
 from haptic_loop.design.assessment import assess
 from haptic_loop.models.hold import HeldPlant
 from haptic_loop.models.scene import Crowd, plant, variants
+from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.crowds import _batch
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.report import DelaySpan, VaryingDelays, _DelaysMet, _PeriodGrowth, switched_stability
@@ -278,6 +279,14 @@ def test_delays_depend_on_the_hands_number():
     growth = switched_crowd(assemble(scenario, SOFT), held_by, np.array([8, 3, 8]), 0, 2.0, None).exact
     assert growth[0] == pytest.approx(growth[2], rel=1e-9)
     assert growth[0] != pytest.approx(growth[1], rel=1e-3)
+
+
+def test_lost_packets_leave_only_a_budgets_guarantee():
+    lossy = load().replace(varying_delay=VaryingDelay((1, 2), (1, 2), loss=0.1))
+    alone, budgeted = (assessed(lossy, "I", given(SOFT), energy_budget=W0) for W0 in (None, 0.0))
+    assert alone.guarantee is None
+    assert "a lost packet makes a force older" in alone.reason
+    assert budgeted.guarantee.energy_J == 0.0
 
 
 def test_a_lost_packet_is_held_for_a_tick():

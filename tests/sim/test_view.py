@@ -7,6 +7,7 @@ import sys
 import threading
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -50,10 +51,12 @@ from haptic_loop.sim.view.session import (
 )
 from haptic_loop.sim.view.stage import (
     _COLUMNS,
+    _account,
     _apart,
     _dressed,
     _envelope,
     _FlatPictures,
+    _limited,
     _loop,
     _overlay,
     _owners,
@@ -388,6 +391,19 @@ def test_the_overlay_says_growth_and_certificates(none, published):
     assert said["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
     assert said["time"] == "0.1 s"
     assert (GIVEN in dict(keys_help(True)).values(), GIVEN in dict(keys_help(False)).values()) == (True, False)
+
+
+def test_the_overlay_says_what_limits_and_shells_do():
+    def prepared(guarantee, rho):
+        return SimpleNamespace(assessment=SimpleNamespace(guarantee=guarantee, force_limits=SimpleNamespace(rho=rho)))
+
+    covered, clipped, none = prepared("here", (0.0,)), prepared("here", None), prepared(None, (0.0,))
+    assert _limited(covered) == "limited: the guarantee holds there too"
+    assert (_limited(clipped), _limited(none)) == ("clipped: not covered", "no guarantee")
+    shell = SimpleNamespace(start_J=2e-3, given_J=1.5e-3, released_J=0.1, limited_ticks=3, ticks=500)
+    acted = "acted on 3 of 500 ticks, "
+    assert _account(shell, covered) == ("energy shell", f"{acted}gave 1.50 mJ of W0 = 2 plus released 100.0")
+    assert _account(shell, none)[1] == f"{acted}no guarantee"
 
 
 def test_a_refusal_is_said_whole_and_once(none):
