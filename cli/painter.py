@@ -42,6 +42,12 @@ class Painter:
             except OSError:
                 self._process = None
 
+    def __del__(self) -> None:
+        """End the second process if the command failed before its picture."""
+        if self._process and self._process.returncode is None:
+            self._process.kill()
+            self._process.communicate()
+
     def draw(self, path: Path, function: str, *arguments: Any) -> Path:
         """Write the figure that a function of sim.plots returns for these arguments, as a PNG file.
 

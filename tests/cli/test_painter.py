@@ -63,3 +63,16 @@ def test_an_unwanted_painter_starts_no_process(monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", lambda *command, **options: started.append(command))
     Painter(wanted=False)
     assert not started
+
+
+def test_a_painter_without_picture_ends_its_process(monkeypatch):
+    """A command that fails leaves no process behind, of which Popen would warn."""
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    started, start = [], subprocess.Popen
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *command, **more: started.append(start(*command, **more)) or started[0]
+    )
+    painter = Painter()
+    assert started[0].poll() is None
+    del painter
+    assert started[0].returncode < 0
