@@ -2,7 +2,6 @@
 
 import warnings
 
-import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
@@ -113,6 +112,8 @@ def test_every_descent_step_is_feasible_and_better():
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # an accuracy of 1e-4 is enough
 def test_the_zeros_are_optimal_for_the_poles(inner):
     """With the poles of the design fixed, condition and norm are convex at each frequency: cvxpy finds the optimum."""
+    import cvxpy as cp  # takes more than a second, in every worker that collects this file
+
     loop, found = inner
     shaping, poles = Shaping(loop), np.diag(found.coupling.V.A)
     highest = shaping.norm(found.coupling.V)[1]
