@@ -435,14 +435,17 @@ class Balance:
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
-        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None."""
+        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None.
+
+        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. Longer ones
+        would dissipate less than the multiplier Q of a certificate for a range of latencies (design.facts.Latency).
+        """
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
             return Balance(delta / loop.T, Delta)
-        spans = np.array(loop.latency)[:, :, None]
-        before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0 if latency is 0
-        after = delta / ((loop.T_max or loop.T) - spans[:, 0])
-        return _LateBalance(after, Delta, before, at_the_latch(variants.plants(), late))
+        first = np.array(late)[:, None]
+        before = np.divide(delta, first, out=np.zeros_like(delta), where=first > 0)  # 0 if latency is 0
+        return _LateBalance(delta / (loop.T - first), Delta, before, at_the_latch(variants.plants(), late))
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
         """Return the work of the forces and the least dissipation, for each tick and channel, (count, m, nsim)."""
@@ -460,7 +463,7 @@ class Balance:
 class _LateBalance(Balance):
     """The energy of each tick if forces latch within the tick, so that each period has two parts."""
 
-    before: Array  # (m, 1) [N/m] delta/(largest latency), until the latch; `damping` is delta/(T_max - least latency)
+    before: Array  # (m, 1) [N/m] delta/(latency), until the latch; `damping` is delta/(T - latency)
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
