@@ -219,11 +219,14 @@ def test_this_environment_designs_use_the_objects_damping(case, rms_db):
     assert not any_environment(found.coupling.compliance(T), loop.theta, DELTA).certified
 
 
-@pytest.mark.slow
 def test_this_environment_designs_stabilise_delayed_environments():
-    loop = asked((0, 0), psi=(1, 1), delta=(2.0, 2.0))
+    """An almost rigid coupling would need more than the damping."""
+    held = Network(("c",), (Spring(("c", "m"), 800.0, 1.0), Spring(("m", "ground"), 700.0, 1.0)), {"m": 1.0})
+    loop = asked((0,), held, (2,), (1,), (2.0,))
     found = design(loop, "this-environment")
     assert found.requirement.ratio <= 1 - RESERVE
+    rigid = force_map(loop.E(), SpringDamper([1e6], [0.0]), loop.theta, loop.psi)
+    assert this_environment(rigid, loop.delta).ratio > 1
     assert force_map(loop.E(), found.coupling, loop.theta, loop.psi).is_stable()
 
 
