@@ -63,7 +63,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
-    """A design for the paper's condition has half the stiffness; the first run should show what is possible."""
+    """The paper's condition renders half of the environment's stiffness; the first run should show what is possible."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"

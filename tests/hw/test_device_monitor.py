@@ -161,7 +161,7 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
 
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
-    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement, although 20 N cause jumps of 0.12 mm at most."""
+    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze, over 0.18 mm are a jump."""
     session, send = hand_driven(scenario, rungs, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0

@@ -191,12 +191,12 @@ def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
 
 @pytest.mark.parametrize(("friction", "closing"), [(0.17, False), (0.34, False), (0.34, True)])
 def test_stronger_forces_overcome_dry_friction(friction, closing):
-    """A friction of 68 % of a test force leaves 0.4 of the motion, and is not taken for a wrong mass."""
+    """Friction of 52 % of a test force leaves 0.57 of the motion; after more friction a stronger force is tried."""
     played(arming_test(closing=closing), rubbing(friction))
 
 
 def test_friction_and_weight_are_no_weak_direction():
-    """Friction of 0.52 N and a weight of 0.26 N leave 0.7 of the motion at 1.3 N, more of it to one side."""
+    """Friction of 0.52 N and a weight of 0.26 N leave 0.8 of the motion at 1.3 N, more of it to one side."""
     for closing in (False, True):
         played(arming_test(cap=1.3, closing=closing), rubbing(0.52, bias=0.26))
 
@@ -213,7 +213,7 @@ def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
 
 @pytest.mark.parametrize(("most", "mass"), [(0.6, 0.25), (0.9, 0.15), (9.0, 0.15)])
 def test_a_saturated_motor_fails_the_last_test(most, mass):
-    """A handle of 0.15 kg instead of 0.25 kg moves farther, which hides at first that a motor makes 0.9 of 1.3 N."""
+    """0.15 kg move 1.2 times as far under 0.9 N as 0.25 kg under 1.3 N; the motion at arming reveals the weak motor."""
     limited, first = masses(mass=mass, motor=lambda force: np.clip(force, -most, most)), arming_test(cap=1.3)
     played(first, limited)
     last = arming_test(cap=1.3, before=first.sizes, known=True)
@@ -237,7 +237,7 @@ def later(motion, ticks):
 
 @pytest.mark.parametrize("q", [5e-5, 1e-4, 2e-4, 3e-4])
 def test_coarse_counts_are_no_hidden_delay(q):
-    """At 1 N the free mass swings by 9 counts of 0.1 mm, whose rounding shifts its delay by at most 0.72 ticks.
+    """At 1.3 N the free mass swings by 10 counts of 0.1 mm, whose rounding shifts its delay by at most 0.63 ticks.
 
     This shift is below the limit of 0.75. Counts up to 0.1 mm show a delay of 2 ticks; for coarser counts the test
     remarks that it does not test the delay.
@@ -394,7 +394,7 @@ def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
 
 @pytest.mark.parametrize("strength", [1, 0])
 def test_noisy_coarse_counts_show_the_motor(strength):
-    """At 1 N the free mass swings by 3 counts of 0.3 mm. Noise of half a count has a range of 2 counts in 100 ms."""
+    """At 1.3 N the free mass swings by 3 counts of 0.3 mm. Noise of half a count has a range of 2 counts in 100 ms."""
     q, draw = 3e-4, np.random.default_rng(5)
     fine, test = masses(q=1e-3 * q), arming_test(q=q, still=4)
     noisy = lambda k, applied: tuple(  # noqa: E731

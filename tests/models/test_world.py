@@ -223,7 +223,7 @@ def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_contact_creates_no_more_than_the_lemma(tmp_path, scene):
-    """`python -m tests.models.test_world` checks more than 120,000 constraints."""
+    """tests/checks/test_worlds.py checks more than 120,000 constraints."""
     assert count_of_the_lemma(tmp_path, scene, 600) > 1000
 
 
