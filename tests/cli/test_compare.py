@@ -57,7 +57,7 @@ def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
     [("one-wall", ["none", "spring-damper", "spring-damper"]), ("omega-pair-ranges", ["none", "spring-damper"])],
 )
 def test_walls_and_ranges_leave_out_other_couplings(tmp_path, name, kinds):
-    rows = compare(tmp_path, "--scenario", name)
+    rows = compare(tmp_path, "--scenario", name, "--no-plot")
     assert [row["coupling"] for row in rows] == kinds
 
 
