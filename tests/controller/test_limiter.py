@@ -253,7 +253,7 @@ def test_the_first_limited_tick_is_found(channel, sign):
     sent, other = (buffer.after[:, limiter.sent_rows[i], 0] for i in (channel, 1 - channel))
     assert buffer.linear_until(10) == 10
     sent[4] = sign * LIMITS[channel]
-    assert buffer.linear_until(10) == 10, "a force at its limit is still linear"
+    assert buffer.linear_until(10) == 10, "a tick with a force at its limit is still linear"
     assert buffer.linear_until(10, 0.5) == 4
     sent[6] = sign * LIMITS[channel] * (1 + 1e-9)
     assert (buffer.linear_until(10), buffer.linear_until(6)) == (6, 6)

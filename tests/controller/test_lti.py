@@ -190,7 +190,7 @@ def test_building_a_block_formats_no_matrices():
 
     class Unwritable(np.ndarray):
         def __repr__(self):
-            raise AssertionError("written as text")
+            raise AssertionError("a matrix was written as text")
 
     matrix = np.eye(2).view(Unwritable)
     block = Lti(matrix, matrix, matrix, matrix, 1e-3)

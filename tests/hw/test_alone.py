@@ -141,7 +141,7 @@ def test_wrong_axes_are_never_armed(board, noise, wrong, causes):
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_a_sensor_dying_under_force_ends_in_a_ramp(board, noise):
+def test_a_sensor_dying_under_force_ramps_out(board, noise):
     bench = Bench(board, 1, noise)
     assert bench.armed() == (RUNNING, 0)
     for k in range(1500):
