@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from haptic_loop.cli.compare import _nearest, main
+from haptic_loop.cli.compare import _beside, _nearest, main
 from haptic_loop.cli.run import main as run_once
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.comparison import Alternative
@@ -76,3 +76,17 @@ def test_a_row_shows_its_worst_channel():
     needs = Requirement("own", (1.0, 3.0), (2.0, 2.0), None)
     row = Alternative("soft", None, requirements={"own": needs, "never": replace(needs, required=(math.inf, 1.0))})
     assert [row.needs(name) for name in ("own", "never", "absent")] == [1.5, None, None]
+
+
+def test_tables_show_growing_loops_without_error():
+    needs = {"this-environment": Requirement("this-environment", (0.5,), (1.0,), None)}
+    rows = [
+        Alternative("none", None, growth_rate_per_s=1.0, force_error_percent=7.0),
+        Alternative("optimal", "this-environment", "this environment", 0.9, -30.0, -1.0, 3.21, requirements=needs),
+        Alternative("published", None, reason="it is of another loop"),
+    ]
+    columns = {column.header: list(column.cells) for column in _beside(rows, None).columns}
+    assert columns["coupling"] == ["none", "optimal", "published"]
+    assert columns["error"] == ["grows", "3.21 %", ""]
+    assert columns["guarantee"] == ["none", "this environment", "not possible: it is of another loop"]
+    assert columns["stiffness"] == ["-", "90 %", ""]

@@ -1,6 +1,7 @@
 """MuJoCo worlds in a loop keep the energy account; scenarios and couplings that do not fit are refused."""
 
 import json
+from dataclasses import replace as replace_fields
 from importlib import import_module
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from haptic_loop.models import world as world_of
 from haptic_loop.sim.couplings import choose, read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, InWorld, Touched, _contacts_of, linearise, scene_of, thrown
+from haptic_loop.sim.world import START_J, HandsInWorld, InWorld, Touched, _contacts_of, linearise, scene_of, thrown
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -485,6 +486,8 @@ def test_thrown_hands_may_outlast_the_scenario(tmp_path):
     short = scenario(tmp_path, TRAY, more=UP, duration=0.1)
     (runs,) = thrown(short, choose(short, "I", "moving-average").coupling, 1, 0, 0.3)
     assert runs.figures.ticks == 300
+    figures = replace_fields(runs.figures, given_J=5e-3, start_J=2e-3, released_J=4e-3)
+    assert HandsInWorld("", 0, figures).excess_J == pytest.approx(-1e-3)  # W0 and 4 mJ were allowed
 
 
 def test_a_scene_that_changed_is_refused(tmp_path):
