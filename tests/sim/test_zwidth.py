@@ -304,7 +304,7 @@ def test_sustained_oscillations_are_told_from_decays():
 def test_a_slow_swing_that_decays_is_no_oscillation():
     """A hand swings back with 4 mm at 0.6 to 1.2 Hz, at any phase, 400 times the threshold.
 
-    A Hann window of 0.75 s leaves 2e-3 of the swing in the lowest octave, unless its trend is subtracted first.
+    A Hann window of 0.75 s leaves up to 9e-3 of the swing in the lowest octave, unless its trend is subtracted first.
     """
     t, phases = (np.arange(1500) * T)[:, None, None], np.linspace(0, np.pi, 24, endpoint=False)
     for hz in (0.6, 1.0, 1.12, 1.2):
