@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from asked import any_environment, this_environment
-from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
+from worlds import DELTA, FIGURE_4, T, force_map
 
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import SpringDamper
@@ -151,7 +151,10 @@ def test_three_steps_beat_the_structured_design(loop, order, diagonal):
 
 @pytest.mark.slow
 def test_environment_delay_designs_never_worsen_their_start():
-    loop = asked((0, 0), SOFT_NETWORK, psi=(1, 1))
+    soft = Network(
+        ("tip",), (Spring(("tip", "mass"), 200.0, 0.25), Spring(("mass", GROUND), 25.0, 0.25)), {"mass": 0.5}
+    )
+    loop = Loop(T, (1,), (1,), (0,), (1.37,), soft)
     found = ccl.design(loop, most_sdps=3)
     assert found.requirement.certified
     assert found.phi is not None
