@@ -687,11 +687,12 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     """Return (the guarantee for the loop that runs or None, the reason why there is none)."""
     loop, requirements, limits = assessment.loop, assessment.requirements, assessment.force_limits
     own = requirements[assessment.condition]
-    if shelled(assessment.environment):
+    plugged = shelled(assessment.environment)
+    if loop.latency and (plugged or limits.energy_budget is not None):
+        return None, "latency: an energy account counts forces that latch at ticks; add a sample to theta instead"
+    if plugged:
         return _shell(assessment)
     if limits.energy_budget is not None:
-        if loop.latency:
-            return None, "latency: the energy budget counts forces that latch at ticks; add a sample to theta instead"
         return _account(assessment, "whatever computes the forces"), None
     if loop.varying_delay:
         anywhere = () if any(loop.psi) else (ANY_ENVIRONMENT.name, KNOWN_DEVICE_ANY.name)

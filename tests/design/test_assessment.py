@@ -66,12 +66,14 @@ def test_another_loop_loses_the_guarantee(changes):
         assert elsewhere.reason
 
 
-def test_an_energy_budget_covers_no_latency():
+def test_an_energy_account_covers_no_latency():
     """A hand that moves only before forces latch gains energy from the last force, which the account does not see."""
     assert assess(LOOP, HERE_ONLY, energy_budget=0.1).guarantee.condition == "energy-budget"
-    late = assess(change(LOOP, latency=((0.0, 2e-4),)), HERE_ONLY, energy_budget=0.1)
-    assert late.guarantee is None
-    assert late.reason.startswith("latency")
+    late = change(LOOP, latency=((0.0, 2e-4),))
+    for accounted in ({"energy_budget": 0.1}, {"environment": lambda x: -100 * x}):
+        assessment = assess(late, HERE_ONLY, **accounted)
+        assert assessment.guarantee is None
+        assert assessment.reason.startswith("latency")
 
 
 def test_another_coupling_does_not_inherit_a_certificate():
