@@ -1,6 +1,6 @@
-/* The calls of Force Dimension's library that hw/force_dimension.py makes, by the public prototypes of dhdc.h.
+/* The calls of Force Dimension's library that hw/force_dimension.py makes, with the public prototypes of dhdc.h.
 
-   Its two devices, with the serial numbers 4711 and 4712, stand still. The test writes every other symbol that the
+   The two devices, with the serial numbers 4711 and 4712, stand still. The test writes every other symbol that the
    binding looks up into a second file, as a call that fails. */
 #include <string.h>
 

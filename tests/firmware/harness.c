@@ -65,7 +65,7 @@ int main(void)
         else if (operation == 'D') harness_deadman(d, (int)word());
         else if (operation == 'R') {
             uint32_t now = word(), n = word();
-            uint8_t *data = (uint8_t *)malloc(n ? n : 1); /* of its exact size, so that the sanitizer sees one byte too many */
+            uint8_t *data = (uint8_t *)malloc(n ? n : 1); /* n bytes exactly, so that the sanitizer finds an access beyond them */
             if (!data || fread(data, 1, n, stdin) != n) return 1;
             harness_receive(d, data, n, now);
             free(data);

@@ -564,7 +564,7 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
     assert emulator.plant.fastest > 1.0  # [m/s] mean speed and swing of the motor
 
 
-# positions count from where the handles are
+# the origin of positions
 
 
 @pytest.mark.parametrize("place", [0.03, -0.03])

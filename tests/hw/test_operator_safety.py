@@ -211,7 +211,7 @@ def test_impossible_limits_are_refused(scenario, options, words):
     assert words in str(error.value)
 
 
-# what outlives the process
+# the incident log
 
 
 def test_the_incident_log_survives_sigkill(tmp_path):

@@ -115,7 +115,7 @@ def test_harmless_faults_leave_forces_alone(scenario, rungs):
 
 
 def test_repeating_devices_count_as_lost(scenario, rungs):
-    """Repeating one STATE for ever is no sign of life: the time-out acts all the same."""
+    """Repeating one STATE for ever is no sign of life: the time-out still acts."""
     rehearsal = rehearsal_of(scenario, rungs)
     session = rehearsal.run_until_armed(0.7)
     assert session.stage == Stage.ARMED
@@ -159,7 +159,7 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
 
 def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
     rehearsal = rehearsal_of(scenario, rungs, arm=False)
-    rehearsal.emulator.plant.begin()  # the person moves all the same
+    rehearsal.emulator.plant.begin()  # the person still moves
     sent = []
     receive = rehearsal.emulator.receive
     rehearsal.emulator.receive = lambda data, now: (sent.append(data), receive(data, now))

@@ -251,7 +251,7 @@ def test_a_persons_arms_may_differ():
         np.testing.assert_allclose(x, np.linalg.inv(Z)[:2, :2], rtol=1e-9)
 
 
-# many hands at once
+# stacks of hands
 
 
 def test_crowds_stack_each_hands_matrices():

@@ -74,7 +74,7 @@ def rows(matrix: Array) -> str:
     return str(((matrix + matrix.T) / 2).tolist())
 
 
-# ---- what files may say
+# ---- contents of files
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def test_more_substeps_change_nothing(simulation):
     np.testing.assert_allclose(one, three, rtol=1e-9, atol=1e-13)
 
 
-# ---- where it cannot be exact
+# ---- limits of exactness
 
 
 def test_the_forces_are_mujocos(simulation):
@@ -192,7 +192,7 @@ def test_springs_need_mujocos_position_stage(simulation):
     assert skipped[0] == 0.0
 
 
-# ---- many at once
+# ---- batches
 
 
 def hands(count: int) -> Crowd:

@@ -336,7 +336,7 @@ def test_the_viewer_s_selection_is_a_grip(none):
     assert stage.grip(perturb) is None
 
 
-# what is shown
+# shapes and texts
 
 
 @pytest.mark.parametrize("name", ["omega-pair", "three-rigid"])

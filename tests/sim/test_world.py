@@ -263,7 +263,7 @@ def test_contacts_that_multiply_a_mass_are_held_back(tmp_path, impedance, gives_
     assert (acted > 0) == (gives_J > 0)
 
 
-# ---- what is claimed
+# ---- guarantees
 
 
 def test_only_a_certified_coupling_is_guaranteed(tmp_path):
