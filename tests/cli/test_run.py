@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from haptic_loop.cli.options import name_of, place
-from haptic_loop.cli.run import _parser, main
+from haptic_loop.cli.run import _crossed, _parser, main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save
@@ -20,6 +20,7 @@ from haptic_loop.design.designs import design_by_kind, usual_condition
 from haptic_loop.design.files import one_command, read, remove
 from haptic_loop.sim import couplings
 from haptic_loop.sim import run as loop
+from haptic_loop.sim.accuracy import CrossCheck
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 from tests.asked import decisive, needs, safe_with
@@ -366,3 +367,10 @@ def test_a_file_that_was_read_is_not_removed(tmp_path):
         with pytest.raises(InputError, match=r"cannot write .*figure\.png: it was read"):
             remove(path)
     assert path.exists()
+
+
+def test_cross_checks_say_whether_verdicts_agree():
+    same, other = (_crossed(CrossCheck("RK4", 4, 1e-7, -1.0, 2e-5, agrees)) for agrees in (True, False))
+    assert "same verdict" in same
+    assert "ANOTHER VERDICT" in other
+    assert "differs by +2.0e-05 1/s" in same

@@ -105,6 +105,7 @@ def test_a_clipped_guarantee_says_where_it_ends():
     ends = "Only while forces stay below their limits."
     assert ends in verdict(clipped)
     assert ends not in verdict(limited)
+    assert "Not certified" not in verdict(limited)
     assert "proved, also while forces are limited" in limited.force_limits.words
     lost = limited.without_guarantee("a packet is lost")
     assert lost.force_limits.words == "limited to 12 N, without a guarantee"

@@ -5,6 +5,9 @@ import json
 import pytest
 from forked import run
 
+from haptic_loop.design.files import InputError
+from haptic_loop.design.own import is_refusal, named, place_of
+
 MINE = """
 from dataclasses import dataclass
 
@@ -202,3 +205,16 @@ def test_a_coupling_that_is_its_compliance(command, place):
     assert done.returncode == 0, done.stderr
     assert "error" not in done.stderr.lower()
     assert "Warning" not in done.stderr
+
+
+def test_errors_name_the_innermost_line(tmp_path):
+    """A user's own refusal keeps its traceback, and one of this package does not need it."""
+    file = tmp_path / "nested_error.py"
+    file.write_text("def inner():\n    raise ValueError('no')\n\ndef outer():\n    inner()\n")
+    with pytest.raises(ValueError, match="no") as caught:
+        named("--x", f"{file}:outer")()
+    assert place_of(caught.value) == f"{file}, line 2"
+    assert not is_refusal(caught.value)
+    with pytest.raises(InputError) as refused:
+        named("--x", "nothing")
+    assert is_refusal(refused.value)
