@@ -35,7 +35,7 @@ def run(tmp_path, *options):
 
 
 def test_case_none_is_figure_5(tmp_path):
-    code, report = run(tmp_path, "--case", "none")
+    code, report = run(tmp_path, "--case", "none", "--no-plot")
     stability = report["stability"]
     assert code == 0
     assert decisive(report)["required_damping"] == pytest.approx([1.7229] * 2, rel=1e-4)
@@ -65,7 +65,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
     """The paper's condition renders half of the environment's stiffness; the first run should show what is possible."""
-    code, report = run(tmp_path, "--case", "I", "--duration", "10")
+    code, report = run(tmp_path, "--case", "I", "--duration", "10", "--no-plot")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"
     assert decisive(report)["proof"] == "rational"

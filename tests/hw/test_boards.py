@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from haptic_loop.cli import design, export
-from haptic_loop.design.coupling_file import load
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.assessment import assess
+from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import _sequential, process_block
+from haptic_loop.sim.scenario import load as load_scenario
 
 pytestmark = pytest.mark.firmware
 
@@ -204,8 +207,10 @@ def test_the_cortex_m7_repeats_the_test_vector(teensy):
 
 def test_the_cortex_m7_limits_vectors(tmp_path):
     """For two devices of three axes, the vector limiter repeats the ticks of Python to the last bit."""
-    words = "--scenario", "omega-space", "--out", str(tmp_path / "coupling.json")
-    assert design.main([*words]) == 0
+    loop = load_scenario("omega-space").loop("I")
+    stiffness, damping = [16000.0] * 3 + [6000.0] * 3, [0.2] * 3 + [2.3] * 3  # rounded from a design of ten seconds
+    coupling = SpringDamper(stiffness, damping)
+    save(Stored.of(loop, coupling, assess(loop, coupling).force_limits.certificate), tmp_path / "coupling.json")
     process = ["--process", "--force-limit", "3", "--out", str(tmp_path / "coupling-process.c")]
     assert export.main([str(tmp_path / "coupling.json"), *process]) == 0
     text = (tmp_path / "coupling-process.c").read_text()
