@@ -117,7 +117,7 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
 
 
 def test_saturation_is_the_same_in_both_engines():
-    """The loop is stable and clips from the start, so no instability amplifies differences between engines."""
+    """The loop is stable although forces clip, so no instability amplifies differences between engines."""
     devices = tuple(d.__class__(force_limit=0.05) for d in SHORT.device)
     loop = assemble(SHORT.replace(device=devices), PUBLISHED["I"])
     a, b = run(loop), run(loop, "exact")
