@@ -65,7 +65,7 @@ def test_a_budget_that_does_not_act_changes_nothing(engine):
 def test_hostile_loops_cannot_exceed_the_budget(start, vary):
     """An optimal coupling on springs 2.5 times stiffer gives hands no more energy than the budget allows."""
     coupling = design_coupling(load().loop("I"), "optimal", "this-environment").coupling
-    scenario = stiffer(load().replace(duration=4.0), 2.5)
+    scenario = stiffer(load().replace(duration=2.0), 2.5)
     simulation = assemble(scenario, coupling)
     if vary:
         rng = np.random.default_rng(7)
@@ -149,7 +149,7 @@ def test_reports_say_what_the_budget_did(tmp_path):
 @pytest.mark.slow
 def test_uneven_periods_cannot_exceed_the_budget():
     """With uneven periods the budget reserves for the longest tick, so an unstable loop gives at most W0."""
-    scenario = stiffer(load().replace(duration=2.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
+    scenario = stiffer(load().replace(duration=1.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
     simulation = assemble(scenario, NoCoupling())
     for start in (0.0, 0.01):
         trace = run(netted(simulation, EnergyNet(start)), "exact")
