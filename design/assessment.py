@@ -261,6 +261,7 @@ class ForceLimits:
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
         less: Whether the limiter is proved in one environment only, while the guarantee covers more.
+        bounded: Whether the limiter is proved only for devices within their guaranteed bounds.
         energy_budget: The start W0 [J] of an energy account of the forces; None without one.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
         proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
@@ -273,6 +274,7 @@ class ForceLimits:
     certificate: Certificate | None = None
     force_limit: tuple[float, ...] = ()
     less: bool = False
+    bounded: bool = False
     energy_budget: float | None = None
     void: bool = False
     proof: str = "sampled"
@@ -349,8 +351,9 @@ def _by_its_own_block(
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
-            c = _rows(condition, loop, requirement)
-            return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof, proof=requirement.proof)
+            c, bounded = _rows(condition, loop, requirement), isinstance(condition, LimitedKnownDevice)
+            covered = ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof, proof=requirement.proof)
+            return replace(covered, bounded=bounded)
         except NotProved:  # The proof does not hold in this loop, or would take long.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
@@ -360,12 +363,13 @@ def _by_its_own_block(
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, c)
-    rho = loop.per_channel(plain.rho(loop))
+    covered = ForceLimits(loop.per_channel(plain.rho(loop)), _OWN_PROOF, requirement, c, bounded=limiter is not plain)
     try:
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
-        return ForceLimits(rho, f"swept, not proved: {refused}", requirement, c)
-    return ForceLimits(rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved, proof="rational")
+        return replace(covered, reason=f"swept, not proved: {refused}")
+    requirement = replace(requirement, proof="rational")
+    return replace(covered, requirement=requirement, certificate=proved, proof="rational")
 
 
 def _rows(
@@ -596,7 +600,7 @@ def assess(
     if plugged:
         limits = ForceLimits(None, "the forces of the environment are clipped before the shell")
     else:
-        where = loop if environment is None else here
+        where = loop if environment is None else loop.at(network)
         limits = _force_limits(where, coupling, requirements, limiter, limiter_proof, known)
     if plugged and energy_budget is None:
         energy_budget = 0.0 if callable(environment) else START_J
@@ -735,7 +739,7 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
     proof = by.proof if limits.rho is None or limits.proved else "sampled"
     longest = loop.T_max or loop.T
     facts = tuple(fact for fact in assessment.facts if environments != ANY or fact not in ("walls", "ranges"))
-    bounded = by.condition in KNOWN_CONDITIONS
+    bounded = by.condition in KNOWN_CONDITIONS or (limits.rho is not None and limits.bounded)
     hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
     facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)
     return Guarantee(by.condition, proof, facts, hands, environments, forces, loop.delays, longest)

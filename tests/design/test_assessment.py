@@ -15,10 +15,10 @@ from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import GROUND, Network, Spring
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.design import assessment as assessment_module
 from haptic_loop.design import compare as comparison
-from haptic_loop.design.assessment import assess
+from haptic_loop.design.assessment import BELOW_LIMITS, assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
 from haptic_loop.design.environments import LIMITER
@@ -111,6 +111,23 @@ def test_a_clipped_guarantee_says_where_it_ends():
     assert lost.force_limits.words == "limited to 12 N, without a guarantee"
     unstable = assess(loop, SpringDamper([1e5, 1e5], [0.0, 0.0]), force_limit=(12.0, 12.0))
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
+
+
+def test_another_environment_keeps_the_switching_delays():
+    """Limited forces need 1.404 times 1.37 N s/m while delays switch, and 0.986 times this while they are constant."""
+    switching = change(LOOP, varying_delay=DelayRange((2,), (3,)), delta=(1.4 * 1.37,))
+    assessment = assess(switching, HERE_ONLY, environment=LOOP.environment)
+    assert (assessment.guarantee.condition, assessment.guarantee.forces) == ("switching", BELOW_LIMITS)
+    assert assessment.force_limits.rho is None
+
+
+def test_a_limiter_of_known_devices_names_them():
+    """This-environment covers every device here, but its block for limited forces fails by 0.5 %."""
+    bounds = DeviceBounds(0.1, 2000.0, 0.5, 2.0)
+    loop = change(LOOP, delta=(0.98 * 1.37,), known_devices=(bounds,))
+    limited = assess(loop, HERE_ONLY)
+    assert (limited.guarantee.condition, limited.force_limits.bounded) == ("this-environment", True)
+    assert "devices with at least 100 g" in limited.guarantee.hands
 
 
 def test_a_sweep_of_limited_forces_is_no_proof():
