@@ -18,7 +18,6 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
-from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.program import OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
 from haptic_loop.design.robustness import Robustness, ranges_around, robustness_nearby
@@ -79,8 +78,7 @@ def _parser() -> options.Parser:
     parser.add_condition("condition to certify (default: that of the coupling)")
     ratio = "soften the coupling until every mode with the scenario's hands has at least this damping ratio"
     parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
-    varying = "also certify any switching of the forces' delays in this range [samples]; with --condition "
-    varying += "this-environment or known-device"
+    varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
         "fail unless this-environment (optimal: or known-device) is proved for limited forces, too "
@@ -129,19 +127,13 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     if args.coupling in KINDS:
         args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
-        if not _for_switching(args):
-            raise InputError("--varying-delay is for spring-damper or optimal, with this-environment or known-device")
+        if "switching" not in kind_of(args.coupling).options:
+            able = " and ".join(kind for kind, design in KINDS.items() if "switching" in design.options)
+            raise InputError(f"--varying-delay with --coupling {args.coupling}: allowed are {able}")
         span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
         with options.refused("--varying-delay: "):
             loop = loop.switching(span)
     return loop
-
-
-def _for_switching(args: argparse.Namespace) -> bool:
-    """Return whether the design takes varying delays into account; --varying-delay is refused for others."""
-    kind = kind_of(args.coupling)
-    condition = named(args.condition or kind.conditions[0])
-    return "switching" in kind.options and (condition.extensible or condition is KNOWN_DEVICE)
 
 
 def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
@@ -384,7 +376,7 @@ class _Report:
     robustness: Robustness | None = render.several(render.robustness_rows)
     ringing: Ringing | None = render.figure("slowest mode", "{.words}", default=None, json="if given")
     best: _Best | None = render.several(_Best.rows, "inlined")
-    sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
+    sdps: int = render.figure("problems solved", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
     interrupted: bool = off_table()
     claim: str | None = render.figure("claim", default=None, json="if given")  # for the user's own condition

@@ -154,19 +154,22 @@ class SearchFigures:
     worst_ratio: float
     worst: str
     violated: bool
-    ended_by_clock: bool
+    ended_early: bool
+    ended_by_clock: bool  # by the user's time limit
     how: str = SEARCH
 
     @classmethod
     def of(cls, searched: Searched) -> SearchFigures:
         """Summarise a search."""
-        worst = searched.worst[0]
-        return cls(searched.tried, worst.ratio, worst.member.name, not suffices(worst.ratio), searched.ended)
+        worst, ended = searched.worst[0], searched.ended
+        violated = not suffices(worst.ratio)
+        return cls(searched.tried, worst.ratio, worst.member.name, violated, ended is not None, ended == "clock")
 
     def __str__(self) -> str:
         verdict = "[red]violated[/]" if self.violated else "no violation found"
         ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else "no damping is enough"
-        ended = ", until its budget was spent" if self.ended_by_clock else ""
+        limit = "--seconds" if self.ended_by_clock else "its budget of counted work"
+        ended = f", until {limit} ended the search" if self.ended_early else ""
         return f"searched, not proved: {verdict}, {ratio} in {self.environments} points{ended}, at {self.worst}"
 
 

@@ -133,7 +133,7 @@ def design(
     proved_last = improving[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
     for candidate in proved_last:
         best = search.between(candidate) if loop.ranges else search.proved_or_smaller(candidate)
-        hurried |= best.searched is not None and best.searched.ended and search.over()
+        hurried |= best.searched is not None and best.searched.ended == "clock"
         if best.proved:
             break
     if best is None or not best.proved or search.mismatch(best) > _HOPELESS:

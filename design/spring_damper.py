@@ -255,7 +255,9 @@ def design(
             raise ValueError("limiter: limited forces are proved for constant delays only; leave out the limiter")
         return _for_this_environment(loop, starts, limiter, band_hz)
     if loop.varying_delay:
-        raise ValueError("delays that vary: use this-environment, the only condition with such designs")
+        raise ValueError(
+            "delays that vary: this function designs for this-environment only, design_coupling for others, too"
+        )
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Literal
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Searched:
 
     worst: tuple[_Worst, ...]
     tried: int  # number of members tried
-    ended: bool = False  # whether the budget of work or the user's time limit ended the search early
+    ended: Literal["work", "clock"] | None = None  # what ended the search early: its budget, or the user's time limit
 
 
 def search(
@@ -63,7 +64,8 @@ def search(
     The search ends early when `work` units of counted work are done, or when `over` returns True because the user's
     time limit has passed. The result then contains the maxima among the members that were tried.
     """
-    ended, until = False, spent_after(work)
+    ended: Literal["work", "clock"] | None = None
+    until = spent_after(work)
     points = [list(_points(region)) for region in regions]
     refinements = [
         min(budgets.RANGE_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)
@@ -77,7 +79,9 @@ def search(
         def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:
             nonlocal tried, ended
             if point.tobytes() not in known:
-                if ended := ended or (tried > 0 and (spent() > until or over())):
+                if tried > 0 and not ended:
+                    ended = "clock" if over() else "work" if spent() > until else None
+                if ended:
                     return -np.inf
                 tried += 1
                 progress(min(tried, total), total)

@@ -76,6 +76,15 @@ def test_an_energy_account_covers_no_latency():
         assert assessment.reason.startswith("latency")
 
 
+def test_the_limiter_is_judged_with_switching_delays():
+    """With constant delays the limiter would be covered (a ratio of 0.70), with switching delays it is not (1.04)."""
+    loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
+    for runs in ({}, {"environment": loop.environment}):
+        limits = assess(loop, coupling, **runs).force_limits
+        assert limits.rho is None
+        assert limits.requirement.ratio > 1
+
+
 def test_another_coupling_does_not_inherit_a_certificate():
     stiffer = HERE_ONLY.scaled(stiffness=1.2)
     assert assess(LOOP, stiffer, certificate=proved_here()).guarantee is None

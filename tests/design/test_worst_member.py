@@ -14,7 +14,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from haptic_loop.design import optimal
 from haptic_loop.design.api import certify, store
-from haptic_loop.design.assessment import check_ranges
+from haptic_loop.design.assessment import SearchFigures, check_ranges
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.program import Options
@@ -128,7 +128,11 @@ def test_many_parameters_find_the_worst_vertex():
     np.testing.assert_array_equal((point_of(found.worst[0].member) - region.low) / 10, signs > 0)
     assert not found.ended
     short = search([region], need, work=-1.0)
-    assert short.ended
+    assert short.ended == "work"
+    assert "counted work ended" in str(SearchFigures.of(short))
+    late = search([region], need, over=lambda: True)
+    assert late.ended == "clock"
+    assert "--seconds ended" in str(SearchFigures.of(late))
     assert short.tried == 1
     assert len(short.worst) == 1
 
