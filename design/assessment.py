@@ -623,8 +623,10 @@ def assess(
         wanted_condition.name,
     )
     guarantee, reason = _guarantee(assessment)
-    by_itself = limits.requirement is not None and limits.rho is not None  # The limiter is proved in `network` only.
-    if guarantee and guarantee.environments == RANGES and by_itself and environment is not None:
+    by_itself = (
+        limits.requirement is not None and limits.rho is not None
+    )  # No search between vertices covers its block.
+    if guarantee and guarantee.environments == RANGES and by_itself:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
         guarantee, reason = _guarantee(assessment)
     if guarantee is None:

@@ -16,6 +16,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
+from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import assessment as assessment_module
 from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import BELOW_LIMITS, assess
@@ -137,6 +138,19 @@ def test_a_limiter_of_known_devices_names_them():
     limited = assess(loop, HERE_ONLY)
     assert (limited.guarantee.condition, limited.force_limits.bounded) == ("this-environment", True)
     assert "devices with at least 100 g" in limited.guarantee.hands
+
+
+def test_limited_forces_are_not_searched_between_vertices():
+    """The limiter's block needs 0.985 times 1.37 N s/m at both ends of the mass, and 0.03 % more between them."""
+    springs = (LOOP.environment.springs[0], change(LOOP.environment.springs[1], stiffness=700.0))
+    network = change(LOOP.environment, masses={"mass": 3.0}, springs=springs)
+    loop = change(LOOP, environment=network, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.985 * 1.37,))
+    limits = assess(loop, HERE_ONLY, ranges_samples=0)
+    between = loop.at(change(network, masses={"mass": 0.2}))
+    assert limits.force_limits.requirement.certified
+    assert not required_damping(between, HERE_ONLY, LIMITER, limits.force_limits.requirement.multiplier).certified
+    assert limits.guarantee.environments == "these ranges"
+    assert limits.guarantee.forces == "also while they are limited, in this environment"
 
 
 def test_a_sweep_of_limited_forces_is_no_proof():
