@@ -56,8 +56,10 @@ def main(argv: list[str]) -> int:
         render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
     verdict = verdicts.lost(assessment, report.robustness) if slow else verdicts.verdict(assessment, report.robustness)
-    lines = ["Interrupted: the robustness is missing, and perhaps the bound."] if report.interrupted else []
-    render.publish(args, report, _tables(scenario, report), lines, verdict=verdict)
+    tables, lines = _tables(scenario, report)
+    if report.interrupted:
+        lines = ["Interrupted: the robustness is missing, and perhaps the bound.", *lines]
+    render.publish(args, report, tables, lines, verdict=verdict)
     return options.exit_code(assessment.holds, report.interrupted)
 
 
@@ -387,14 +389,27 @@ class _Report:
         return _OBJECTIVE_WORDS[self.objective_name]
 
 
-def _tables(scenario: Scenario, report: _Report) -> list[render.Table]:
+#: rows that are left out of long tables, the least important first
+_LESS = (
+    "channels",
+    "problems solved",
+    "damping, any switching",
+    "ranges, inside",
+    "bases [dB]",
+    "ranges, worst vertex",
+)
+
+
+def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], list[str]]:
+    """Return the tables, and a line that names the rows left out of the first, if any."""
     title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
+    rows, left_out = render.shortened(rows, _LESS)
     shown = [render.facts(title, rows)]
     if report.price:
         title = "in the nominal environment / at the worst vertex"
         shown.append(render.columns(title, _OVER_RANGES, report.price, left=range(5)))
-    return shown
+    return shown, left_out
 
 
 def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:

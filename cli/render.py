@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -195,6 +196,25 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
         if text is not None:
             table.add_row(name, text)
     return table
+
+
+def shortened(rows: Rows, less: Sequence[str]) -> tuple[list[tuple[str, str | None]], list[str]]:
+    """Return at most _MOST_ROWS rows, and a line that names those left out, if any.
+
+    The rows named in `less` are left out as far as necessary, the least important first. A row without a name belongs
+    to the row before it.
+    """
+    kept, out = [row for row in rows if row[1] is not None], []
+    names = list(accumulate((name for name, _ in kept), lambda before, name: name or before))
+    for name in less:
+        if len(kept) > _MOST_ROWS and name in names:
+            kept = [row for row, of in zip(kept, names, strict=True) if of != name]
+            names = [of for of in names if of != name]
+            out.append(name)
+    return kept, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
+
+
+_MOST_ROWS = 15  # of a table of facts
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:

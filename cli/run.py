@@ -65,7 +65,8 @@ def main(argv: list[str]) -> int:
     report = replace(report, robustness=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
-    render.show(args, _tables(scenario, report), report.remarks, _details(report))
+    tables, left_out = _tables(scenario, report)
+    render.show(args, tables, [*report.remarks, *left_out], _details(report))
     with render.progress("storing the trace and drawing the picture"):
         files = _save(args, out, run, report, painter)
     render.publish(args, report, (), folder=out, files=files)
@@ -215,15 +216,33 @@ def _title(what: str, report: RunReport) -> str:
 # The report as tables.
 
 
-def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
+#: rows that are left out of long tables, the least important first
+_LESS = (
+    "channels",
+    "damping, any switching",
+    "slowest mode",
+    "ranges, inside",
+    "age of the forces",
+    "simulated in",
+    "ranges, worst vertex",
+    "rendered stiffness",
+    "ticks",
+    "worst switching found",
+    "ranges, between",
+)
+
+
+def _tables(scenario: Scenario, report: RunReport) -> tuple[list[Any], list[str]]:
+    """Return the tables, and a line that names the rows left out of the first, if any."""
     title = f"{scenario.title(report.case)}: coupling {report.kind}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
+    rows, left_out = render.shortened([render.channel_row(scenario.environment.contacts), *_rows(report)], _LESS)
+    shown = [render.facts(title, rows)]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
     if report.paper:
         cells = {"": "{r.what}", "paper": "{r.paper}", "here": "{r.here}", "why": "{r.why}"}
         shown.append(render.columns("beside the paper", cells, report.paper, range(4)))
-    return shown
+    return shown, left_out
 
 
 def _rows(report: RunReport) -> render.Rows:

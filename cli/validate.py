@@ -37,6 +37,17 @@ if TYPE_CHECKING:
 
 _HUMANS, _IN_A_WORLD = 1000, 100  # default numbers of hands
 _ENVIRONMENTS = ("nominal", "ranges")
+#: rows that are left out of long tables, the least important first
+_LESS = (
+    "time",
+    "damping, any switching",
+    "age of the forces",
+    "difference of growth rates",
+    "ticks",
+    "environments",
+    "worst switching found",
+    "traces",
+)
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
@@ -60,12 +71,14 @@ def main(argv: list[str]) -> int:
     report = _reported(args, chosen, assessment, question, findings, wall, searched)
     files = _save(args, out, question, findings, searched.worst, chosen.kind, painter)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
+    rows, left_out = render.shortened(render.rows_of(report), _LESS)
     lines = [
+        *left_out,
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
         *friction_left_out(scenario.device),
     ]
-    shown = [render.facts(title, render.rows_of(report))]
+    shown = [render.facts(title, rows)]
     render.publish(args, report, shown, lines, out, files, verdicts_of.verdict(assessment))
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED

@@ -236,3 +236,12 @@ def test_two_references_are_refused(tmp_path):
     for words in ("--reference II", "--case II"):
         with pytest.raises(InputError, match=f"^{words} with lam of the scenario"):
             scenario_of(f"--scenario {tmp_path}/own.toml {words}")
+
+
+def test_long_tables_leave_out_less_important_rows():
+    """A row without a name belongs to the row before it, and rows without a text do not count."""
+    rows = [(f"row {i}", "1") for i in range(14)] + [("spare", "2"), ("", "3"), ("absent", None), ("last", "4")]
+    kept, (line,) = render.shortened(rows, ("row 3", "spare", "row 5"))
+    assert kept == [row for row in rows if row[0] not in ("row 3", "spare", "", "absent")]
+    assert line.endswith(": row 3; spare.")
+    assert render.shortened(rows[:15], ("row 3",)) == (rows[:15], [])
