@@ -203,7 +203,13 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
 
 
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
-    """Print the log of the session, then the figures of the link, of the energy accounts and of the scene."""
+    """Print the session's log, and the figures of the link, of energy accounts and of the scene.
+
+    Without an assessment, whose verdict was printed before, the end of the session comes first.
+    """
+    if report.assessment is None:
+        last = report.session.log[-1]
+        console.print(f"[red]Not certified[/]: the session is {_colour(last.stage)}, {last.cause}.", soft_wrap=True)
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
     link = report.link

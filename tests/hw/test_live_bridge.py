@@ -355,6 +355,12 @@ def test_uncertified_couplings_are_not_armed(emulator, scenario):
     assert "not certified" in session.cause
 
 
+def test_a_refusal_is_the_first_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert bridge.main(["--rehearse", "--coupling", "none", "--no-plot", "--measure", "100"]) == 1
+    assert capsys.readouterr().out.startswith("Not certified: the session is refused, ")
+
+
 @pytest.mark.slow
 def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
     emulator = EmulatorProcess("--fault=unplug@0.05", f"--pace={PACE}")
