@@ -623,9 +623,8 @@ def assess(
         wanted_condition.name,
     )
     guarantee, reason = _guarantee(assessment)
-    by_itself = (
-        limits.requirement is not None and limits.rho is not None
-    )  # No search between vertices covers its block.
+    # No search between vertices covers the limiter's own block.
+    by_itself = limits.requirement is not None and limits.rho is not None
     if guarantee and guarantee.environments == RANGES and by_itself:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
         guarantee, reason = _guarantee(assessment)

@@ -25,6 +25,7 @@ from haptic_loop.controller.budget import (
     ShellFigures,
 )
 from haptic_loop.controller.delay import LOST, Ticks, ages
+from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import Net, Process
 from haptic_loop.design.assessment import Assessment
@@ -119,9 +120,11 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
 
 def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: BudgetFigures) -> str | None:
     """Return the reason why the budget never acts in this run from rest, or None if it may act."""
-    scenario = simulation.scenario
+    scenario, law = simulation.scenario, simulation.process.law
+    free = isinstance(law, Limiter) and not law.rho.any()  # A limiter with rho = 0 keeps the environment passive.
     if (
         budget.cap_J is not None
+        or ((simulation.process.force_limit < np.inf).any() and not free)
         or any(scenario.psi)
         or scenario.switches
         or (simulation.process.encoder_step > 0).any()

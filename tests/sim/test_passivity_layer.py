@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -11,7 +12,7 @@ from worlds import checkered
 from haptic_loop import design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.budget import EnergyBudget, Packets
-from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.delay import packet_delays
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, idle, netted
@@ -36,15 +37,29 @@ def given(simulation, trace):
 
 def test_budgets_are_idle_with_damping_to_spare():
     """A budget uses 95 % of the damping, so any-environment must need at most as much on every channel."""
-    simulation, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
+    clipped, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
+    unlimited = replace(clipped, process=clipped.process.unlimited)
 
-    def reason(*shares, guarantee="any passive environment", budget=budget):
+    def reason(*shares, guarantee="any passive environment", budget=budget, simulation=unlimited):
         required = tuple(share * d for share, d in zip(shares, SHORT.delta, strict=True))
         return idle(simulation, [Requirement("own", required, SHORT.delta, None, guarantee=guarantee)], budget)
 
     assert reason(0.94, 0.94).startswith("it never acts")
     assert reason(0.94, 0.96) is reason(0.94, 0.94, guarantee="this environment") is None
-    assert reason(0.94, 0.94, budget=replace(budget, cap_J=1.0)) is None
+    assert reason(0.94, 0.94, budget=replace(budget, cap_J=1.0)) is reason(0.94, 0.94, simulation=clipped) is None
+
+
+def test_a_budget_acts_on_clipped_forces():
+    """Clipped at 0.3 and 0.1 N, a certified coupling gives 2 mJ per slow closed path: the hand must pay it first."""
+    loop, most = SHORT.loop("I"), np.array([[0.3], [0.1]])
+    G, budget = loop.sent(SpringDamper([600.0, 400.0], [0.5, 0.5])), EnergyBudget(loop.delta, loop.T, Packets((1, 2)))
+    corners = 1e-3 * np.array([[0, 0], [-10, -10], [-13, -10], [-3, 0], [0, 0]])
+    path = np.vstack([np.linspace(a, b, 500) for a, b in pairwise(corners)])
+    z, dx = np.zeros(G.order), np.diff(path, axis=0, prepend=path[:1])
+    for x, step in zip(path, dx, strict=True):
+        z, f = G.A @ z + G.B @ x, G.C @ z + G.D @ x
+        budget.limit(np.clip(f[:, None], -most, most), step[:, None])
+    assert budget.figures().limited_ticks > 100
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
