@@ -742,7 +742,8 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
     forces = BELOW_LIMITS if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
     proof = by.proof if limits.rho is None or limits.proved else "sampled"
     longest = loop.T_max or loop.T
-    facts = tuple(fact for fact in assessment.facts if environments != ANY or fact not in ("walls", "ranges"))
+    unused = {"walls" if environments == ANY else "", "" if environments == RANGES else "ranges"}
+    facts = tuple(fact for fact in assessment.facts if fact not in unused)
     bounded = by.condition in KNOWN_CONDITIONS or (limits.rho is not None and limits.bounded)
     hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
     facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)

@@ -153,6 +153,14 @@ def test_limited_forces_are_not_searched_between_vertices():
     assert limits.guarantee.forces == "also while they are limited, in this environment"
 
 
+def test_one_environment_covers_no_ranges():
+    """The nominal mass of 1 kg needs 0.9713 times 1.37 N s/m, and a mass of 0.1 kg needs 0.9735 times."""
+    loop = change(LOOP, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.973 * 1.37,))
+    nominal = assess(loop, HERE_ONLY, ranges_samples=0, limiter=False)
+    assert (nominal.ranges.proved, nominal.holds) == (False, False)
+    assert (nominal.guarantee.environments, nominal.guarantee.facts) == (HERE, ())
+
+
 def test_a_sweep_of_limited_forces_is_no_proof():
     """A coefficient of 130 decimals has no exact proof: any-environment, which covers the limiter, is only swept."""
     loop = change(LOOP, theta=(0,), lam=(0,))
