@@ -596,6 +596,7 @@ def assess(
     if loop.varying_delay:
         switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
         switched += (KNOWN_DEVICE, KNOWN_DEVICE_ANY) if loop.known_devices else ()
+        switched += (own,) if own else ()
         requirements |= {each.name: judged(loop.at(network), coupling, each) for each in switched}
     if limiter_proof is None and known and known.limiter:
         limiter_proof = known.limiter

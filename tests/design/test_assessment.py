@@ -22,7 +22,7 @@ from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import BELOW_LIMITS, assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
-from haptic_loop.design.environments import LIMITER
+from haptic_loop.design.environments import LIMITER, ThisEnvironment
 from haptic_loop.design.result import HERE, NotProved
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
@@ -129,6 +129,21 @@ def test_another_environment_keeps_the_switching_delays():
     assessment = assess(switching, HERE_ONLY, environment=LOOP.environment)
     assert (assessment.guarantee.condition, assessment.guarantee.forces) == ("switching", BELOW_LIMITS)
     assert assessment.force_limits.rho is None
+
+
+def test_own_conditions_meet_the_switching_delays():
+    """A condition that names nothing in `covers` is refused, so that its limiter does not count either."""
+
+    class Own(ThisEnvironment):
+        name = "own"
+
+        def lag(self, loop):
+            return (0.0,) * loop.channels
+
+    switching = change(LOOP, varying_delay=DelayRange((2,), (3,)), delta=(1.4 * 1.37,))
+    assessment = assess(switching, HERE_ONLY, condition=Own())
+    assert "varying_delay" in assessment.decisive.reason
+    assert (assessment.holds, assessment.force_limits.rho) == (False, None)
 
 
 def test_a_limiter_of_known_devices_names_them():
