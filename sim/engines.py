@@ -339,10 +339,11 @@ class MujocoEngine:
     """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
 
     def __init__(
-        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
+        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int | None = None, timing: Timing | None = None
     ) -> None:
         import mujoco
 
+        substeps = least_substeps(integrator) if substeps is None else substeps
         self.model = _discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
@@ -441,13 +442,14 @@ class MujocoBatchEngine:
         held_by: Variants,
         T: float,
         integrator: str = "RK4",
-        substeps: int = 4,
+        substeps: int | None = None,
         nthread: int = 0,
         timing: Timing | None = None,
     ) -> None:
         import mujoco
         from mujoco.batch import Batch
 
+        substeps = least_substeps(integrator) if substeps is None else substeps
         model = _discretised(held_by.scene, T, integrator, substeps)
         calls = len(held_by) * substeps * (1 if integrator == EXPONENTIAL else 4)
         self.batch = batch = Batch(model, len(held_by), nthread or int(calls < _CALLS_FOR_THREADS))

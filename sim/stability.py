@@ -21,7 +21,7 @@ from haptic_loop.controller.tick import Process, StepBuffer, at_limit
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant, at_the_latch, hold
 from haptic_loop.models.scene import Scene, Variants, quiet_warnings
-from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off
+from haptic_loop.sim.engines import Engine, MujocoBatchEngine, least_substeps, profiler_off
 from haptic_loop.sim.run import Simulation, beginnings, make_engine, run_blocks
 from haptic_loop.sim.trace import Trace
 
@@ -149,7 +149,7 @@ def mujoco_plants(
     variants: Variants,
     process: Process,
     integrator: str = "RK4",
-    substeps: int = 4,
+    substeps: int | None = None,
     nthread: int = 0,
     late: Sequence[float] | None = None,
 ) -> HeldPlant:
@@ -159,6 +159,7 @@ def mujoco_plants(
     a period is a power of the map of a substep, unless forces latch between substeps.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
+    substeps = least_substeps(integrator) if substeps is None else substeps
     n = variants.states + (m if late else 0)
     timing = Timing(np.array([T]), np.array([late])) if late else None
     once, powers = (substeps, 1) if late else (1, substeps)
