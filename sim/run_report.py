@@ -101,7 +101,8 @@ class RunReport:
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            "transparency": transparency and transparency.reason,
+            # The other reason explains tau, which only JSON has.
+            "transparency": transparency and transparency.relative_mismatch == 0 and transparency.reason,
             "credible": self.credible.reason,
             **{name: part.reason for name, part in certificates.items()},
         }

@@ -218,11 +218,9 @@ def test_own_conditions_state_environments_and_limits():
     needs = requirements_of(PAIR, stiff, own=own)
     assert assess(PAIR, stiff, condition=own).guarantee.any_environment
     assert not needs["any-environment"].certified
-    assert _covered_limits(PAIR, stiff, needs).within((9.0, 9.0)).words.endswith("limited to 9 N, in this environment")
+    assert _covered_limits(PAIR, stiff, needs).less
     assert assess(PAIR, stiff).guarantee.environments == "this environment"
-    assert (
-        _covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
-    )
+    assert not _covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).less
 
 
 @dataclass(frozen=True)

@@ -290,16 +290,14 @@ def test_long_delays_wait_in_the_host(scenario):
 
 
 def test_nothing_uncertified_is_loaded(scenario, rungs):
-    with pytest.raises(
-        SafetyStop, match=r"published is not certified for theta = \[1, 2\]: any-environment needs 7.629"
-    ):
+    with pytest.raises(SafetyStop, match=r"published .* theta = \[1, 2\]: any-environment needs 7.629"):
         certified_coupling(scenario, "I", "published", None, 1)
     with pytest.raises(SafetyStop, match="at most theta = 15"):
         certified_coupling(scenario, "I", None, None, 16)
     session = session_with(scenario)
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: ())
     rehearsal.run_until_armed(0.1)
-    assert (session.stage, session.cause) == (Stage.REFUSED, "the coupling is not certified")
+    assert session.stage == Stage.REFUSED
 
 
 def test_reserves_take_over_after_arming(scenario, rungs):
@@ -367,7 +365,7 @@ def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
     assert [r.link for r in rungs] == [1, 2, 3]
     assert all(r.certified for r in rungs)
     assert_in_reserve(rungs)
-    with pytest.raises(SafetyStop, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
+    with pytest.raises(SafetyStop, match=r"stiff\.json .* theta = \[2, 2\]"):
         certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
 
 
@@ -428,7 +426,9 @@ def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
     session.record = recorder
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
-    assert report.assessment.force_limits.words.startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    limits = report.assessment.force_limits
+    assert limits.proved
+    assert tuple(limits.force_limit) == (0.3, 0.2)
     asked = np.abs(recorder.link()["asked"])
     assert (asked <= (0.3, 0.2)).all()
     assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3
