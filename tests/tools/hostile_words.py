@@ -184,7 +184,7 @@ SILENT = [
     (("design", "--seconds", "9"), "--seconds"),
     (("design", "--high-gain", "2"), "--high-gain"),
     (("design", "--coupling", "ccl", "--limiter"), "limiter"),
-    (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
+    (("design", "--varying-delay", "1-2,0-3", "--coupling", "moving-average"), "varying-delay"),
     (("design", "--coupling", "ccl", "--order", "99"), "--order"),
     (("export", "c.json", "--without-theta"), "--without-theta"),
     (("audit", "--K", "1,2"), "--K"),
@@ -250,7 +250,7 @@ REFUSED = {
     "validate": """--links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
     "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%%
-        --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
+        --coupling moving-average --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
         --compare | --objective sup | --order 0 --coupling ccl
         --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --coupling optimal
         --band 1,0 --coupling optimal | --best""",
