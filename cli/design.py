@@ -83,7 +83,7 @@ def _parser() -> options.Parser:
     varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
-        "fail unless this-environment (optimal: or known-device) is proved for limited forces, too "
+        "fail unless the proof covers limited forces, too; for this-environment, and for known-device if optimal "
         "(default: only a spring-damper tries this proof)"
     )
     one_of = parser.add_mutually_exclusive_group()
@@ -101,7 +101,7 @@ def _add_optimal_options(parser: options.Parser, title: str) -> None:
     group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     parser.add_band(to=group)
-    gain = "limit of |F|/|E| above 100 Hz (default none: the design only reduces the force there)"
+    gain = "limit of |F|/|E| above 100 Hz (default: no limit; the design only penalises the force there)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
     limit = "stop enlarging the basis and searching the ranges after about S seconds (default: no time limit)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
@@ -116,7 +116,10 @@ def _percent(text: str) -> float:
 
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """Return the loop with --ranges and --varying-delay; set args.condition to its default. Raises InputError."""
+    """Return the loop with --ranges and --varying-delay; a missing args.condition becomes the usual one.
+
+    Raises InputError.
+    """
     from haptic_loop.design.audit import LONGEST_DELAY
 
     loop = scenario.loop(args.case)
@@ -153,8 +156,9 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Design and prove. Raises InputError for contradictory options, DesignFailed if no coupling was found.
+    """Design a coupling and prove its condition.
 
+    Raises InputError for contradictory options, DesignFailed if no coupling was found.
     The second part of the result is the decay after a knock, or None without --decay.
     """
     from haptic_loop.design.api import proved

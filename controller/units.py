@@ -1,7 +1,7 @@
 """The unit of positions: m, or rad for rotary devices, with N m, N m s/rad and kg m2 in place of N, N s/m and kg.
 
-The equations are the same for both. The program's texts use metres. `in_unit` converts a text to radians before it is
-printed, drawn, or written to a file's header or keys.
+The equations are the same for both. The program's texts use metres. `in_unit` replaces the units in a text by
+rotary ones before the text is printed, drawn, or written to a file's header or keys; numbers stay the same.
 """
 
 from __future__ import annotations

@@ -1,21 +1,21 @@
 """The matrix D of the dual problem in design.bound, with a lower bound of its eigenvalues on the whole circle.
 
 D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0, with the H and C_k of design.bound, is scaled by
-root(delta) from both sides. H is piecewise linear; at each bend x_i its slope changes by 2 pi c_i. With H_0 = mean and
-a = 1/z - 1 this gives
+root(delta) from both sides. H is piecewise linear; at each bend x_i its slope changes by 2 pi c_i. H_0 is the mean of
+H over the circle (`mean`). With a = 1/z - 1 this gives
 
     (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
 
 In an interval of length l without a bend inside, the error of linear interpolation is at most
-- l^2/8 max |f^(2)| for any f;
+- l^2/8 max |f^(2)| for any f, with the second derivative f^(2);
 - l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), where d is the distance of the interval from 0 modulo 2 pi. Proof:
   Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2 with |cot(x/2)|/2 <= 1/|x|. The bound 1/|x| is the second derivative of
   x log x, whose interpolation error is largest on [0, l], where it is l/e;
 - l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with derivatives in the middle, for the sum over far bends, whose
   terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
-- |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g. The last two terms are the error of a times the
-  interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times its slope,
-  with |a^(1)| = |a^(2)| = 1.
+- |a| (error of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for the product a g. The last two terms are the error of
+  a times the interpolant of g. The second derivative of this product is a^(2) times the interpolant plus 2 a^(1) times
+  its slope, with |a^(1)| = |a^(2)| = 1.
 On the line between two Hermitian matrices, no matrix has an eigenvalue below the smaller of their least eigenvalues.
 The least eigenvalue of D in the interval is therefore at least the smaller of those at its ends, less the Frobenius
 norm of the errors above and of rounding.
@@ -70,8 +70,9 @@ class DualMatrix:
     def lower(self, swept: Array, wanted: float) -> tuple[float, Array, Array]:
         """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
-        The intervals between the frequencies `swept` and the bends are halved until each has a bound above -wanted, or
-        a bound near the eigenvalues at its ends. The search also ends after _MOST evaluations of bends.
+        The intervals between the frequencies `swept` and the bends are halved until each has a bound above -`wanted`,
+        or an error that is small beside the eigenvalues at its ends. The search also ends
+        after _MOST evaluations of bends.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
         budget = _MOST // self.points.size - w.size

@@ -73,7 +73,7 @@ def one_line(text: object) -> str:
 
 
 def counted(path: str) -> str:
-    """Return the path of a value with list entries counted from 1: human[0].mass becomes human #1.mass."""
+    """Return the dotted name of a field with list entries counted from 1: human[0].mass becomes human #1.mass."""
     return re.sub(r"\[(\d+)\]", lambda match: f" #{int(match[1]) + 1}", path)
 
 

@@ -1,8 +1,8 @@
 """The four calls to a device that a session needs. `Driver` in hw/driver.py makes them.
 
 There are three implementations: a device at a serial port (docs/protocol.md), several of them (hw/boards.py), and
-devices that the host clocks (hw/force_dimension.py). Calls wait for at most 0.5 ms or a tick, because keys, signals and
-time-outs are handled between two calls.
+devices that the host clocks (hw/force_dimension.py). A call waits for at most 0.5 ms, or a tick, because keys, signals
+and time-outs are handled between two calls.
 """
 
 from __future__ import annotations
@@ -86,7 +86,10 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send CONFIG, and repeat it while the device ramps. Raises SafetyStop if it drives for more than 50 ms."""
+        """Send CONFIG every 0.1 s until the device acknowledges or refuses it.
+
+        Raises SafetyStop if the device still drives 50 ms after the first CONFIG.
+        """
         answer = self._answer(config)
         if (
             not isinstance(answer, wire.Ack)

@@ -27,7 +27,7 @@ class HeldPlant:
     """
 
     A: _Array  # (..., states, states)
-    B: _Array  # (..., states, outside + m)
+    B: _Array  # (..., states, external forces + m)
     C: _Array  # (m, states)
     T: float  # [s]
 

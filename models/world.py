@@ -121,7 +121,7 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 digest of the names and contents of all files of a scene, without their folders.
 
-    Raises ValueError if a file cannot be read or is no XML.
+    Raises ValueError if a file cannot be read or is not XML.
     """
     total = hashlib.sha256()
     for file in files_of(path):
@@ -136,7 +136,7 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of the children of the world, in file order, that have no joint and are no mocap bodies.
+    """Return the names of the children of the world, in file order, that have no joint and are not mocap bodies.
 
     Those that are not welded may be contacts. Raises ValueError for a file that cannot be read or that MuJoCo refuses.
     """
@@ -148,7 +148,7 @@ def touchable_bodies(path: Path) -> list[str]:
 
 
 class World:
-    """A scene with slides and springs at its contacts, compiled with the settings that the port needs.
+    """A scene with slides and springs at its contacts, compiled with the settings that `WorldPort` needs.
 
     One world serves any number of ports (simulations), one after the other on one thread.
     """
@@ -169,7 +169,7 @@ class World:
             contacts: One contact per device.
             stiffness: G of each device, (axes, axes), symmetric and positive definite [N/m].
             T: The period of the loop [s].
-            every: The number of ticks per step of the scene, so that a step lasts every * T.
+            every: The number of ticks per step of the scene, so that a step lasts `every` * T seconds.
             gravity: False switches the scene's gravity off.
 
         Raises:
@@ -369,7 +369,10 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
 
 
 def _principal(G: Array, contact: Contact) -> tuple[Array, Array]:
-    """Return stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag Q'. Raises ValueError."""
+    """Return stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag(stiffnesses) Q'.
+
+    Raises ValueError.
+    """
     axes = len(contact.along)
     if G.shape != (axes, axes):
         raise ValueError(f"contact {contact.body!r} has {axes} directions, its spring is {G.shape[0]} x {G.shape[1]}")
@@ -416,7 +419,7 @@ def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, t
 
 
 def _fixed_to(body: Any) -> Iterator[Any]:
-    """Return the body and its children without joints, which move with it."""
+    """Return the body and all its descendants that are fixed to it without joints."""
     yield body
     for child in body.bodies:
         if not child.joints:
@@ -558,7 +561,7 @@ class WorldPort:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Repeat the step, up to _MOST_REPETITIONS times, until the same contacts are limited by the same forces.
+        """Repeat the step, up to _MOST_REPETITIONS times, until the same forces limit the same contacts twice.
 
         On a limited contact the limited force acts instead of the spring.
         """
@@ -603,7 +606,7 @@ class WorldPort:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return an upper bound [J] on the energy that constraints created in the last step: positive excesses."""
+        """Return an upper bound [J] on the energy that constraints created in the last step: all positive excesses."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 

@@ -44,11 +44,13 @@ _APART = 1e-12  # entries of D_V, the direct part of a coupling, below this rela
 class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
-    given_J: float  # largest energy given to hands and devices, beyond the dissipation of the devices' damping
+    given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
     port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
-    created_J: float  # upper bound on the energy that contacts created, by the lemma in docs/theory.md, MuJoCo worlds
-    unsettled_ticks: int  # ticks in which the limited channels still changed after the last repetition of the step
+    created_J: (
+        float  # upper bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
+    )
+    unsettled_ticks: int  # steps of the scene in which limited forces still changed after the last repetition
     warnings: list[str]  # the texts of MuJoCo's warnings
 
 
@@ -208,7 +210,7 @@ class Touched:
 
 
 def live(simulation: Simulation) -> Simulation:
-    """Return the loop with its world, for any number of ticks; the net delays the forces."""
+    """Return the simulation with its world as a net, which also delays the forces, for any number of ticks."""
     touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:
@@ -242,7 +244,7 @@ class InWorld:
     """A world, its shell, and the energy that hands and devices received."""
 
     def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
-        """`damping` (m, m) [N/m]: Delta/T, so that devices dissipate dx' Delta dx/T in a period."""
+        """`damping` (m, m) [N/m] is Delta over the longest period: devices dissipate dx' damping dx a tick or more."""
         self.ports, self._shell, self._damping = ports, shell, damping
         m, nsim = len(damping), len(ports)
         self._x: Array | None = None
@@ -288,13 +290,13 @@ class InWorld:
 RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the initial speeds of all bodies of devices and hands
 _NEVER = 1e3  # [J] W0 so large that the shell never acts
-_ADVERSARIES = 20  # sets of hands that are thrown with a shell that never acts
+_ADVERSARIES = 20  # sets of hands that start with random speeds and a shell that never acts
 _STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
 
 
 @dataclass(frozen=True)
 class HandsInWorld:
-    """The energy that one set of hands received after it was thrown at a world."""
+    """The energy that one set of hands received in a world after a start with random speeds."""
 
     kind: str
     number: int
@@ -372,7 +374,10 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
 
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int) -> dict[str, float]:
-    """Return per adversary the least energy [J] at a port whose shell never acts; 0 if the scene gave no energy."""
+    """Return for each adversary the least energy [J] that entered the port, without a shell or with an idle one.
+
+    It is negative if the scene gave energy, else 0.
+    """
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, _ADVERSARIES, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):

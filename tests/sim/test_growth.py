@@ -1,4 +1,4 @@
-"""Displacements alone give known growth rates; voluntary motion and encoder steps are no oscillations."""
+"""Rates measured from displacements equal known ones; voluntary motion and encoder steps count as no oscillation."""
 
 import json
 
@@ -31,7 +31,7 @@ def motion(seconds, *modes):
     ("frequency", "rate"), [(f, g) for f in (6.2, 84.0) for g in (-3.0, -0.5, 0.4, 1.5)] + [(84.0, 6.0)]
 )
 def test_a_known_rate_comes_back(frequency, rate):
-    """Rates are right to four standard errors plus 0.02 1/s for the voluntary motion in the slowest octave."""
+    """The error is at most four standard errors, plus 0.02 1/s by voluntary motion in the slowest octave."""
     found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
     assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
     assert found.error_per_s < 0.2
@@ -56,7 +56,7 @@ def test_a_person_and_an_encoder_are_no_oscillation():
 
 
 def test_brief_flicker_below_the_named_size_is_nothing():
-    """A decaying 5 Hz mode has 0.6 um in the first window: above its octave's floor, but below 1.1 um."""
+    """A decaying 5 Hz mode of 0.6 um exceeds the rounding floor of its octave, but not the 1.1 um of the message."""
     found = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
     assert found.reason == "nothing oscillates above 1.1 um"
 
@@ -80,8 +80,8 @@ def test_a_limit_cycle_neither_grows_nor_decays():
     assert found.amplitude_m == pytest.approx(2e-3 * np.hypot(1, 0.5), rel=0.01)  # both channels together
 
 
-def test_the_exact_engines_growth_without_its_states():
-    """Without coupling, while people move, the rate is the eigenvalue's within 1e-3 1/s."""
+def test_displacements_give_the_exact_engines_growth():
+    """The rate measured without coupling, while people move, equals the eigenvalue's within 1e-3 1/s."""
     simulation = assemble(load().replace(duration=6.0), NoCoupling())
     exact = dominant_mode(close(simulation.plant, simulation.F)).growth
     record = run(simulation, "exact")
@@ -141,7 +141,7 @@ def test_a_trace_that_says_nonsense_is_bad_input(run_part, words):
         growths(made(motion(0.6), {"run": run_part}))
 
 
-def test_a_trace_that_names_no_stretch_is_one():
+def test_a_trace_without_steady_ticks_is_one_part():
     (found,) = growths(made(motion(4.0, (2e-3, 84.0, 1.0)), {"run": None}))
     assert found.growth_rate_per_s == pytest.approx(1.0, abs=1e-2)
 
@@ -151,7 +151,7 @@ def test_parts_keep_the_ticks_of_their_trace():
     assert (found.first, found.stop) == (1800, 3300)  # the second half of the part
 
 
-def test_an_empty_trace_or_none_is_one_line(tmp_path):
+def test_unusable_traces_and_plot_paths_are_refused(tmp_path):
     made(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="has no ticks"):
         trace.main([str(tmp_path / "empty.npz")])
@@ -170,7 +170,7 @@ def alike():
     """Return two equal devices and hands with equal motions, joined so stiffly that a mode between them grows.
 
     A BLAS kernel may add the two halves of a row in different orders. A tick then excites the mode by one rounding,
-    2e-16 of the state. The mode grows by 33/s: the sum over 0.35 s is 6e-10, below the 1e-8 that counts as excited.
+    2e-16 of the state. The mode grows by 33/s: all roundings of 0.35 s add up to 6e-10; 1e-8 counts as excited.
     """
     one = load("omega-pair")
     link = {"between": ["contact 1", "contact 2"], "stiffness": 2000.0}
