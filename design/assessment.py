@@ -155,7 +155,7 @@ class SearchFigures:
     worst: str
     violated: bool
     ended_early: bool
-    ended_by_clock: bool  # by the user's time limit
+    ended_by_clock: bool  # whether the user's time limit (--seconds) ended the search
     how: str = SEARCH
 
     @classmethod

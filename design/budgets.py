@@ -70,9 +70,9 @@ FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
 #: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Numbers of points between the vertices of ranges: on all edges, unless the least number on each edge gives more, as
-#: for six parameters; least and most on one edge; on faces and inside; and starts of compass searches. Up to five
-#: parameters they take about the 500 sweeps of RANGES.
+#: Points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, but on one edge at
+#: least RANGE_ALONG[0] (with six parameters these are more) and at most RANGE_ALONG[1]; RANGE_DRAWN on faces and
+#: inside. RANGE_STARTS compass searches follow. Up to five parameters all of these take about the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the

@@ -333,7 +333,8 @@ class Condition(ABC):
     def fact_names(self, loop: Loop) -> tuple[str, ...]:
         """Return the names of `FACTS` that a certificate of this loop lists."""
         walls, limited = loop.environment.walls, self.parameters(loop)
-        present = loop.latency, walls, limited, loop.varying_delay, loop.ranges
+        ranges = loop.ranges and self.guarantee(loop) != "this environment"
+        present = loop.latency, walls, limited, loop.varying_delay, ranges
         return tuple(name for name, is_there in zip(FACTS, present, strict=True) if is_there)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:

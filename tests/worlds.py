@@ -115,7 +115,9 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
 
 
 def contact_by_hand(z, T, mass=0.0, stiffness=0.0, damping=0.0, coupling=None):
-    """Return F, J, H and Y (k,) of a tip with this mass, spring and damper to ground, behind a spring-damper.
+    """Return F, J, H and Y (k,) of a tip that a spring-damper coupling holds.
+
+    The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
 
     They map a device's displacement and a wall's force at the tip to the sent force and the tip's displacement.
     """

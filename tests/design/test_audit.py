@@ -38,7 +38,7 @@ def pair(coupling, **changes) -> tuple[Loop, Coupling]:
 
 
 def report(*subject):
-    """Return the audit as plain JSON values."""
+    """Return the audit as its JSON file stores it: dictionaries, lists, numbers and texts."""
     return plain(audit(*subject))
 
 

@@ -30,7 +30,8 @@ from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.result import NotProved, from_ratio
+from haptic_loop.design.result import HERE, NotProved, from_ratio
+from haptic_loop.design.robustness import ranges_around
 from haptic_loop.sim.scenario import load as scenario
 from tests.checks.random_loops import proofs
 
@@ -538,3 +539,13 @@ def test_no_condition_certifies_at_equality(condition, theta, room, certified):
     need = required_damping(loop, SOFT, condition).required
     edge = msgspec.structs.replace(loop, delta=tuple(each * (1 + room) for each in need))
     assert required_damping(edge, SOFT, condition).certified is certified
+
+
+def test_certificates_of_one_object_list_no_ranges():
+    """With psi = 1 Theorem 4 holds for the object in its Phi, here the nominal one."""
+    pair, coupling = scenario().loop("I"), SpringDamper([2800.0, 1700.0], [1.6, 2.2])
+    ranges = ranges_around(pair.environment, 10.0)
+    loop = msgspec.structs.replace(pair, psi=(1, 1), delta=(5.0, 5.0), ranges=ranges)
+    certificate = prove(loop, coupling, "any-environment")
+    assert (certificate.guarantee, certificate.facts) == (HERE, ())
+    assert verify(Stored.of(loop, coupling, certificate)).proved

@@ -378,7 +378,7 @@ MULTIPLIERS = {"a": (2000.0,), "a + c": (900.0,), "d": (700.0,), "m": (0.3,), "a
 
 
 def work(first, second):
-    """Return Re(first* second)."""
+    """Return the real part of the inner product of two complex vectors."""
     return np.vdot(first, second).real
 
 

@@ -154,7 +154,10 @@ def test_the_gain_set_is_exact(theta, sigma, most_stored):
 @pytest.mark.parametrize("phi", [0.0, 0.3])
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_the_gain_set_equals_its_block(theta, phi):
-    """k/2 + b - |c|^2 is |W|^2 times the block of any-environment for V = 1/W without its multiplier's row (Schur)."""
+    """k/2 + b - |c|^2, which the search keeps positive, is |W|^2 times the block of any-environment for V = 1/W.
+
+    With phi > 0 it is that times the Schur complement of the row of the multiplier phi.
+    """
     loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
     unit = msgspec.structs.replace(unit, delta=(1.0,))
@@ -238,7 +241,7 @@ def test_failed_searches_claim_no_impossibility():
 
 @pytest.mark.validate
 def test_proposed_changes_hold_when_made():
-    """Each proposal passes the sweep when designed. The best comes first, and none repeats the request."""
+    """Each proposed design is certified by a sweep. The least error comes first, and none is the failed request."""
     loop = asked((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
     proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)

@@ -88,7 +88,7 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
 
 
 def test_any_environment_designs_take_varying_delays(tmp_path):
-    """Gains are searched for constant delays, with less damping until the loop that switches is certified."""
+    """The search assumes constant delays. It is repeated with less damping until switching delays are certified."""
     with pytest.raises(ValueError, match="this-environment only"):
         design(load().loop("I").switching(DelayRange(*RANGE)), "any-environment")
     main(["--condition", "any-environment", "--varying-delay", "1,2", "--out", str(tmp_path / "c.json")])

@@ -438,7 +438,7 @@ def test_answers_that_overtake_each_other_are_timed(scenario):
 
 
 def test_ages_while_forces_act_count_skipped_answers(scenario):
-    """A burst every 4 ms brings four answers, of which a STATE reports the youngest only."""
+    """Every 4 ms four answers arrive together; the next STATE reports only the age of the youngest."""
     scenario, faults = scenario.replace(T=1e-3), (FaultInjection.parse("burst=0.004"),)
     session, recorder = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), Recorder(2)
     session.record = recorder

@@ -61,7 +61,7 @@ def test_numpy_alone_finds_the_published_requirements(every):
 
 @pytest.mark.parametrize("name", ["o01-wall-light-device", "o02-soft-wall"])
 def test_growth_without_coupling_is_that_of_the_body(name):
-    """Device and hand are one body on a spring-damper, discretised by the matrix exponential."""
+    """Device and hand are one body on a spring and a damper. The matrix exponential gives its motion in a tick."""
     loop = tomllib.loads((ROOT / "loops" / f"{name}.toml").read_text())
     T, (theta,), (device,), (human,) = loop["T"], loop["theta"], loop["device"], loop["human"]
     (link,), (spring,) = human["links"], loop["environment"]["springs"]
