@@ -395,7 +395,6 @@ class _Report:
 
 #: rows that are left out of long tables, the least important first
 _LESS = (
-    "channels",
     "problems solved",
     "damping, any switching",
     "ranges, inside",

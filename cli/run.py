@@ -218,7 +218,6 @@ def _title(what: str, report: RunReport) -> str:
 
 #: rows that are left out of long tables, the least important first
 _LESS = (
-    "channels",
     "damping, any switching",
     "slowest mode",
     "ranges, inside",
@@ -229,6 +228,7 @@ _LESS = (
     "ticks",
     "worst switching found",
     "ranges, between",
+    "varying delay",
 )
 
 
