@@ -14,11 +14,11 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # largest number of steps of RK4 at its default substeps; they take a minute or two
+_MOST_STEPS = 3_000_000  # most steps of a run with RK4 at its default substeps; 3 million take a minute or two
 _LEGEND = (
-    "position: relative rms error; growth: the larger error of the growth rates with and without the coupling [1/s]",
+    "position: relative rms error; growth: error of the growth rate [1/s], the larger of with and without coupling",
     "cycle: standard deviation [N] and frequency [Hz] of the limit cycle without coupling, if there is one",
-    "real: simulated seconds per second; *: right verdict, on the Pareto front of this engine's speed and errors",
+    "real: simulated seconds per second; *: right, and no setting of the same engine beats its speed and both errors",
 )
 
 
@@ -36,7 +36,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Measure every engine. Return 0 if the defaults judge stability correctly, 1 if not, 130 if interrupted."""
+    """Measure every engine. Return 0 if the default settings judge stability rightly, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.accuracy")
@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(right: bool, rows: Sequence[Row]) -> str:
-    """Return whether the default settings judge stability correctly, and the errors of the exponential integrator."""
+    """Say whether the default settings judge stability correctly, with the errors of the exponential integrator."""
     words = "The defaults judge stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
     for row in rows:
         if (row.integrator, row.substeps) == (EXPONENTIAL, 1):

@@ -45,7 +45,7 @@ class _Report:
     case: str
     scenario: str | None
     device: _CatalogueDevice | None
-    gains: str | None  # the source of a device's gains
+    gains: str | None  # source of the listed device's gains; None if they are not used
     audit: Audit = off_table("inlined")
     encoder: EncoderSteps | None = off_table()
     notes: tuple[str, ...] = off_table()
@@ -147,9 +147,9 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """Return the options, completed by the catalogue's numbers. Raises InputError.
+    """Return the options, completed by the numbers that the catalogue has for --device. Raises InputError.
 
-    `source` is the source of the catalogue's gains, or None if they are not used.
+    With --device, `source` is added: the source of the catalogue's gains, or None if they are not used.
     """
     if not args.device:
         return args
@@ -175,7 +175,7 @@ _UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, 
 
 
 def _list_devices(args: argparse.Namespace) -> int:
-    """Print the catalogue."""
+    """Print the catalogue of devices, with a source for every number."""
     parts: dict[str, dict[str, Any]] = render.plain(CATALOGUE)
     facts = [fact for part in parts.values() for fact in part.values() if isinstance(fact, dict)]
     numbered = {source: i for i, source in enumerate(dict.fromkeys(fact["source"] for fact in facts), start=1)}
@@ -253,7 +253,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """Return the range of --varying-delay, or else the scenario's. Raises InputError if the former excludes theta."""
+    """Return the range of --varying-delay, else the loop's or None. Raises InputError if the option excludes theta."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:
@@ -288,7 +288,7 @@ def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:
-        if result.assessment.requirements[condition].certified:  # This wall is certified, and perhaps stiffer ones.
+        if result.assessment.requirements[condition].certified:  # The audited K is certified itself.
             return f"The stiffest wall with {damper} was not found: {margin.reason}."
         return f"No wall with {damper} was found to be certified: {margin.reason}."
     return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."

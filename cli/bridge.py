@@ -1,6 +1,6 @@
 """python -m hw.bridge: drive a device with a coupling that is certified for the measured delay.
 
-port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out -> trace and report
+Steps of a session: port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out -> trace and report
 """
 
 from __future__ import annotations
@@ -39,16 +39,17 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
-    # A device without a clock applies forces at once.
+    # A device without a clock applies each force on arrival.
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
-        args.energy_budget = None  # A world has one energy account instead, with W0 from `world_start`.
+        args.energy_budget = None  # A world has its energy account instead, which begins with `start` [J].
     behind = session_cli.boards_behind(args, scenario)
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # Emulated handles are held.
+    # In a rehearsal the scenario's hands hold the handles.
+    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)
     session = session_for(scenario, settings, **limits)
     below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
     scenario = session.scenario
@@ -163,7 +164,7 @@ def _print_certificate(
 
 
 def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
-    """Return the row of a coupling with the first condition that certifies it."""
+    """Return the table row of a coupling, with the damping needed by the first condition that certifies it."""
     assessment = program.assessment
     gains, requirements = assessment.gains, (assessment.decisive, *assessment.requirements.values())
     certified = next(need for need in requirements if need.certified)
@@ -198,7 +199,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """Bound the power [W] that a hand may receive in a tick longer than certified: sum f^2/(4 delta)."""
+    """Bound the power [W] that a hand receives in an overlong tick: sum f^2/(4 delta), at the force caps f [N]."""
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 

@@ -1,6 +1,6 @@
 """python -m design.check coupling.json: prove a stored coupling again, from the file alone.
 
-The stored certificate needs no solver. For another --condition, multipliers may be searched.
+No solver runs for the stored certificate. For another --condition, multipliers may be searched.
 """
 
 from __future__ import annotations

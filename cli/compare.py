@@ -34,7 +34,7 @@ _MOST = 6  # curves that can be told apart in one panel
 def main(argv: list[str]) -> int:
     """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed.
 
-    Ctrl-C ends the command without a report, because a table that lacks couplings may name a wrong best one.
+    Ctrl-C ends the command without a report, because the best coupling of an incomplete table may not be the best.
     """
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
@@ -51,7 +51,7 @@ def _parser() -> options.Parser:
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("condition of names without :CONDITION (default: the coupling's); FILE.py:NAME judges all")
+    parser.add_condition("for names without :CONDITION (default: the coupling's); one of your own judges all couplings")
     parser.add_output(picture=True)
     parser.only("with --coupling: the runs of every coupling use no seed", lambda args: args.coupling, "seed")
     return parser
@@ -86,7 +86,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return the verdict: of the guaranteed couplings the one with the least force error, then the best stiffness."""
+    """Name the guaranteed coupling of least force error; of equal ones, that with the static stiffness nearest E's."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -182,7 +182,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, Chosen], list[str]]:
-    """Return the couplings by name, and why designs failed. Raises DesignFailed if all failed."""
+    """Return the couplings by name, and one line per failed design. Raises DesignFailed if all failed."""
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
     for name in names:
@@ -212,7 +212,7 @@ def _named(name: str) -> tuple[str, str | Condition | None]:
 
 
 def _guarantees(report: Comparison) -> render.Table:
-    """Return the table of required damping [N s/m], or of its share if the devices' dampings differ."""
+    """Return the table of required damping [N s/m], or of required over available if the devices' dampings differ."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
@@ -251,13 +251,13 @@ def _binds(part: ConditionCurve) -> str:
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:
-    """Return the worst device's figure, green if it is certified."""
+    """Return the damping that the worst device needs: `scale` times required over available; green if certified."""
     need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
     return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return the damping, or with scale 1 its share, that the worst stiffness or mass within ten percent requires."""
+    """Return the damping, `scale` times required over available, for the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
@@ -269,7 +269,7 @@ def _feel(report: Comparison) -> render.Table:
     named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}
 
     def at(hz: float, curves: Array) -> list[float]:
-        """Return each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+        """Return the value of each channel's curve at `hz`, a point of the grid; nan above Nyquist's frequency."""
         return [float(np.interp(hz, report.frequency_hz, column, right=np.nan)) for column in curves.T]
 
     rows = [[name, *(_list(at(hz, getattr(felt, what))) for what, _, hz in columns)] for name, felt in named.items()]

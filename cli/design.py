@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    slow = args.coupling == "optimal"  # The bound of an optimal coupling takes seconds.
+    slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before.
     if slow:
         render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
@@ -156,10 +156,9 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Design a coupling and prove its condition.
+    """Return a design with its proof, and the decay after a knock (None without --decay).
 
     Raises InputError for contradictory options, DesignFailed if no coupling was found.
-    The second part of the result is the decay after a knock, or None without --decay.
     """
     from haptic_loop.design.api import proved
 
@@ -176,16 +175,17 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
         return proved(loop, design), decay
 
 
-#: shares of the damping in the search for a damping ratio, and the number of bisections between two of them
+#: shares of the devices' damping for which --decay designs, and the number of bisections between two shares
 _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 
 
 def _that_decays(
     scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
-    """Design for less and less damping, which gives softer couplings, until every mode has at least this damping ratio.
+    """Design for less and less damping, which gives softer couplings, until every mode has at least damping `ratio`.
 
-    A coupling certified for less damping is also certified for the available damping. Raises DesignFailed.
+    A coupling certified for less damping is also certified for the devices' damping. Raises DesignFailed if the ratio
+    is not reached.
     """
     from haptic_loop.sim.run import assemble
     from haptic_loop.sim.stability import ringing
@@ -248,7 +248,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 def _bound_and_robustness(
     args: argparse.Namespace, loop: Loop, design: Design, file: str
 ) -> tuple[BoundBeside | None, Robustness | None, bool]:
-    """Return the bound of an optimal coupling, the robustness, and whether Ctrl-C skipped one of them."""
+    """Return a bound on the error of optimal couplings, the robustness, and whether Ctrl-C skipped one of them."""
     from haptic_loop.design.bound import BoundBeside
     from haptic_loop.design.optimal import Optimal
 
@@ -306,7 +306,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # convex designs may be softer still
+        searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # softer springs are not from this search
         yield "", f"{SOFTEST:g} N/m is the softest that the search tries" if searched else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
@@ -324,7 +324,7 @@ _OBJECTIVE_WORDS = {
     "loop-norm": "the least norm of W1 L W2, (23) of the paper",
     "rms": "the least rms transparency error, a ratio",
     "sup": "the least peak transparency error, a ratio",
-    "stiffness": "the most stiffness, of all channels together [N/m]",
+    "stiffness": "the largest sum of the channels' stiffnesses [N/m]",
 }
 
 
@@ -404,7 +404,7 @@ _LESS = (
 
 
 def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], list[str]]:
-    """Return the tables, and a line that names the rows left out of the first, if any."""
+    """Return the tables, and a line that names the rows left out of the first table, if any."""
     title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
     rows, left_out = render.shortened(rows, _LESS)

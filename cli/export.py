@@ -65,7 +65,7 @@ class _Exported:
 
 
 def main(argv: list[str]) -> int:
-    """Export a stored coupling. Return 0, or 1 if the certificate in its file does not hold."""
+    """Export a stored coupling. Return 1 if its file has a certificate that does not hold, else 0."""
     args = _parser().parse_args(argv)
     stored = read_coupling(args.coupling)
     speak(stored.loop.unit)
@@ -157,7 +157,7 @@ def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ..
 
 
 def _error(block: ExportedBlock) -> str:
-    """Return one line on the error of single precision in 4096 random ticks."""
+    """Return one line on how far single precision differs from double in 4096 random ticks."""
     error, largest = single_precision_error(block)
     unit = "N" if block.output.letter == "f" else "m"
     return (

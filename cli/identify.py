@@ -1,9 +1,9 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
-By default two sittings (sessions) are recorded; with --port, the handles are at another place in the second. Nobody may
-hold them; if a hand damps a handle in one sitting, the other reveals it. The excitation is played in a bridge session
-with limits of force and speed; the force cap is the excitation's largest force. With --transmission two sittings with
-clamped handles follow, for bounds of motor mass and transmission (hw/transmission.py; known-device conditions).
+By default two sittings (sessions) are recorded; with --port, the user moves the handles between them. Nobody may hold a
+handle; if a hand damps a handle in one sitting, the other reveals it. Each sitting plays the excitation in a session
+like that of hw.bridge; its force cap is the excitation's largest force. With --transmission two sittings with clamped
+handles follow, for bounds of motor mass and transmission (hw/transmission.py), which the known-device conditions need.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
 from haptic_loop.models.device import Device, RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
 
-# Shares of the force in the sittings with clamped handles; a difference between these sittings shows backlash.
+# Shares of --force in the two sittings with clamped handles; a difference between these sittings shows backlash.
 _LEVELS = 1.0, 0.5
 _CLAMPED = 1000.0  # [kg] mass that clamps the handle of an emulated device
 
@@ -76,7 +76,7 @@ class _Report:
     warnings: list[str] = off_table()
     reason: str | None = off_table("if given")
     transmissions: list[TransmissionBounds] | None = off_table("if given", None)  # one per axis, with --transmission
-    no_transmissions: str | None = off_table("if given", None)  # why --transmission gave none
+    no_transmissions: str | None = off_table("if given", None)  # why --transmission gave no bounds
 
     @property
     def verdict(self) -> str:
@@ -177,10 +177,10 @@ def _sitting(
 ) -> _Sitting:
     """Play the excitation to every axis, record the motion and estimate.
 
-    With `clamped` the excitation is a chirp at this share of the force, and the function estimates nothing.
+    `clamped` is for a sitting with clamped handles: a chirp at this share of --force is recorded, nothing is estimated.
     """
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
-    r = scenario.lever  # the options state figures at the hand
+    r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise: the options are figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # This limit stops a device that is lighter than declared.
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
@@ -201,7 +201,8 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
-    seconds = played(1).seconds - 0.2  # The gain rises in the 0.3 s of zero force at the beginning.
+    # `hold_session` counts time at full gain; the gain rises while the excitation begins with 0.3 s of zero force.
+    seconds = played(1).seconds - 0.2
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
@@ -257,7 +258,8 @@ def _with_transmissions(
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
     """Return a device's [[device]] table for a scenario, with declared stiffness unless all axes identified it.
 
-    `axes` and `bounds` have one entry per free axis. Masses and transmission are means over the axes, bounds the worst.
+    `axes` and `bounds` have one entry per free axis. Masses and the transmission are means over the axes; each bound is
+    the worst of the axes.
     """
 
     def listed(figures: Sequence[str]) -> str:
@@ -323,7 +325,7 @@ def _figures(report: _Report) -> render.Table:
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{getattr(friction, name):.5g} ± {2 * friction.errors[name]:.2g}" for name in names]
-        bound = _floored(axis.delta, 4) if report.bounded else "-"  # never above the bound
+        bound = _floored(axis.delta, 4) if report.bounded else "-"
         cells.append((str(i), *figures, mode, bound, f"{math.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
     heads = (
         *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),

@@ -133,8 +133,8 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         nobody_reads()
     except OSError as error:
         code = _cannot(error)
-    # If Ctrl-C ended a call of exec(), such as that of dataclass, Python would end by sending itself SIGINT. A later
-    # call makes it forget that.
+    # If Ctrl-C ended a call of exec(), such as that of dataclass, Python would end by sending itself SIGINT. The empty
+    # call below makes Python forget that interrupt.
     exec("")
     sys.exit(code)
 

@@ -150,7 +150,7 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
         longest = (
-            "longest period [s], if periods vary: certificates then cover all up to this one (known-device: from T_min)"
+            "longest period [s], if periods vary: certificates cover all periods up to it (known-device: from T_min on)"
         )
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
         known = (
@@ -188,11 +188,11 @@ class Parser(argparse.ArgumentParser):
         """Add --rigid, a rigid wall in place of the environment."""
         wall = "a rigid wall in place of the environment; one channel, the scenario's first"
         self.add_argument("--rigid", action="store_true", help=wall)
-        replaced = "without --rigid: its wall replaces the environment and its reference"
+        replaced = "without --rigid, whose wall replaces the environment and the reference"
         self.only(replaced, lambda args: not args.rigid, "environment", "lam")
 
     def add_human(self, more: str = "") -> None:
-        """Add --human."""
+        """Add --human; `more` names what else than a list of hands a .py may hold."""
         who = f"other humans: one [[human]] per device in a .toml, or a list of hands{more or ' in a .py'}"
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 

@@ -4,8 +4,8 @@
     ..                                               # This process computes at the same time.
     painter.draw(path, "draw_run", signals, title)   # writes the figure of plots.draw_run(signals, title)
 
-The second process sends the picture back, and writes no file. It ends when this one ends, because its standard input is
-closed then. If it cannot be started, or ends without a picture, this process draws.
+The second process sends the picture back and writes no file. It ends when the first process ends, because its standard
+input is closed then. If it cannot be started, or ends without a picture, the first process draws.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Painter:
 
 
 def serve() -> None:
-    """Draw the picture that standard input asks for, and write it to standard output: the second process."""
+    """Draw the picture that standard input asks for, and write it to standard output. The second process runs this."""
     os.environ["MPLBACKEND"] = "Agg"
     skip_docstrings()
     from haptic_loop.sim import plots

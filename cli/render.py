@@ -214,7 +214,7 @@ def shortened(rows: Rows, less: Sequence[str]) -> tuple[list[tuple[str, str | No
     return kept, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
 
 
-_MOST_ROWS = 15  # of a table of facts
+_MOST_ROWS = 15  # most rows of a table that `shortened` makes
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
@@ -255,7 +255,7 @@ def figure(
 
 
 def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:
-    """Return a dataclass field that the table shows as these rows."""
+    """Return a dataclass field that the table shows as the rows that `rows` makes of its value."""
     return field(metadata={"rows": rows, "json": json})
 
 
@@ -281,7 +281,7 @@ def rows_of(report: Any) -> Rows:
 
 
 def certified(need: Requirement, proof: bool = True) -> str:
-    """Say whether the condition holds, and with `proof` whether exact arithmetic proves it."""
+    """Return the words for whether a condition holds; with `proof`, also for whether exact arithmetic proves it."""
     if not need.certified:
         return "[red]not certified[/]"
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
@@ -293,7 +293,7 @@ def short(condition: str) -> str:
 
 
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
-    """Yield one row for each condition with its damping, and with `proof` whether exact arithmetic proves it."""
+    """Yield a row per condition: its required damping, whether it holds, and with `proof` whether it is proved."""
     for name, need in requirements.items():
         yield f"damping, {name}", f"{need.words(digits)}: {certified(need, proof)}"
 
@@ -314,7 +314,7 @@ def transparency_error(figures: Transparency) -> str:
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
 
-_MUCH = 2.0  # ratio of required to available damping nearby, above which the report proposes --ranges
+_MUCH = 2.0  # ratio of required to available damping in nearby environments, above which a report proposes --ranges
 
 
 def robustness_rows(there: Robustness | None) -> Rows:

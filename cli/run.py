@@ -183,7 +183,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
-    """Return the walls between a contact and ground, (channel, place, name), and the ticks (N,) that touch any wall."""
+    """Return (channel, place [m], name) of each wall from a contact to ground, and which ticks (N,) touch any wall."""
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None
@@ -233,7 +233,7 @@ _LESS = (
 
 
 def _tables(scenario: Scenario, report: RunReport) -> tuple[list[Any], list[str]]:
-    """Return the tables, and a line that names the rows left out of the first, if any."""
+    """Return the tables, and a line that names the rows left out of the first table, if any."""
     title = f"{scenario.title(report.case)}: coupling {report.kind}"
     rows, left_out = render.shortened([render.channel_row(scenario.environment.contacts), *_rows(report)], _LESS)
     shown = [render.facts(title, rows)]
@@ -297,13 +297,13 @@ def _speed(run: Ran) -> str:
 
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
-    """Return a table of the integrators and substeps tried on this scene; those of this run are marked."""
+    """Return a table of the integrators and substeps tried on this scene; a star marks those of this run."""
     cells: dict[str, Any] = {
         "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
         "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
         "CPU s": "{r.cpu_s:.3f}",
-        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # below the clock's resolution
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # 0 s is below the resolution
     }
     title = "speed against error on this scene (*: this run, the cheapest within --error)"
     return render.columns(title, cells, engines)

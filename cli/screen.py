@@ -20,7 +20,7 @@ _OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # an opening
 
 
 def _in_unit(shown: Any) -> Any:
-    """Return a text or table in the unit of this command."""
+    """Return a text or table in metres or radians, whichever this command uses."""
     if isinstance(shown, Table):
         shown.title = shown.title and in_unit(str(shown.title))
         for column in shown.columns:

@@ -39,7 +39,8 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_constant_dela
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] virtual time that a rehearsal may take beyond the requested seconds
 _SHOWN_US = 100_000  # [us] virtual time between two updates of a rehearsal's progress bar
-_SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
+#: counters that the status line shows unless they are 0
+_SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")
 
 
 def add_link_options(parser: options.Parser) -> None:
@@ -156,9 +157,10 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Return a function that tells whether the file of --deadman was touched; the driver reads the keys itself.
+    """Return a function that tells whether the user touched the file of --deadman since its last call.
 
-    Returns None if nobody has to be present, or if the device has its own switch.
+    For --deadman key it always returns False, because the driver reads the keys itself. The result is None without a
+    deadman, and if the device has its own switch.
     """
     if named in (None, "device"):
         return None
@@ -211,7 +213,7 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
 
 
 def _ports(args: argparse.Namespace) -> list[str]:
-    """Return the paths of --port; empty if the host gives the clock, because then no serial port is open.
+    """Return the paths of the serial ports in --port; none for a device that the host clocks.
 
     Raises:
         InputError: A path is empty.
@@ -224,7 +226,7 @@ def _ports(args: argparse.Namespace) -> list[str]:
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Return whether the host gives the clock, because the device has no clock."""
+    """Return whether --port names a device without a clock, whose ticks the host times."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 

@@ -95,7 +95,7 @@ def verdict(
 
 
 SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
-_NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling in an object without stiffness is no better than none
+_NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness is no better than no force
 
 
 def _useless(assessment: Assessment) -> str:

@@ -109,7 +109,7 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Film:
-    """The film's file."""
+    """A film: its file, its number of pictures and their number per second."""
 
     file: str
     pictures: int
@@ -187,7 +187,7 @@ def _parser() -> options.Parser:
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
-    """Return the name of the first coupling, and the script without it. Raises InputError."""
+    """Return the first coupling's name, and the script without an event that names it. Raises InputError."""
     label = _label(args)
     usual = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else _SCRIPT if usual else None
@@ -222,7 +222,7 @@ def _names() -> list[str]:
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """Film the session in simulated time, so that the film is reproducible; Ctrl-C makes it shorter."""
+    """Film the session in simulated time, so that the film is reproducible; Ctrl-C ends it early."""
     from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Report:
-    """The report of each of these commands; SI units."""
+    """The report of every command on a world, in SI units."""
 
     scenario: str
     scenario_digest: str
@@ -88,7 +88,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """Return W0 [J] of --energy-budget. Raises InputError for a cap, because a world's account has no cap."""
+    """Return W0 [J], the initial energy of a world's account, from --energy-budget. Raises InputError for a cap."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget

@@ -1,6 +1,6 @@
 """python -m sim.zwidth: map which K and B are certified, stable with random humans, and stable in MuJoCo (Z-width).
 
-options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> files
+Flow of data: options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> files
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
 _FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
-_PRESS = 3.0  # [N] steady force of a hand; maps of environments have none, because soft ones would yield to it
+_PRESS = 3.0  # [N] steady force of a hand; 0 in maps of environments, because soft ones would yield to a steady force
 
 
 def main(argv: list[str]) -> int:
