@@ -27,7 +27,7 @@ def report(tmp_path_factory):
     return code, json.loads((place / "r.json").read_text())
 
 
-def test_figures(report):
+def test_errors_and_verdicts_of_each_integrator_are_known(report):
     code, outcome = report
     assert code == 0
     rows = {(row["integrator"], row["substeps"]): row for row in outcome["rows"]}
@@ -45,7 +45,7 @@ def test_figures(report):
     assert all(row["wall_s_per_simulated_s"] > 0 for row in outcome["rows"])
 
 
-def test_a_limit_cycle_has_its_forces_deviation():
+def test_cycle_deviation_is_that_of_the_late_forces():
     """The deviation is the largest standard deviation of a channel's force in the last 4000 ticks of the cycle."""
     scenario = load().replace(duration=5.0)
     loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
@@ -61,7 +61,7 @@ def test_undominated_rows_form_the_pareto_front():
     assert [row.pareto for row in _with_front(rows)] == [True, True, False, True, False]
 
 
-def test_bad_duration():
+def test_a_duration_without_a_number_is_refused():
     with pytest.raises(InputError, match="--duration is 'x'"):
         main(["--duration", "x"])
 
@@ -75,7 +75,7 @@ def test_runs_say_when_they_stop_being_credible():
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
     assert part.transmission_force_n == pytest.approx(force.max(axis=0))
-    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # a period has only 10 samples
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # a period at 84 Hz has only 10 ticks
     assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
     assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)
@@ -98,7 +98,7 @@ def test_a_run_clipping_at_once_has_no_error():
     assert error.reason.startswith("the unstable run first clips at t = 0.000 s, and growth")
 
 
-def test_a_dominant_frequency_ignores_the_first_time():
+def test_dominant_frequency_is_independent_of_the_start_time():
     t = 1e-3 * np.arange(1000)
     f, none = np.sin(2 * np.pi * 50 * t)[:, None], np.zeros((1000, 1))
     rates = [Trace(t + begin, none, f, none, none, none, {}).dominant_frequency_hz() for begin in (0.0, 5.0)]

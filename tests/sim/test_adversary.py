@@ -1,4 +1,4 @@
-"""The search for the worst passive human finds one where this-environment fails, and none where it holds."""
+"""The search for the worst passive human destabilises loops that fail this-environment, and no loop that meets it."""
 
 import json
 from dataclasses import replace
@@ -38,15 +38,15 @@ def test_the_search_destabilises_loops_below_the_requirement():
     assert all(row.worst.destabilises for row in rows)
 
 
-def test_nobody_destabilises_sufficient_damping():
+def test_nobody_destabilises_a_sufficiently_damped_loop():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
     # The growth with lossless hands approaches 0 from below, up to the rounding of eigenvalues.
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
-def test_it_searches_the_latest_forces():
-    """The loops have the longest period and the largest latencies."""
+def test_the_search_assumes_the_latest_forces():
+    """The searched loops have the longest period and the largest latencies."""
     scenario = SCENARIO.replace(T_max=2e-3, latency=((1e-4, 3e-4), (0.0, 5e-4)))
     F, hands = assemble(scenario, NoCoupling()).F, HumanSets((SCENARIO.human,))
     held = hold(variants(SCENARIO.device, hands).plants(), 2e-3, [3e-4, 5e-4])
@@ -55,7 +55,7 @@ def test_it_searches_the_latest_forces():
 
 @pytest.mark.slow
 def test_the_condition_is_tight_with_long_delays():
-    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping a hand is found."""
+    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping a hand destabilises."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
     print([(row.short, row.worst.growth) for row in rows])
@@ -81,6 +81,7 @@ def test_known_devices_are_searched_within_their_bounds(tmp_path):
 
 
 def both_hands(monkeypatch):
+    """Let the search try only persons who hold both devices."""
     monkeypatch.setattr(adversary, "_PASSES", tuple(kind for kind in adversary._PASSES if kind.held))
     assert adversary._PASSES
 
@@ -159,7 +160,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_the_rate_by_shortage():
+def test_only_a_shortage_of_damping_is_found():
     rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 4))
     found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
     assert found == {0: [False, False], 0.2: [True, True]}

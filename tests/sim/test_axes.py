@@ -152,7 +152,7 @@ def test_persons_hold_devices_with_the_same_axes() -> None:
         parse(person + text)
 
 
-def test_delays_are_one_for_each_device() -> None:
+def test_each_device_has_one_delay_and_one_level() -> None:
     space = scenario()
     assert (space.theta, space.psi, space.delta) == ((1, 1, 1, 2, 2, 2), (0,) * 6, (1.37,) * 6)
     changed = space.replace(theta=(0, 3), delta=(1.0, 2.0), latency=((0.0, 1e-4), (1e-4, 2e-4)))
@@ -166,7 +166,7 @@ def test_delays_are_one_for_each_device() -> None:
         space.replace(theta=(1, 2, 3))
 
 
-def test_springs_in_space_are_their_matrices() -> None:
+def test_springs_in_space_match_closed_form_matrices() -> None:
     stiffness = np.array([[900.0, 120.0, -40.0], [120.0, 500.0, 10.0], [-40.0, 10.0, 300.0]])
     more = f', {{ between = ["left", "ground"], stiffness = {rows(stiffness)}, damping = [0.5, 0.2, 0.1] }}'
     more += ', { between = ["right", "ground"], stiffness = 50.0, along = [1, 2, 2] }'
@@ -211,7 +211,7 @@ def test_walls_push_along_their_normals() -> None:
 
 
 def push_along(scene: Scene, direction: Array, first: int, ticks: int) -> Array:
-    """Return forces (ticks, outside): for 50 ticks 1 N on the first handle and -1/2 N on the second."""
+    """Return forces (ticks, outside) from tick `first`, before tick 50: `direction` on handle 1, -1/2 of it on 2."""
     w = np.zeros((ticks, scene.outside))
     for k, column in enumerate(scene.tapped):
         w[: max(0, 50 - first), column] = (1.0, -0.5)[k // len(direction)] * direction[k % len(direction)]
@@ -231,7 +231,7 @@ def test_three_decoupled_axes_equal_one_axis(engine: str) -> None:
     assert not traces[0].x[:, [0, 2, 3, 5]].any()
 
 
-def test_clamped_axes_leave_a_line() -> None:
+def test_two_clamped_axes_leave_a_single_axis() -> None:
     clamped = scenario('clamped = ["y", "z"]', 'clamped = ["y", "z"]')
     assert clamped.loop("I").axes is None
     scene = build(clamped.device, clamped.human)
@@ -261,8 +261,8 @@ def test_rotated_loops_have_rotated_trajectories(kind: str, engine: str) -> None
         assert np.abs(before @ Q.T - after).max() < 1e-9 * np.abs(before).max()
 
 
-def test_plant_with_matrices_is_its_exponential() -> None:
-    """A device of 0.25 kg in a hand of 0.3 kg moves by the solution of M x'' = -K x - B x' - f."""
+def test_plant_with_matrices_equals_a_matrix_exponential() -> None:
+    """A device of 0.25 kg in a hand of 0.3 kg follows M x'' = -K x - B x' - f, with M = 0.55 kg."""
     hand = np.array([[3.0, 0.5, 0.0], [0.5, 2.0, -0.4], [0.0, -0.4, 1.0]])
     K = np.array([[200.0, -50.0, 20.0], [-50.0, 150.0, 0.0], [20.0, 0.0, 90.0]])
     device = RigidDevice(axes=3, damping=tuple(map(tuple, DAMPING.tolist())))
@@ -355,12 +355,12 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
     for name in ("_NEWTON", "_HALVINGS", "_SPLIT"):
         monkeypatch.setattr(complementarity, name, 0)
     blocked = run_scenario(space, COUPLING, lag)
-    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # forces are 0 before the first one, too
+    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # the delay adds zero forces in the first ticks
     assert 10 < blocked.unsolved <= zero
     assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
 
 
-def test_reports_say_that_held_torques_are_free() -> None:
+def test_reports_do_not_cover_held_torques() -> None:
     rows = [dict(verdict.rows(assess(each.loop("I"), SpringDamper([3000.0] * m, [0.3] * m)))).get("held torques")
         for each, m in ((scenario(), 6), (line(), 2))]  # fmt: skip
     assert "not covered" in str(rows[0])
@@ -368,7 +368,7 @@ def test_reports_say_that_held_torques_are_free() -> None:
 
 
 def test_search_shares_a_multiplier_within_a_device() -> None:
-    """The slope of `room` by gains and multipliers equals central differences."""
+    """The derivatives of `room` with respect to gains and multipliers equal central differences."""
     loop = LimiterLoop(scenario('clamped = ["x"]', 'clamped = ["x"]').loop("I"))
     x = loop.point(SpringDamper([3000.0, 4000.0, 2000.0, 2500.0], [0.3, 0.4, 0.5, 0.2]))
     x[8:] += [0.1, -0.2, 0.3, 0.05]

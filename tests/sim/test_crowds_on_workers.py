@@ -97,7 +97,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, wo
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while len(workers := children(process.pid)) < workers_and_their_clerk:  # one is the resource tracker
+    while len(workers := children(process.pid)) < workers_and_their_clerk:  # the clerk: Python's resource tracker
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(0.2)

@@ -36,7 +36,7 @@ def exact(simulation):
 
 
 def test_traces_hold_measured_positions_and_speeds(exact):
-    """A central difference of x_handle lacks (2 pi 84 Hz T)^2/6 = 7 % of a mode at 84 Hz, and less of slower ones."""
+    """A central difference underestimates speeds at 84 Hz by (2 pi 84 Hz T)^2/6 = 7 %, and slower ones by less."""
     slope = np.gradient(exact.x_handle, SHORT.T, axis=0)
     assert np.linalg.norm(slope - exact.v_handle) < 0.07 * np.linalg.norm(exact.v_handle)
     step = 1e-5

@@ -56,7 +56,7 @@ def stiff(transmission: float):
 
 
 def knocked(simulation, engine: Engine, ticks: int, start=None) -> Driven:
-    """Run without voluntary motion, with 5 N on both handles for 20 ticks."""
+    """Run without voluntary motion, with 5 N on both handles for the first 20 ticks."""
 
     def outside(first, count):
         w = np.zeros((count, simulation.scene.outside))
@@ -90,10 +90,11 @@ def longer(matrix):
 @pytest.mark.parametrize("T", [1e-5, 1.2e-3, 1e-2, 0.1])
 @pytest.mark.parametrize("stiffness", [14500.0, 1.45e6, 1e9])
 def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
-    """The measured map equals exponentials by SciPy and in extended precision; velocities are divided by `fastest`.
+    """The measured map equals exponentials by SciPy and in extended precision.
 
-    Rounding of the generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number;
-    rounding of the result adds one `eps` for each term of its sums.
+    Velocities are divided by the `fastest` mode [rad/s], so that they are of the size of positions. Rounding of the
+    generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number; rounding of the
+    result adds one `eps` for each term of its sums.
     """
     loop = stiff(stiffness)
     continuous, fastest = plant(loop.scene.model), np.sqrt(stiffness / 0.06)
@@ -112,7 +113,7 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
 
 @pytest.mark.parametrize("coupling", [NoCoupling(), PUBLISHED["I"]], ids=["no coupling", "published"])
 @pytest.mark.parametrize("stiffness", [14500.0, 1.45e6])
-def test_growth_is_the_exact_loops(stiffness, coupling):
+def test_growth_equals_that_of_the_exact_loop(stiffness, coupling):
     loop = assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=stiffness),) * 2), coupling)
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
     # Four Runge-Kutta steps, which are too few for the stiffer transmission, are less accurate.
@@ -137,8 +138,8 @@ def test_more_substeps_change_nothing(simulation):
 # ---- limits of exactness
 
 
-def test_the_forces_are_mujocos(simulation):
-    """If springs change after the engine was built, its matrix J is old, but accelerations are of the new springs.
+def test_the_engine_takes_mujocos_forces(simulation):
+    """If springs change after the engine was built, its Jacobian J is old, but accelerations follow the new springs.
 
     With a wrong J the method is of first order: halving the step halves the error."""
     wrong = 1.5
@@ -166,7 +167,7 @@ def _one_period(process: Process, engine: Engine, outside: int):
     return np.stack(columns, axis=1)
 
 
-def test_of_first_order_where_devices_rub():
+def test_friction_makes_the_engine_first_order():
     """Coulomb friction switches within a step, so the error against RK4 x 32 only halves with the step."""
     loop = assemble(RUBBING, PUBLISHED["I"])
 
@@ -217,7 +218,7 @@ def test_a_batch_is_a_loop_over_single_engines(simulation):
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_many_hands_are_each_their_own_scene(substeps):
+def test_each_simulation_equals_its_own_scene(substeps):
     """Each simulation of a batch equals that of its own compiled scene, and that of the exact batch."""
     crowd = hands(5)
     held_by = variants(SCENARIO.device, crowd)
@@ -266,7 +267,7 @@ def test_the_default_follows_from_the_scene(simulation):
 
 @pytest.mark.parametrize(("mode", "rate"), [(0.0, 6.0), (0.0, 6.5), (1.3, 2.0), (0.1, 0.1)])
 def test_substeps_are_the_fewest_within_the_limits(mode, rate):
-    """A step is at most 0.2 rad of the fastest mode and less than one time constant, and a period has four or more."""
+    """A step is at most 0.2 rad of the fastest mode and less than one time constant; a period has at least 4 steps."""
     count = _PlantSpeed(mode, rate).substeps(1.0)
     fits = [n for n in range(4, 20) if mode / n <= 0.2 and rate / n < 1]
     assert count == fits[0]
@@ -292,12 +293,12 @@ def test_engines_default_to_their_integrator(simulation):
         ),
     ],
 )
-def test_what_is_refused_is_named(simulation, call, message):
+def test_refusals_name_the_wrong_setting(simulation, call, message):
     with pytest.raises(ValueError, match=message):
         call(simulation)
 
 
-def test_heavy_hands_need_no_substeps():
+def test_light_handles_need_no_substeps():
     """A 1 g handle in an undamped hand needs at least 24 Runge-Kutta steps, but one exponential step."""
     device = CompliantDevice(handle_mass=1e-3)
     human = Human((Link(0.0, 0.0, 300.0),))
@@ -322,7 +323,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """The chosen setting keeps the error allowed against RK4 x 64; RK4 with half its substeps exceeds a quarter."""
+    """The chosen setting keeps the allowed error; RK4 with half its substeps exceeds a quarter of it (by RK4 x 64)."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -343,13 +344,16 @@ def test_friction_keeps_the_error_with_fewest_steps():
 
 
 def test_gaps_between_runs_bound_the_finest_error():
-    """For runs x + c/n the bound is 1.5 c/n; if gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q)."""
+    """Gaps are distances between runs with n and 2 n substeps.
+
+    For runs x + c/n the bound is 1.5 c/n. If gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q).
+    """
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
     assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding errors need not contract
     assert _missed([0.0, 0.0, 0.0]) == 0
-    # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the distance from 512 substeps.
+    # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the distance from 512 steps.
     gaps = [1.05, 0.167, 0.0794, 0.0849, 0.0183, 0.0117]
     for count, apart in ((3, 9.76e-2), (4, 1.29e-2), (5, 3.11e-2), (6, 1.97e-2)):
         assert _missed(gaps[:count]) > apart
@@ -371,7 +375,7 @@ def test_unreachable_errors_are_refused(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """The first two runs predict 512 steps of 4 evaluations in each of 100 ticks for all runs: no third run begins."""
+    """By the first two runs, all runs would need 512 steps of 4 evaluations in 100 ticks, so no third run begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
@@ -397,11 +401,11 @@ def test_engines_are_compared_on_the_actual_run():
         apart = np.sqrt(np.mean((own - truth) ** 2) / np.mean(truth**2))
         found += [c.position_relative_rms for c in done.choices if c.name == "RK4 x 2"]
         assert found[-1] == pytest.approx(apart)
-    assert found[0] != found[1]  # the budget acts
+    assert found[0] != found[1]  # the energy budget changes the motion
 
 
 def test_the_cross_check_finds_wrong_matrices(monkeypatch):
-    """RK4 has no J, so it reveals an exponential engine whose J is wrong by one part in a thousand."""
+    """RK4 needs no Jacobian J, so it reveals an exponential engine whose J is wrong by one part in a thousand."""
     loop = assemble(SCENARIO.replace(duration=0.5), PUBLISHED["I"])
     sound = cross_check(
         loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EngineSettings("mujoco", EXPONENTIAL, 1)
@@ -423,7 +427,7 @@ def test_the_cross_check_finds_wrong_matrices(monkeypatch):
 # ---- the exponential of many small matrices
 
 
-def test_phi_matches_expm_for_many_sizes():
+def test_exponentials_match_extended_precision_for_many_sizes():
     rng = np.random.default_rng(0)
     for n in (1, 4, 14):
         matrices = rng.normal(size=(40, n, n)) * np.geomspace(1e-8, 30, 40)[:, None, None]
@@ -436,7 +440,7 @@ def test_phi_matches_expm_for_many_sizes():
 
 
 def test_an_undamped_oscillator_turns():
-    """exp([[0, w], [-w, 0]]) is a rotation by w, also by many turns."""
+    """exp([[0, w], [-w, 0]]) is a rotation by w, also for an angle w of many turns."""
     w = np.geomspace(1e-3, 1e3, 13)
     turned = expm_each(w[:, None, None] * np.array([[0.0, 1.0], [-1.0, 0.0]]))
     exact = np.stack([np.stack([np.cos(w), np.sin(w)], -1), np.stack([-np.sin(w), np.cos(w)], -1)], axis=1)

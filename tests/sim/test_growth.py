@@ -1,4 +1,4 @@
-"""Rates measured from displacements equal known ones; voluntary motion and encoder steps count as no oscillation."""
+"""Growth rates from displacements equal known ones; voluntary motion and encoder steps count as no oscillation."""
 
 import json
 
@@ -19,7 +19,7 @@ T, STEP = 1.2e-3, np.full(2, 1e-6)
 
 
 def motion(seconds, *modes):
-    """Return 15 mm at 0.6 Hz plus modes (final amplitude [m], frequency [Hz], growth [1/s]), in whole encoder steps."""
+    """Return 15 mm at 0.6 Hz plus modes (last size [m], Hz, growth [1/s]), halved in channel 2, in encoder steps."""
     t = T * np.arange(round(seconds / T))
     x = 15e-3 * np.sin(2 * np.pi * 0.6 * t + 0.3)
     for size, frequency, rate in modes:
@@ -31,11 +31,11 @@ def motion(seconds, *modes):
     ("frequency", "rate"), [(f, g) for f in (6.2, 84.0) for g in (-3.0, -0.5, 0.4, 1.5)] + [(84.0, 6.0)]
 )
 def test_a_known_rate_comes_back(frequency, rate):
-    """The error is at most four standard errors, plus 0.02 1/s by voluntary motion in the slowest octave."""
+    """The error is at most four standard errors, plus 0.02 1/s because voluntary motion disturbs the slowest octave."""
     found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
     assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
     assert found.error_per_s < 0.2
-    assert found.frequency_hz == pytest.approx(frequency, abs=1.5)  # a line is 1 Hz wide
+    assert found.frequency_hz == pytest.approx(frequency, abs=1.5)  # the spectrum's lines are 1 Hz apart
     assert found.trend == ("grows" if rate > 0 else "decays")
 
 
@@ -136,7 +136,7 @@ def made(x, meta):
         ({"encoder_step_m": [1e-6, float("nan")]}, "not finite"),
     ],
 )
-def test_a_trace_that_says_nonsense_is_bad_input(run_part, words):
+def test_a_trace_with_wrong_metadata_is_refused(run_part, words):
     with pytest.raises(InputError, match=words):
         growths(made(motion(0.6), {"run": run_part}))
 

@@ -22,13 +22,13 @@ from tests.checks.hard import cases, devices, measure, nominal
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """tests/checks/hard.py defines when a setting holds; `default_substeps` errs by at most 1e-2 1/s of growth."""
+    """tests/checks/hard.py defines when a setting holds; with `default_substeps` growth errs by at most 1e-2 1/s."""
     row = measure(hard)
     assert row.holds, row
 
 
 @pytest.mark.parametrize(("side", "wrong"), [(-0.1, None), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
-def test_within_a_tenth_of_the_boundary(side, wrong):
+def test_verdicts_are_right_near_the_boundary(side, wrong):
     """The default RK4 gives the right verdict for loops whose exact growth is -0.1 or 0.1 1/s.
 
     At 0.1 1/s cheaper settings call the loop stable: MuJoCo's integrators err to that side, so at -0.1 none is wrong.
@@ -70,9 +70,9 @@ def quiet(loop):
 
 
 def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
-    """Return the share of 60 starts within 0.5 m and 10 m/s whose forces clip after 48 s, and two other figures.
+    """Return the share of 60 far starts and the number of `near` starts whose forces clip after 48 s, and a frequency.
 
-    These are the number of clipping runs among `near` starts within a fifth of these bounds, and the frequency [Hz] of
+    Far starts are random within 0.5 m and 10 m/s; near starts are within a fifth of this. The frequency [Hz] is that of
     the strongest motion.
     """
     humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
@@ -98,7 +98,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 
 @pytest.mark.slow
-def test_clipping_breaks_certificates_that_damped_hands_mend():
+def test_certified_loops_keep_clipping_with_lossless_hands():
     """A coupling that is certified for the linear loop keeps clipping with lossless hands, not with damped ones."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=30)
@@ -141,7 +141,7 @@ def test_long_runs_do_not_drift(minutes):
     drift = np.abs(late - early).max()
     print(f"{minutes} minutes: {drift:.1e} m between the periods after the first minute and at the end")
     assert drift < 1e-12
-    # A sum of periods would miss ticks; a counter cannot.
+    # A clock that adds up periods would be a tick off; the loop counts ticks.
     accumulated = np.cumsum(np.full(ticks, loop.scenario.T))
     missed = (np.floor(accumulated / loop.scenario.T) != np.arange(1, ticks + 1)).sum()
     print(f"an accumulated clock is one tick off at {missed} of {ticks} ticks")

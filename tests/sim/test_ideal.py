@@ -19,8 +19,9 @@ SCENARIO = load()
 def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
     """Return the forces of Figure 4's network by backward Euler in positions, without a state space.
 
-    The mass M (1 kg) is between spring-dampers (800, 1) and (700, 1): (M/T^2 + D/T + K) q = M (2 q- - q--)/T^2 + the
-    pull of both contacts. The force of contact i is that of its spring-damper, `late[i]` samples later.
+    The mass M (1 kg) is between spring-dampers (800, 1) and (700, 1), with sums K and D: (M/T^2 + D/T + K) q =
+    M (2 q- - q--)/T^2 + D q-/T + the pull of both contacts; q- is the last q. The force of contact i is that of its
+    spring-damper, `late[i]` samples later.
     """
     k, b, M = np.array([800.0, 700.0]), np.array([1.0, 1.0]), 1.0
     q, before, x_old, forces = 0.0, 0.0, np.zeros(2), []

@@ -78,7 +78,7 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
 
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
 @pytest.mark.parametrize("limit", [0.69, 1e3])
-def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
+def test_runs_in_blocks_equal_runs_by_ticks(engine, apart, limit):
     """Runs in blocks equal runs tick by tick up to rounding, even if a block must be undone from a limited tick on."""
     simulation = assemble(weak(limit, limit).replace(duration=3.0), BUILT, (11.4167, 11.4167))
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
@@ -91,7 +91,7 @@ def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
         np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
 
 
-def test_single_stretches_feel_every_outside_force():
+def test_a_single_block_applies_every_outside_force():
     simulation = assemble(weak(1e3, 1e3).replace(duration=0.1), BUILT, (11.4167, 11.4167))
     found, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
     np.testing.assert_allclose(found.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())

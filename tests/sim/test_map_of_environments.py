@@ -38,8 +38,8 @@ def optimal():
 def densely(sweep, coupling_force, K, B):
     """Return required over available damping from up to 60010 frequencies and the network's equations alone.
 
-    Of the frequencies 5e-5 apart, only those near a tenth of them within 1 % of the largest figure are swept. Between
-    this tenth, a peak of width 0.01 rises by (2.5e-4/0.01)^2 only.
+    Of frequencies 5e-5 rad/sample apart, every tenth is swept first. Its neighbours follow only if its figure is within
+    1 % of the largest. Between the first ones, a peak of width 0.01 rises by (2.5e-4/0.01)^2 only.
     """
     T, (M, D, S) = sweep.loop.T, sweep.loop.network.matrices()
     network = sweep.loop.network
@@ -81,7 +81,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
         assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
 
 
-def test_the_model_of_a_pair_may_stay_behind():
+def test_model_kept_uses_the_scenarios_environment():
     """`model kept` uses V = Q (I - E0 Q)^-1 with the scenario's E0; for other E it differs from this-environment."""
     coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)

@@ -59,7 +59,7 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_its_file_proves_and_drives_the_process(files, form):
+def test_coupling_files_prove_and_drive_the_process(files, form):
     """The forces are a convolution with the impulse response that samples of F on the circle |z| = 1.05 give."""
     scenario, _, path = files[form]
     stored, loop = load_file(path), scenario.loop("I")
@@ -94,7 +94,7 @@ def test_single_runs_equal_batched_runs(files, form, tmp_path):
     assert (batch["unstable"], batch["holds"]) == ({"exact": 0, "mujoco": 0}, True)
 
 
-def test_its_forces_are_limited_as_the_file_proves(files):
+def test_forces_are_limited_as_the_file_proves(files):
     scenario, _, path = files["filter"]
     weak = tuple(msgspec.structs.replace(device, force_limit=0.3) for device in scenario.device)
     scenario = scenario.replace(device=weak, duration=0.6)
@@ -109,7 +109,7 @@ def test_its_forces_are_limited_as_the_file_proves(files):
 
 @pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
 @pytest.mark.parametrize("form", FORMS)
-def test_its_export_repeats_to_the_last_bit(files, form, tmp_path):
+def test_exports_repeat_to_the_last_bit(files, form, tmp_path):
     out, limit = tmp_path / "p.c", ["--force-limit", "3"] if form == "filter" else []
     assert export.main([str(files[form][2]), "--process", *limit, "--out", str(out)]) == 0
     built = [str(CC), "-std=c99", "-ffp-contract=off", "-DHAPTIC_LOOP_TEST", str(out), "-o", str(tmp_path / "p"), "-lm"]
@@ -133,7 +133,7 @@ def test_the_live_window_equals_the_simulator(files, form):
     frame = running.frame(0.25)
     ticks = round(frame.t / scenario.T)
     record = close_loop(shown.simulation, "exact", ticks=ticks + 1)
-    # Each force is a sum over at most 29 states, which the two programs add in different orders.
+    # Each force is a sum over at most 29 states, which window and simulator add in different orders.
     np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)
 
 

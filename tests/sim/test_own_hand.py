@@ -106,7 +106,7 @@ def test_a_vanishing_tissue_mass_changes_nothing():
     assert off[0] / off[1] == pytest.approx(2.0, abs=0.1)
 
 
-def test_impedances_have_the_expected_order():
+def test_impedances_are_exact_or_of_second_order():
     simulation = assemble(held_by(Light(), MuscleBySpace()), PUBLISHED["I"])
     exact = run(simulation, "exact")
     assert rms(run(simulation).s, exact.s) < 1e-10  # rounding
@@ -242,7 +242,7 @@ def test_population_verdicts_equal_those_of_single_hands():
         assert found.mass[i] == pytest.approx(np.sqrt(hands[0].mass * hands[1].mass))
 
 
-def test_a_person_may_hold_with_such_hands():
+def test_a_person_may_hold_with_own_hands():
     person = Person((1, 2), 20.0, 15.0, 900.0)
     scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),))).replace(person=(person,))
     exact, mujoco = (simulate(scenario, PUBLISHED["I"], engine=engine) for engine in ("exact", "mujoco"))
@@ -279,7 +279,7 @@ def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
         main([*words, "--human", f"{hands}:one"])
 
 
-def test_a_measured_hand_and_a_population_from_files(tmp_path):
+def test_files_define_measured_hands_and_populations(tmp_path):
     """A state space in TOML is checked and simulated; a Python file may define a population."""
     file = tmp_path / "hands.toml"
     space = "[[human]]\nmass = 0.2\nA = [[-30.0]]\nB = [[1.0]]\nC = [[{C}]]\nD = [[2.0]]\n"
@@ -322,7 +322,7 @@ def test_a_state_space_is_no_coupling():
         simulate(SCENARIO, PUBLISHED["I"].compliance(SCENARIO.T))
 
 
-def test_a_population_on_a_wall():
+def test_engines_agree_on_a_population_at_walls():
     """Both engines' verdicts are those of the worst frozen contact state; traces touch the wall and give no energy."""
     scenario = load("one-wall")
     coupling = design_coupling(scenario.loop("I"), "spring-damper", "any-environment")

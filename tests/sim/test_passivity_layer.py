@@ -1,4 +1,4 @@
-"""The energy budget and the shell bound the energy that simulated loops give to hands."""
+"""The energy budget, and the shell around a user's environment, bound the energy that loops give to hands."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ def test_budgets_are_idle_with_damping_to_spare():
 
 
 def test_a_budget_acts_on_clipped_forces():
-    """Clipped at 0.3 and 0.1 N, a certified coupling gives 2 mJ per slow closed path: the hand must pay it first."""
+    """Clipped at 0.3 and 0.1 N, a certified coupling gives 2 mJ per slow closed path, so the budget must limit it."""
     loop, most = SHORT.loop("I"), np.array([[0.3], [0.1]])
     G, budget = loop.sent(SpringDamper([600.0, 400.0], [0.5, 0.5])), EnergyBudget(loop.delta, loop.T, Packets((1, 2)))
     corners = 1e-3 * np.array([[0, 0], [-10, -10], [-13, -10], [-3, 0], [0, 0]])
@@ -103,7 +103,7 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
         assert np.abs(trace.f).max() < 0.5 * np.abs(alone.f).max()
 
 
-def test_walls_stand_behind_a_budget_too():
+def test_budgets_bound_loops_with_walls():
     """A large budget changes nothing in a run with a wall; with W0 = 0 no energy is given."""
     scenario = load("one-wall").replace(duration=1.5)
     simulation = assemble(scenario, NoCoupling())
@@ -163,7 +163,7 @@ def test_reports_say_what_the_budget_did(tmp_path):
 
 @pytest.mark.slow
 def test_uneven_periods_cannot_exceed_the_budget():
-    """With uneven periods the budget reserves for the longest tick, so an unstable loop gives at most W0."""
+    """With uneven periods the budget reserves energy for the longest tick, so an unstable loop gives at most W0."""
     scenario = stiffer(load().replace(duration=1.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
     simulation = assemble(scenario, NoCoupling())
     for start in (0.0, 0.01):
@@ -175,6 +175,6 @@ def test_uneven_periods_cannot_exceed_the_budget():
         assert trace.net.figures().limited_ticks > 10
 
 
-def test_a_net_counts_forces_that_latch_at_ticks():
+def test_energy_accounts_refuse_forces_that_latch_late():
     with pytest.raises(ValueError, match="an energy account assumes forces that latch at ticks"):
         netted(assemble(SHORT.replace(latency=((0.0, 1e-4),) * 2), NoCoupling()), NoCoupling(), EnergyNet(0.0))

@@ -37,7 +37,7 @@ def loop():
     return simulation, w, peers.PEERS["exact"](simulation, w)
 
 
-def test_every_peer_is_looked_at():
+def test_every_peer_has_an_allowed_error():
     assert set(ALLOWED) | {"exact"} == set(peers.PEERS)
 
 
@@ -46,7 +46,7 @@ def test_every_peer_is_looked_at():
 def test_peers_simulate_the_same_loop(loop, name):
     allowed, needed = ALLOWED[name]
     if needed:
-        pytest.importorskip(needed, reason=f"{needed} is no dependency: this runs where somebody has installed it")
+        pytest.importorskip(needed, reason=f"{needed} is no dependency: this test runs if it is installed")
     simulation, w, (z, s, f) = loop
     others_z, others_s, others_f = peers.PEERS[name](simulation, w)
     assert (others_z.shape, others_s.shape, others_f.shape) == (z.shape, s.shape, f.shape)

@@ -62,7 +62,7 @@ def trace(f, x=None):
     return Trace(T * np.arange(len(f)), x, f, x, x, np.zeros((len(f), 1)), {})
 
 
-def test_a_run_is_drawn_with_its_turns():
+def test_the_zoom_shows_the_sharpest_six_periods():
     t = np.arange(4000)
     f = np.stack([np.sin(t / 300), np.sin(t / 300 + 1)], axis=1)
     f[2500:2600, 1] += 0.2 * np.sin(np.arange(100) * 2 * np.pi / 12)  # 83 Hz
@@ -101,7 +101,7 @@ def test_nearby_handles_are_drawn_with_their_distance(drawn):
     np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
 
 
-def test_names_walls_and_curves_that_coincide(drawn):
+def test_legends_name_walls_and_curves_that_coincide(drawn):
     """A calm run has no zoom; walls are drawn at their positions; the legend names a curve that covers another."""
     t = np.arange(3000)
     wave = np.sin(t / 300)
@@ -125,7 +125,7 @@ def test_names_walls_and_curves_that_coincide(drawn):
         np.testing.assert_allclose(spans, edges + T)
 
 
-def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
+def test_onsets_show_amplitudes_and_implausible_parts_are_grey(drawn):
     t = T * np.arange(6000)
     swing = 1e-6 * np.exp(1.4 * t) * np.cos(2 * np.pi * 84 * t)
     handle = 0.015 * np.sin(2 * np.pi * 0.6 * t)
@@ -197,7 +197,7 @@ def test_binding_frequencies_are_marked(undrawn):
     np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
     marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
     np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37))
-    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # drawn at the edge: 0 Hz, 40 times the available damping
+    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # 0 Hz and a ratio of 40 are drawn at the edges
     assert here.get_title() == "this environment"
     assert here.get_ylabel() == "required damping [N s/m]"
     assert "soft (no curve: see the printed remarks)" in lines(anywhere)

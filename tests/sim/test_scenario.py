@@ -99,7 +99,7 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
         (".", "is a folder, expected a file"),
     ],
 )
-def test_a_missing_file_names_what_there_is(name, message):
+def test_missing_files_and_folders_are_refused(name, message):
     with pytest.raises(InputError, match=message):
         load(name)
 
@@ -109,7 +109,7 @@ def test_a_scenario_is_loaded_by_name_or_file():
         load(3)
 
 
-def test_a_file_that_is_no_text(tmp_path):
+def test_a_binary_file_is_refused(tmp_path):
     (tmp_path / "x.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="UTF-8"):
         load(tmp_path / "x.toml")
@@ -120,7 +120,7 @@ def test_built_in_scenarios_load(name):
     assert load(name).name == name
 
 
-def test_the_default_is_the_papers():
+def test_the_default_scenario_is_the_papers():
     scenario = load()
     assert scenario.environment == FIGURE_4
     assert (scenario.T, scenario.theta, scenario.psi, scenario.delta) == (1.2e-3, (1, 2), (0, 0), (1.37, 1.37))
@@ -137,7 +137,7 @@ def test_titles_name_the_delay_of_the_reference():
     assert list(titles.values()) == [title for case in CASES for title in each[case]]
 
 
-def test_replacing_checks_again():
+def test_replaced_fields_are_checked():
     scenario = load()
     assert scenario.replace(delta=(2.0, 0.8)).delta == (2.0, 0.8)
     for change, message in [
@@ -215,7 +215,7 @@ def test_damping_and_other_fields_are_replaced_together():
     assert reversed_ == together
 
 
-def test_the_damping_counts_the_new_devices():
+def test_delta_applies_to_the_new_devices():
     rigid = {"kind": "rigid", "damping": 2.0}
     assert load().replace(delta=(1.0, 0.5), device=[rigid, rigid]).device == (
         RigidDevice(damping=1.0),
@@ -261,7 +261,7 @@ def test_lists_in_space_are_per_device(change, message):
     assert str(caught.value) == message
 
 
-def test_device_axes_are_counted_with_the_contacts():
+def test_device_axes_must_be_as_many_as_contacts():
     plane = msgspec.structs.replace(load("omega-space").device[0], axes=2)
     network = load("omega-space").environment
     with pytest.raises(InputError) as caught:
@@ -272,13 +272,13 @@ def test_device_axes_are_counted_with_the_contacts():
 
 
 @pytest.mark.parametrize("case", ["III", "i", "", None, 1])
-def test_a_case_that_is_none_is_refused(case):
+def test_an_unknown_case_is_refused(case):
     with pytest.raises(InputError) as caught:
         load().loop(case)
     assert str(caught.value) == f"case is {case!r}, allowed are none, I, II"
 
 
-def test_the_digest_knows_every_number():
+def test_the_digest_changes_with_the_delays():
     scenario = load()
     assert scenario.digest == load().digest
     assert scenario.digest != scenario.replace(theta=(1, 3)).digest
@@ -300,7 +300,7 @@ springs = [{{ between = ["a", "b"], stiffness = 100.0 }}]
 """
 
 
-def test_a_device_of_the_catalogue_with_overrides():
+def test_given_values_override_the_catalogue():
     """A given value replaces the published one; a field without either has the default of the device's class."""
     both = parse(FALCON.format(device='[{ device = "falcon", damping = 0.5 }, "omega.3"]'))
     falcon, omega = both.device
@@ -398,7 +398,7 @@ def test_measured_friction_replaces_the_published_bound():
         ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "unknown field `mas` (did you mean `mass`?)"),
     ],
 )
-def test_a_device_that_is_not_known_well_enough(device, message):
+def test_incomplete_or_unknown_devices_are_refused(device, message):
     with pytest.raises(InputError) as caught:
         parse(FALCON.format(device=device))
     assert message in str(caught.value)

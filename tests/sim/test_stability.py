@@ -50,7 +50,7 @@ def test_exact_and_measured_growth(coupling, growth, frequency):
     assert measured == pytest.approx(mode.growth, abs=1e-3)
 
 
-def test_the_this_environment_matrix_is_the_loop():
+def test_the_closed_loop_matrix_repeats_the_run():
     """Steps of the closed loop's matrix give the states of the run."""
     simulation = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), PUBLISHED["I"])
     record = run(simulation, "exact")
@@ -61,7 +61,7 @@ def test_the_this_environment_matrix_is_the_loop():
         xi = loop.A @ xi + loop.B @ record.w[k]
 
 
-def test_left_eigenvector():
+def test_the_left_eigenvector_satisfies_its_equation():
     simulation = assemble(load(), NoCoupling())
     loop = close(simulation.plant, simulation.F)
     left = _left_eigenvector(loop).conj()
@@ -80,7 +80,7 @@ def test_a_trace_that_says_nothing_gives_a_reason():
 
 
 def test_fits_end_before_a_limiter_acts():
-    """A limiter acts `ahead` ticks before its force arrives."""
+    """A limiter acts `ahead` (here 3) ticks before its force arrives."""
     simulation = assemble(load().replace(duration=0.2), PUBLISHED["I"])
     trace, loop = run(simulation), close(simulation.plant, simulation.F)
     first = int(np.argmax(np.abs(trace.f[:, 0])))
@@ -114,8 +114,8 @@ def test_free_hands_settle_by_their_speed():
     assert growth == pytest.approx(rates[-2], rel=1e-3)
 
 
-def test_figures_of_an_impulse_are_its_traces():
-    """The energy is the least sum of f'dx + dx' delta dx/T, and speeds are compared between two quarters."""
+def test_figures_of_an_impulse_follow_from_its_trace():
+    """The energy is the least sum of f'dx + dx' delta dx/T; settling is the last quarter's speed over the second's."""
     late = Network(("a",), (Spring(("a", GROUND), 2000.0),))
     scenario = load("one-wall").replace(environment=late, theta=(2,), tap=None)
     question = Validation(scenario, NoCoupling(), 0, 3, 1, "exact", 0.25)
@@ -153,7 +153,7 @@ def test_contact_at_the_beginning_is_counted():
     assert (contact.made, contact.ticks) == (1, inside.samples - 1)
 
 
-def test_verdicts():
+def test_growth_above_zero_is_unstable():
     assert verdict(Mode(np.array(1.0), 1e-3).growth) == "stable"
     assert verdict(Mode(np.array(1.001), 1e-3).growth) == "unstable"
     assert Mode(np.array(0.0), 1e-3).growth == -np.inf
@@ -182,7 +182,7 @@ def knocked(K):
     return poles[np.argmax(poles.real)]
 
 
-def test_knocks_die_away_as_the_held_plant():
+def test_ringing_equals_poles_of_the_held_plant():
     """Device and hand are one body on a spring; the poles come from matrices that are written out here."""
     pair = knocked(900.0)
     said = ringing(assemble(parse(KNOCK + "springs" + SPRING), NoCoupling()))
@@ -193,7 +193,7 @@ def test_knocks_die_away_as_the_held_plant():
     assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
 
 
-def test_knocks_die_away_slowest_in_some_contact():
+def test_ringing_is_that_of_the_slowest_contact():
     """A wall is a spring or nothing; here the touching wall decays more slowly and has the least damping ratio."""
     away, held = knocked(0.0), knocked(900.0)
     assert away.real < held.real

@@ -43,12 +43,12 @@ def test_pace_of_known_matrices():
     assert pace(np.zeros((2, 2))) == _PlantSpeed(0.0, 0.0)
 
 
-def test_the_default_scenario_needs_no_more_than_four(simulation):
+def test_the_default_scenario_needs_four_substeps(simulation):
     assert pace(plant(simulation.scene.model).A).mode == pytest.approx(520.8, abs=0.1)
     assert default_substeps(simulation) == 4
 
 
-def test_the_exact_engine_is_its_own_map(simulation):
+def test_the_exact_engines_map_is_the_plant(simulation):
     held = _measured_hold(simulation, "exact")
     np.testing.assert_allclose(held.A, simulation.plant.A, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(held.B, simulation.plant.B, rtol=1e-9, atol=1e-12)
@@ -106,15 +106,15 @@ def test_edges_of_the_stable_regions(integrator, edge):
         assert (_step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
 
 
-def test_the_rule_knows_who_holds_devices_that_rub():
-    """Coulomb friction is taken out of the scene for the rule; a person who holds both devices stays in it."""
+def test_substeps_with_friction_include_the_person():
+    """The number of substeps follows from the scene without friction, but with the person who holds both devices."""
     person, device = Person((1, 2), 20.0, 1.0, 100.0), CompliantDevice(friction=0.5)
     loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), PUBLISHED["I"])
     assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5
     assert default_substeps(loop, "RK4") == 4
 
 
-def test_run_uses_and_reports_the_rule(tmp_path):
+def test_runs_use_and_report_default_substeps(tmp_path):
     path = tmp_path / "stiff.toml"
     text = (SCENARIOS / "omega-pair.toml").read_text()
     path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))

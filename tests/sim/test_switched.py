@@ -57,7 +57,7 @@ def own_hold() -> HeldPlant:
 
 
 def test_mode_products_equal_the_simulated_map():
-    """60 ticks with random ages from a random state equal the product of their mode matrices."""
+    """60 ticks with forces of random ages, from a random state, equal the product of their mode matrices."""
     rng, ticks, depth = np.random.default_rng(0), 60, (3, 2)
     wanted = np.tile(depth, (ticks, 1))
     for k in range(4, ticks):
@@ -289,7 +289,7 @@ def test_lost_packets_leave_only_a_budgets_guarantee():
     assert budgeted.guarantee.energy_J == 0.0
 
 
-def test_a_lost_packet_is_held_for_a_tick():
+def test_a_lost_packet_holds_the_last_force():
     """Ages count from the first tick in which every channel has a force."""
     delays = np.tile(np.array([1, 2])[None, :, None], (30, 1, 1))
     delays[9, 0] = -1

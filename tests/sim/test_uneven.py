@@ -147,7 +147,7 @@ def test_forces_latch_within_their_tick():
         Timing(np.array([1e-3]), np.array([[1e-3]]))
 
 
-def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
+def test_a_run_reports_the_times_of_ticks(tmp_path, capsys):
     file = tmp_path / "r.json"
     recorded = tmp_path / "ticks.txt"
     recorded.write_text("# s\n1.1e-3\n0.8e-3\n\n1.4e-3\n")
@@ -200,7 +200,7 @@ def test_slow_rates_have_no_verdict():
 
 
 def test_slow_creep_is_undecided():
-    """A hand and a spring of 0.011 N/m in all creep against 4.37 N s/m; their mass adds 3e-4 to the rate."""
+    """A hand and a spring of 0.011 N/m in all creep against 4.37 N s/m; the mass changes this rate by 0.03 %."""
     human, spring = Human((Link(0.3, 3.0, 0.01),)), Network(("a",), (Spring(("a", GROUND), 1e-3),))
     changes = {"device": (RigidDevice(damping=1.37),), "human": (human,), "tap": None, "environment": spring}
     scenario = load("one-wall").replace(T=0.02, theta=(1,), period=Periods(0.018, 0.02), duration=1.0, **changes)
@@ -228,7 +228,7 @@ def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     assert not all(row.holds for row in uneven.uneven_ticks(0, 2, 300))
 
 
-def test_latch_positions_are_the_plants():
+def test_latch_positions_follow_the_plants_motion():
     """One person joins two devices; the second device latches first, and its new force then moves the first."""
     rng = np.random.default_rng(4)
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-300 * np.array([[2, -1], [-1, 2]]), -2 * np.eye(2)]])
@@ -286,7 +286,7 @@ def test_both_engines_trace_late_forces():
     found = _examine(Validation(late, NoCoupling(), 0, 2, 1, "both", 0.25), range(2))
     assert found.witnessed.all()
     np.testing.assert_allclose(found.trace, found.exact, atol=1e-6)
-    np.testing.assert_allclose(found.mujoco, found.exact, atol=1e-3)  # RK4
+    np.testing.assert_allclose(found.mujoco, found.exact, atol=1e-3)  # MuJoCo steps by RK4 here
 
 
 def test_the_energy_audit_sees_late_forces():

@@ -93,7 +93,7 @@ def test_drawn_devices_are_within_their_bounds(engine):
 @pytest.mark.slow
 @pytest.mark.parametrize("humans", [60, pytest.param(400, marks=pytest.mark.validate)])
 def test_no_hand_makes_known_devices_unstable(tmp_path, humans):
-    """At 1.001 times the damping of known-device no hand makes a drawn device unstable; the worst one replays."""
+    """With 1.001 times the damping that known-device requires, all drawn sets are stable, and the worst one replays."""
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
     base += ["--duration", "0", "--engine", "exact", "--humans", str(humans), "--links", "mixed", "--no-limiter"]
@@ -206,7 +206,7 @@ def test_mujoco_maps_are_runge_kutta_polynomials(devices):
 
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
-def test_batch_engine_is_the_exact_engine(devices):
+def test_batched_exact_engines_equal_single_ones(devices):
     people = crowd(4, 2)
     held_by = variants(devices, people)
     plants = hold(held_by.plants(), SCENARIO.T)
@@ -261,7 +261,7 @@ class EveryThirdLossless:
 
 
 def test_sampled_traces_are_those_of_all_hands():
-    """MuJoCo traces lossless hands, those nearest to the limit and a random sample; the exact engine, the others."""
+    """MuJoCo traces lossless hands, those nearest to instability and a random sample; the exact engine, the others."""
     people = SCENARIO.replace(population=EveryThirdLossless())
     question = Validation(people, PUBLISHED["I"], 3, 200, 1, "both", 0.3)
     some, every = validate(question), validate(replace(question, all_traces=True))
@@ -456,7 +456,7 @@ def test_adversaries_contradict_certificates_only():
         (["--case", "none", "--coupling", "published"], "with --case none"),
     ],
 )
-def test_bad_calls(options, message, tmp_path):
+def test_bad_options_are_refused(options, message, tmp_path):
     with pytest.raises(InputError, match=message):
         main([*options, "--out", str(tmp_path)])
 
@@ -484,7 +484,7 @@ def test_a_negative_range_is_refused(tmp_path):
         ("[[human", "not valid TOML"),
     ],
 )
-def test_bad_human_files(text, message, tmp_path):
+def test_bad_human_files_are_refused(text, message, tmp_path):
     (tmp_path / "h.toml").write_text(text)
     with pytest.raises(InputError, match=message):
         run_command.main(["--human", str(tmp_path / "h.toml"), "--out", str(tmp_path)])

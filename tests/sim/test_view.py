@@ -120,7 +120,7 @@ def press(running, *names):
 
 
 def test_the_session_is_the_simulation(none):
-    """Frames at any times show the run, but for a rounding per tick, which the unstable mode amplifies sevenfold.
+    """Frames at any times show the run up to one rounding error per tick, amplified sevenfold by the unstable mode.
 
     A block of ticks sums in another order than single ticks.
     """
@@ -216,7 +216,7 @@ def test_a_process_that_runs_away_starts_again():
 # keys, scripts and pushes
 
 
-def test_keys_leave_the_viewer_its_own():
+def test_keys_of_mujocos_viewer_stay_free():
     """MuJoCo's viewer uses the digits 0 to 5, the letters and some other keys."""
     own = {ord(c) for c in "012345ABCDEFGHIJKLMNOPQRSTUVWXYZ [],-=`/;'\\"} | {256, 258, 262, 263, 266}
     assert not own & set(KEYS)
@@ -280,7 +280,7 @@ def test_every_tick_is_made_or_counted_as_lost(steps):
     for step in steps:
         now += step
         assert 0 <= pace.due(now) <= 100
-        # less than a tick is left over after each look
+        # after each call less than a tick is left over
         assert -1e-6 <= now - pace.lost - pace.done * pace.T <= pace.T * (1 + 1e-6)
     assert pace.overruns <= sum(step > 0.098 for step in steps)
 
@@ -406,7 +406,7 @@ def test_the_overlay_says_what_limits_and_shells_do():
     assert _account(shell, none)[1] == f"{acted}no guarantee"
 
 
-def test_a_refusal_is_said_whole_and_once(none):
+def test_a_refusal_is_shown_completely_and_once(none):
     """A refusal of any length stands in a separate part of the window, where no bodies are."""
     running = session(none)
     press(running, "Insert")
@@ -531,7 +531,7 @@ class FakeWindow:
         self.figures.append(figures)
 
 
-def test_the_window_s_loop_without_the_window(none):
+def test_the_window_loop_follows_an_injected_clock(none):
     """Frames come at 60 Hz of an injected clock, the mouse reaches the session, and texts reach the window."""
     running = LiveLoop(none, Inline())
     stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
@@ -581,7 +581,7 @@ def test_arrows_show_what_devices_feel(none):
         assert bar[0] - at[0] == pytest.approx(-f / most * drawing._LONGEST, abs=1e-6)
 
 
-def test_the_window_s_loop_ends_when_it_should(none):
+def test_the_window_loop_ends_at_its_time(none):
     stage = _ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(1000, stage), [0.0]
 
@@ -746,7 +746,7 @@ def test_mp4_without_ffmpeg_is_refused(monkeypatch, tmp_path):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="on other systems no variable names the display")
-def test_without_a_display_there_is_a_line(monkeypatch):
+def test_a_missing_display_is_refused(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"no window can be opened: .*; --video FILE\.gif needs no window"):

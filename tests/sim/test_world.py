@@ -66,7 +66,7 @@ class Touch:
         self.start = float(hands.energy()[0])
 
     def tick(self) -> float:
-        """Return by how much the energy [J] of hands and devices exceeds that at the start."""
+        """Run one tick and return by how much the energy [J] of hands and devices exceeds that at the start."""
         free = self.shell.free(self.hands.x)
         wanted = self.port.step(free[:, 0])[:, None]
         if self.credit:
@@ -195,7 +195,7 @@ TRAY = f"""<mujoco><worldbody><body name="left" pos="-0.05 0 0">{TIP}</body><bod
 UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
-def test_the_shell_credits_released_gravity(tmp_path):
+def test_the_shell_credits_energy_that_gravity_releases(tmp_path):
     """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy, the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
     acted = {}
@@ -250,7 +250,7 @@ def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
 
 @pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
 def test_contacts_that_multiply_a_mass_are_held_back(tmp_path, impedance, gives_J):
-    """Contacts of 0.1 kg hit walls: solimp 0.99 and MuJoCo's default give energy, of which the shell passes W0."""
+    """Contacts of 0.1 kg hit walls: solimp 0.99 and MuJoCo's default give energy; the shell passes at most W0."""
     tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
     walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))
     text = f"""<mujoco><option gravity="0 0 0"/><default><geom solimp="{impedance} 0.001"/></default><worldbody>{walls}
@@ -312,7 +312,7 @@ def test_this_environment_says_nothing_of_a_world():
         (Compliance(Lti.constant([[1e-3, 0.0], [0.0, 0.0]], T)), "is not symmetric and positive definite"),
     ],
 )
-def test_couplings_unfit_for_worlds_are_one_line(coupling, message):
+def test_couplings_unfit_for_worlds_are_refused(coupling, message):
     with pytest.raises(InputError, match=message) as caught:
         simulate(load("world-peg"), coupling)
     assert "\n" not in str(caught.value)
@@ -510,7 +510,7 @@ class _Random:
         return self.rng.normal(size=u0.shape)
 
 
-def test_figures_at_a_port_are_its_sums():
+def test_figures_at_a_port_are_sums_over_ticks():
     """The acting force differs from the sent one, as behind a delay."""
     rng, V = np.random.default_rng(0), SpringDamper([500.0, 700.0], [0.5, 0.4]).compliance(T)
     ports, damping = [_Random(rng, 0.03), _Random(rng, 0.01)], np.array([[1.4, 0.2], [0.2, 1.1]]) / T

@@ -1,4 +1,4 @@
-"""Values of the K-B map equal closed forms and design.conditions; its verdicts equal those of single loops."""
+"""Ratios of the K-B map equal closed forms and those of single couplings; its verdicts equal those of single loops."""
 
 import csv
 import json
@@ -83,7 +83,7 @@ SWEEPS = {
 
 
 @pytest.mark.parametrize("name", SWEEPS)
-def test_the_map_is_that_of_design_margin(name):
+def test_maps_equal_requirements_of_single_couplings(name):
     """Maps begin at 1e-6 rad/sample; the error that this causes grows with the square of the delay, here to 1e-11."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
@@ -139,7 +139,7 @@ def test_a_late_spring_needs_the_closed_form():
         np.testing.assert_allclose(needed, share * K * T, rtol=1e-9)
 
 
-def test_the_stiffest_spring_dampers():
+def test_the_stiffest_certified_spring_dampers_are_known():
     """The largest K is 2740 N/m without delay (2 delta/T), and 1135 with one sample of delay against a wall.
 
     Against every passive environment it is 878.86 N/m at T = 1.2 ms, and inversely proportional to T."""
@@ -174,7 +174,7 @@ def test_a_velocity_filter_is_a_series_spring():
     np.testing.assert_allclose(1 / V.G[0, :, 0, 0], F.at(z)[:, 0, 0] * z, rtol=1e-9)
 
 
-def test_suprema_find_what_a_dense_sweep_finds():
+def test_suprema_equal_those_of_a_dense_sweep():
     centre, width = np.array([0.3, 1.7, 2.9]), np.array([0.05, 0.4, 1.0])
 
     def peaks(w):
@@ -189,7 +189,7 @@ def test_suprema_find_what_a_dense_sweep_finds():
     assert suprema(lambda w: np.where(w > 3, np.nan, w), common, own).tolist() == [np.inf] * 3
 
 
-def test_the_grid_says_what_is_wrong_with_it():
+def test_bad_grids_are_refused_and_defaults_fit():
     sweep = rigid(1)
     for arguments, message in (
         ((8, (10, 5), None), "--K-range is 10,5, expected the lower end first"),
@@ -218,7 +218,7 @@ def test_edges_interpolate_along_their_axis():
 
 
 @pytest.mark.parametrize("links", [1, 0], ids=["simple", "mixed"])
-def test_the_population_is_decided_as_one_by_one(links):
+def test_population_growth_equals_that_of_single_humans(links):
     """The growth equals that of sim.stability for the same humans; 1e-7 1/s is the eigenvalues' rounding over T."""
     sweep = rigid(1)
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 3, 30, links)
@@ -322,7 +322,7 @@ def walled(count):
 
 
 @pytest.mark.parametrize("walls", [0, 1, 2])
-def test_many_processes_are_each_as_alone(walls):
+def test_batched_processes_equal_single_ones(walls):
     """Processes in one buffer equal single ones but for rounding, since sums are in another order."""
     rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
     if walls:
@@ -461,7 +461,7 @@ def audit(tmp_path_factory):
     return code, json.loads((out / "report.json").read_text()), out
 
 
-def test_where_the_limits_of_an_omega3_lie(audit):
+def test_chai3ds_limit_of_an_omega3_is_not_certified(audit):
     code, report, _ = audit
     (mark,) = report["marks"]
     assert code == DOES_NOT_HOLD
@@ -517,7 +517,7 @@ def test_a_failing_mark_or_cell_is_reported():
     assert report(-1.0, good, points=moving, sweep=with_devices(sweep, friction=0.2)).holds
 
 
-def test_the_files_of_a_map(audit):
+def test_a_map_writes_its_files(audit):
     _, report, out = audit
     assert report["files"] == [str(out / name) for name in ("map.csv", "zwidth.png", "report.json")]
     assert json.loads((out / "again.json").read_text()) == report
@@ -553,7 +553,7 @@ def test_maps_show_what_known_devices_allow(tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["certificates", "population", "MuJoCo"])
-def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
+def test_ctrl_c_keeps_finished_parts_of_a_map(stage, tmp_path, monkeypatch, capsys):
     def draw(*arguments):
         def stop(at, done, total):
             if at == stage and done:
