@@ -38,7 +38,7 @@ class TooLong(ValueError):
 # end when a budget is spent. Without a user's time limit they read no clock, so that a busy or slow machine gets the
 # same result as a fast one.
 #
-# One unit is about one second of one core at 2.4 GHz, within a factor of two. The factors below were measured on it.
+# One unit is one second of a core at 2.4 GHz, to a factor of two. The factors below were measured on such a core.
 
 
 _PARTS = 10**12
@@ -100,7 +100,7 @@ def within(
         _counter.most, _counter.message, _counter.over = before
 
 
-_PRODUCT = 5e-8  # [units] one product and one sum of short integers; longer ones were measured up to 5000 bits
+_PRODUCT = 5e-8  # [units] a product and a sum of short integers; the growth with length was measured to 5000 bits
 _DIFFERENCE = 2e-6  # [units] a product and a difference of fractions
 
 
@@ -160,7 +160,7 @@ def compiled(name: str) -> Any:
     folder = Path(scipy.__path__[0], *name.split(".")[1:-1])
     spec = PathFinder.find_spec(name, [str(folder)])
     if spec is None or spec.loader is None:
-        return import_module(name)  # in a package that is laid out in another way
+        return import_module(name)  # This release of SciPy has its modules in other folders.
     sys.modules[name] = module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -297,7 +297,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
     """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
     The matrices come from series of small blocks and are triangular after a permutation. The next pivot is in the row
-    with the fewest entries, and there in the column with the fewest (Markowitz), so that few entries fill in.
+    with the fewest entries, and there in the column with the fewest (Markowitz), so that few zeros become nonzero.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]

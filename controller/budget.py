@@ -46,7 +46,7 @@ from haptic_loop.controller.lti import Array, Lti
 
 START_J = 2e-3  # [J] W0 of a MuJoCo world, unless a run says otherwise
 EPS = 0.05  # share of the damping that a budget does not use
-_UNTOLD = 4096  # ticks that wait for the device's report; older ones keep their largest loss
+_UNTOLD = 4096  # A tick whose report is missing for longer than this number of ticks keeps its largest loss.
 _HUGE = 1e12  # [N] larger forces count as errors
 _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 

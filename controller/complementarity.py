@@ -1,4 +1,4 @@
-"""The nonlinear equations of a tick: complementarity problems of walls and force limits, with a unique solution."""
+"""The nonlinear equations of a tick (controller.tick): complementarity problems of walls and of force limits."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Complementarity(_Problem):
 
 @dataclass(frozen=True, eq=False)
 class BoxProblem(_Problem):
-    """f = q - M v with lower <= f <= upper; v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
+    """Limited forces f and slips v: f = q - M v, lower <= f <= upper; v >= 0 at upper, <= 0 at lower, otherwise 0.
 
     If M is a P-matrix, there is exactly one solution for every q. If minors are zero but none is negative, as for an
     environment without a connection to ground, f is still unique. Then the enumeration skips singular active sets, and
@@ -224,7 +224,7 @@ def _within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BallProblem(_Problem):
-    """f = q - M v with f in a product of balls, and v along the outward normal where f is on the sphere, else 0.
+    """Forces f limited as vectors: f = q - M v with f in a product of balls, v an outward normal on a sphere, else 0.
 
     The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
     diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in

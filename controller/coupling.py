@@ -545,8 +545,8 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
     """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
     Each pole or pair adds a section to a chain, up to the last function whose coefficient is not zero. The states of
-    the chain for the sum of all inputs are sums over the chains of the inputs, as far as the shortest of them reaches.
-    Only its states beyond this length are added.
+    the chain for the sum of all inputs are sums over the chains of the inputs, up to the length of the shortest chain.
+    Only the states of the sum's chain beyond this length are added.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size

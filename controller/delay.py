@@ -127,7 +127,7 @@ class HeldLine:
 
 _Pattern = Literal["constant", "random", "bursty", "adversarial", "recorded"]
 
-_LONGEST = 1000  # [samples]
+_LONGEST = 1000  # [samples] largest delay that a file may have
 
 
 class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -145,7 +145,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if len(self.lo) != len(self.hi):
             lengths = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
-            raise ValueError(f"{lengths}: one each per channel")
+            raise ValueError(f"{lengths}: give one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
             if not 0 <= lo <= hi <= _LONGEST:
                 raise ValueError(
@@ -235,7 +235,7 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if bool(self.recorded) == (self.min is not None or self.max is not None):
-            raise ValueError("period is either min and max or recorded: give one of them")
+            raise ValueError("period: give either min and max, or recorded")
         if self.recorded:
             wrong = [T for T in self.recorded if not 1e-6 <= T <= 0.1]
             if wrong:

@@ -36,7 +36,7 @@ class _Units:
     def __init__(self, shaping: lmi.Shaping, phi: Array | None) -> None:
         loop, self.usable, self.T = shaping.loop, shaping.usable, shaping.loop.T
         names, none = loop.environment.contacts, (0,) * loop.channels
-        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # no effect on the condition
+        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # The condition ignores it.
         self.loop = Loop(1.0, loop.theta, none, none, (1.0,) * loop.channels, anything)
         self.phi = None if phi is None else phi / self.usable
 
@@ -46,7 +46,7 @@ class _Units:
         return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
 
     def block(self, V: Lti) -> Lti:
-        """Return the block of Theorem 4, affine in V, with rows of the multiplier scaled to unit size."""
+        """Return the block of Theorem 4, affine in V; its rows for phi are scaled to a unit diagonal."""
         demand = any_environment_demand(V, self.loop, self.phi)
         block, one = demand.gain + demand.free, np.ones(V.inputs)
         scale = np.diag(np.append(one, 1 / np.sqrt(np.diag(block.D)[V.inputs :])))
@@ -65,7 +65,8 @@ class _Units:
 class _FixedOrder:
     """The couplings with `order` states per channel; the unknowns p are the free entries of A, B and V1.
 
-    phi (m,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay.
+    phi (m,) [N s/m] is the multiplier of a delay psi >= 1; None without such a delay. If `diagonal`, V has no entries
+    between different channels.
     """
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
@@ -167,9 +168,9 @@ class _Lemmas:
         self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
 
     def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
-        """Return the inequalities in the unknowns.
+        """Return Lemmas 2 and 3 as inequalities in the unknowns v; `every` holds the indices of v.
 
-        `parts` splits them into p - at, Q, a lower bound of Q^-1, U, a lower bound of U^-1, and mu^2/norm^2.
+        `parts` splits v into p - at, Q, a lower bound of Q^-1, U, a lower bound of U^-1, and mu^2/norm^2.
         """
 
         def passivity(v: Array) -> Array:
@@ -211,14 +212,14 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
 # positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
 # X) the feasible set shrinks to a convex part of itself that still contains the current coupling. Each semidefinite
-# program (SDP) therefore improves on the last one, mu^2 enters linearly, and there is no bisection. In state
+# program (SDP) therefore improves on the previous one. It needs no bisection, because mu^2 enters linearly. In state
 # coordinates with Q0 = I the tangent is 2I - Q.
 
 
 _Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu
 _SETTLED = 1e-4  # The descent ends after a step that improves the norm by less than this share.
-_FIRST_ROOM = 0.05  # relative room above the initial norm for the first certificate
-_LEAST, _MOST = 0.1, 1.99  # bounds of Q and U in a step that starts at I, so that unexcited states do not degenerate
+_FIRST_ROOM = 0.05  # The first storage U proves a norm that is larger than the initial norm by this share.
+_LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step from I; they keep 2I - Q, 2I - U positive
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
@@ -256,7 +257,7 @@ def _descended(family: _FixedOrder, p: Array, norm: float, holds: _Judge, budget
 
 
 def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
-    """Solve one SDP in (p - at, Q, U, mu^2/norm^2) and return p, Q and U."""
+    """Solve one SDP in (p - at, Q, U, mu^2/norm^2) for the least mu and return its p, Q and U."""
     nq, nu = lemmas.LQ.shape[0], lemmas.LU.shape[0]
     ends = np.cumsum([lemmas.at.size, lmi.packed(nq), lmi.packed(nu)])
     every = range(ends[-1] + 1)
@@ -288,9 +289,10 @@ def design(
     diagonal: bool = True,
     most_sdps: int = budgets.FIXED_ORDER_PROBLEMS,
 ) -> Design:
-    """Design a coupling with `order` states per channel, from strictly feasible spring-damper gains.
+    """Design a coupling with `order` states per channel by a descent from strictly feasible spring-damper gains.
 
-    Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
+    If `diagonal`, the coupling does not join channels. The descent has at most `most_sdps` steps. Raises Infeasible if
+    Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
     whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")

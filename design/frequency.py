@@ -1,4 +1,7 @@
-"""Suprema over frequency, on a grid that is dense near poles, with refinement between its points."""
+"""Suprema, peaks and integrals over frequency, for the sweeps of all conditions.
+
+Grids are dense near poles, and peaks are refined between the points of a grid.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +21,16 @@ from haptic_loop.design import budgets
 
 
 _ERROR = 1e-6  # relative error of an integral
-_ROUNDING = 1e-20  # least mean that counts: the squared difference of two responses that agree to ten digits
+_ROUNDING = 1e-20  # Smaller means count as 0: rounding causes them in squared differences of nearly equal responses.
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
 def integral(response: Callable[[Array], Array], grid: Array) -> float:
     """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
-    Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval is halved if
-    the two results differ by more than its share of _ERROR, relative to the integral. Because rounding would cause
-    endless halving, means below _ROUNDING do not count. If too many intervals qualify, only the worst are halved.
+    Gauss's rule with three points is applied to each interval of the grid and to its halves. An interval that is the
+    share s of the range is halved if the two results differ by more than s _ERROR times the integral, unless the mean
+    of their difference is below _ROUNDING. If too many intervals qualify, only the worst are halved.
     """
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
@@ -60,7 +63,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 # `suprema` does the work of `supremum` for many functions of frequency at once, with one row for each function.
 
 
-_PEAKS = 3  # highest local maxima of a row that are refined
+_PEAKS = 3  # number of highest local maxima of each function that are refined
 _POINTS, _ROUNDS = 17, 8  # A round divides a bracket by (_POINTS - 1)/2; eight rounds find a smooth peak to rounding.
 
 _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
@@ -97,7 +100,7 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
 
 
 def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
-    """Return the frequencies (n, peaks) of the grid below and above `at`; a grid may contain a frequency twice."""
+    """Return the frequencies (n, peaks) of the grid next below and above `at`; a grid may contain a frequency twice."""
     room = 1e-12 * grid[:, -1:]
     below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
     above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
@@ -125,12 +128,12 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
 
 
 _POINTS_SWEPT = 3000  # approximate number of points in a grid and its refinement
-_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: a point's response per inputs x states^2, a Schur form per states^3
+_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: one response per inputs x states^2, one Schur form per states^3
 _POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep
 
 
 def _sweep_cost(G: Lti) -> float:
-    """Return the time of a sweep of G [s], correct to a factor of three; delays at the outputs of G cost nothing."""
+    """Estimate the time of a sweep of G [s] to a factor of three; delays at the outputs of G cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
@@ -276,7 +279,7 @@ _EIGHTHS = np.arange(1, 8)[:, None] / 8
 
 
 def _narrowed(response: Response, bracket: Array) -> Array:
-    """Return each bracket narrowed to the best of its points and 16 more, with the neighbours of the best."""
+    """Return new brackets: the best of each bracket's three points and of 16 trial points, with its two neighbours."""
     (left, middle, right), (low, high, last) = bracket
     width = right - left
     with np.errstate(divide="ignore", invalid="ignore"):  # Equal points or values give the middle.
@@ -362,4 +365,4 @@ def _least_of_two(a: Array, d: Array, b: NDArray[np.complex128]) -> tuple[Array,
     return (a + d) / 2 - radius, v / np.where(size == 0, 1.0, size)[:, None]
 
 
-_ROWS_AT_ONCE = 12  # rows up to which all eigenvectors are faster
+_ROWS_AT_ONCE = 12  # largest number of rows for which it is faster to compute all eigenvectors

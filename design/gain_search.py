@@ -1,10 +1,10 @@
-"""Design spring-damper gains for one environment by a local search from several starts.
+"""Search spring-damper gains for one environment, from several starts (called by design.spring_damper).
 
 The feasible set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by
-sequential quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a
-violation are added, until the gains pass the sweep or a budget is spent.
+sequential quadratic programming with the condition at sampled frequencies. The frequency at which a refined sweep finds
+the worst violation is added, until the gains pass the sweep or a budget is spent.
 
-For each channel the block of a condition is affine in G = (I + Psi E V)^-1 Psi E and affine in the multiplier. So its
+The block of a condition is affine in G = (I + Psi E V)^-1 Psi E and, for fixed G, in the multiplier. So its
 responses at G = 0 and G = I, each with the multipliers 0 and 1, determine all its values and slopes. Only the block of
 known devices is not affine in its multiplier; `KnownDeviceLoop` computes it anew at each x.
 """
@@ -35,7 +35,7 @@ from haptic_loop.design.transparency import BAND_HZ, rms_mismatch
 
 #: share of the damping that the condition at sampled frequencies leaves unused, for violations between them
 _SAMPLED_RESERVE = 1.5 * RESERVE
-SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+SOFTEST, STIFFEST = 1.0, 1e6  # [N/m] bounds of K in the search
 _CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
 _STUCK = 1e-3  # A search that ends with a larger violation than this has no feasible point nearby.
 FEW = 12  # largest number of channels for which steps are cheap
@@ -108,11 +108,11 @@ class SampledLoop:
         return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
     def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
-        """Return the demand, affine in G and the multiplier mu (active,)."""
+        """Return the condition's demand for G and the multiplier mu (active,)."""
         return this_environment_demand(self.loop.late(G), self.loop)
 
     def block(self, G: Sampled, mu: Array) -> Sampled:
-        """Return the block with 1 - _SAMPLED_RESERVE times the damping."""
+        """Return the condition's block for the share 1 - _SAMPLED_RESERVE of the damping."""
         demand = self.demand(G, mu)
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
@@ -132,7 +132,7 @@ class SampledLoop:
         self._impose(np.append(self.conditions, w))
 
     def _impose(self, w: Array) -> None:
-        """Sample loop and condition at w (k,): the block's entries at G = mu = 0, their slopes in G, mu and G mu."""
+        """Sample the loop at w (k,), and the block's entries at G = mu = 0 with their slopes in G, mu and G mu."""
         self.conditions, m = w, self.loop.channels
         self._sample("conditions", w)
         self._known.clear()
@@ -275,7 +275,7 @@ _Differentiable = tuple[Callable[[Array], Any], Callable[[Array], Any]]  # a fun
 def _slsqp(
     objective: _Differentiable, constraint: _Differentiable, x: ArrayLike, bounds: Any, most: int, ftol: float
 ) -> Array:
-    """Return x (n,) after at most `most` steps of SLSQP: least objective where constraint(x) (m,) >= 0.
+    """Minimise the objective subject to constraint(x) (m,) >= 0 by at most `most` steps of SLSQP; return x (n,).
 
     With SciPy 1.17 the compiled routine is called in a loop like that of `minimize`, because the import of
     scipy.optimize takes 0.2 s. The routine's state and workspace differ between releases, so with any other release
@@ -314,7 +314,7 @@ def _slsqp(
 def _shared(loop: Loop) -> tuple[list[int], Array]:
     """Return the first channel of each device, and a matrix (m, m) of means over the axes of each device.
 
-    The matrix maps one number per channel to the mean over the channel's device, because its axes share c or alpha.
+    The matrix maps one number per channel to the mean over the channel's device, whose axes share c or alpha.
     """
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
@@ -362,7 +362,7 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """The loop with limited forces: x = (log K, B/delta, c), where c is the weight of lag 1 for each channel."""
+    """The loop with limited forces: x = (log K, B/delta, c), with the limiter's weight c of lag 1 per channel."""
 
     bounds = (0.0, 5.0)
     _first = 0.5  # first value of the weight
@@ -485,7 +485,7 @@ def least_rms(
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
     `sampled` makes the loop, and the search from each start uses a copy. For more than FEW channels the first optimum
-    is returned, because steps are expensive and the start hardly matters; `likeliest_first` sorts the starts.
+    is returned, because steps are expensive and the start hardly matters. The caller sorts the starts.
     """
     first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None

@@ -6,12 +6,12 @@ motor's mass keeps its speed continuous. The bounds are the motor's least mass m
 P = k_max^2/b_min, and b_max. Let beta > 0 [s] be any number, and let the force f be held in each period. Then the
 motor, its transmission and every passive hand behind the transmission satisfy
 
-    sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 a^2,
+    sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = least integral of c0 v^2 + c2 a^2 over the period,
 
 with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b_max/4, the motor's displacement dx in a period, its speeds v and v+
-at the ends, dv = v+ - v, and its acceleration a. docs/theory.md has the proof. The blocks below state that the
-environment's side returns less energy than L. design.necessary computes a lower bound of the damping that conditions
-on these devices require.
+at the ends, dv = v+ - v, and its acceleration a. L is the least over all motions with these dx, v and v+.
+docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
+design.necessary computes a lower bound of the damping that conditions on these devices require.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def shortest_period(loop: Loop) -> float | None:
 
 
 class _Known(NamedTuple):
-    """The bounds of the devices, (m,) each, in one arithmetic."""
+    """The bounds of the devices, (m,) each, all as floats or all as Fractions."""
 
     P: Any  # [N/(m s)] largest k^2/b of the transmission
     damping: Any  # [N s/m] largest damping of the transmission
@@ -158,7 +158,7 @@ def _principal_axes(level: Rows) -> tuple[Any, tuple[float, ...]]:
 
     Q is the Cayley transform of a rational skew matrix S and therefore exactly orthogonal. The eigenvectors come from
     Jacobi's rotations, whose additions, products and roots round alike on every machine. So every machine can check a
-    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii. Raises NotProved if this is not positive.
+    proof. d is the diagonal of Q' Delta Q less the Gershgorin radii. Raises NotProved if an entry of d is not positive.
     """
     n = len(level)
     A, V = np.array(level, dtype=float), np.eye(n)
@@ -225,7 +225,7 @@ def _check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], ab
             least, most = (flint.arb(_fmpq(value[i])) for value in (below, above))
             if not (below[i] > 0 and least < short and long < most):
                 between = f"{float(below[i])!r} to {float(above[i])!r}"
-                raise NotProved(f"q #{i + 1} lies outside of its bounds on file, {between} s")
+                raise NotProved(f"q of channel {i + 1} is not proved to lie within the file's bounds, {between} s")
 
 
 def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
@@ -347,11 +347,11 @@ class Sweep:
         return float((beta**2 * self.P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
 
     def holds(self, idle: Complex, z: Complex, share: Any, beta: Array) -> NDArray[np.bool_]:
-        """Return whether the block is positive at each frequency, (k,)."""
+        """Return whether the block with the L of this share of the damping is positive at each frequency, (k,)."""
         return positive(_with_cost(idle, z, period_cost(self.loop, np.broadcast_to(share, z.shape), beta), self.moves))
 
     def shares(self, idle: Complex, z: Complex, beta: Array, high: float, steps: int = _BISECTIONS) -> Array:
-        """Return the least share (k,) up to `high` at each frequency; inf if `high` is not enough."""
+        """Return the least share (k,) up to `high` that `holds` at each frequency; inf where `high` is not enough."""
         k, low = z.size, self.floor(beta)
         if not low < high:
             return np.full(k, np.inf)
@@ -390,7 +390,7 @@ class Sweep:
 
 
 class _Search:
-    """The search for beta and multipliers.
+    """The search for the beta and multipliers that require the least share of the damping.
 
     The unknowns are x = (beta [s] per device, multipliers in their units, share of the damping). The multiplier alpha
     of switching delays is replaced by 1/alpha. All axes of a device have one beta, as matrix levels require.
@@ -414,7 +414,7 @@ class _Search:
         return x[: self.m][self.device]
 
     def parts(self, environment: int, w: Array) -> tuple[Complex, Complex]:
-        """Return z (k,) and blocks (.., k, n, n): for zero beta and multipliers, then slopes in each of these.
+        """Return z (k,), and the block at zero beta and multipliers with its slopes in each of them, (.., k, n, n).
 
         The margin `spare` of the demand is subtracted from the first block.
         """
@@ -462,7 +462,7 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n) with L; rows of switching delays are scaled, which makes it concave in x."""
+        """Return the block (k, n, n) with L; rows of switching delays are scaled, by 1 at `at`, to make it concave."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = _with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:  # 1/alpha
@@ -508,7 +508,7 @@ class _Search:
         return share, binding
 
     def room(self, z: Complex, parts: Complex, idle: Complex, x: Array) -> Array:
-        """Return the least eigenvalue (k,) of the block with L, each scaled to a diagonal of about one."""
+        """Return the least eigenvalue (k,) of each block with L, after scaling its diagonal to about one."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block = _with_cost(idle, z, cost, self.sweep.moves)
         terms = np.abs(np.diagonal(parts, axis1=2, axis2=3)) * np.abs(np.concatenate([[1.0], x[:-1]]))[:, None, None]
@@ -571,7 +571,7 @@ class _Search:
             self.tangents.append(self.tangent(z[at : at + 1], parts[:, at : at + 1], x))
 
     def lowest(self, x: Array) -> list[tuple[int, int]]:
-        """Return (environment, place of the frequency) of the least local minima of the room."""
+        """Return (environment, index of the frequency) of the _VIOLATED least local minima of `room`."""
         minima = []
         for e, (z, parts) in enumerate(self.sampled):
             room = self.room(z, parts, self.idle(z, parts, x), x)
@@ -790,9 +790,9 @@ class KnownDevice(Condition):
         """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid.
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
-        beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map needs thousands of
-        couplings. Returns None for matrix levels or if the plain condition returns None, and inf if this condition does
-        not cover the loop or has multipliers of facts.
+        beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map over K and B (sim.zwidth)
+        needs thousands of couplings. Returns None for matrix levels or if the plain condition returns None, and inf if
+        this condition does not cover the loop or has multipliers of facts.
         """
         plain = None if loop.levels else self.plain.ratios(loop, coupling)
         if plain is None or self.unknowns(loop) or self.beyond(loop):

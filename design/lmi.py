@@ -1,7 +1,7 @@
 """The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
-`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
-arrays or cvxpy expressions.
+The designs by Theorem 4 use them. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive
+(semi)definite; their arguments are arrays or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them. The remedies are in
 design.conditions; the formulas here have T = 1:
@@ -162,7 +162,7 @@ def reachability_scaled(G: Lti) -> Array:
         warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
         try:
             W = scipy.linalg.solve_discrete_lyapunov(A, W)
-        except scipy.linalg.LinAlgWarning:  # Stiff blocks: sum A^k B B' A'^k; each step doubles the number of terms.
+        except scipy.linalg.LinAlgWarning:  # Then A^k B B' A'^k is summed; each step doubles the number of terms.
             while np.abs(step := A @ W @ A.T).max(initial=0.0) > 1e-16 * np.abs(W).max(initial=0.0):
                 W, A = W + step, A @ A
     size = max(np.trace(W) / max(G.order, 1), 1e-300)

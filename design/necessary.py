@@ -1,7 +1,7 @@
 """The necessary damping of devices with known motor and transmission (Theorem A), by a sweep.
 
-A linear motor (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper b in
-parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
+A motor with linear dynamics (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper
+b in parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
 responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
 conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
 held. With one channel, or channels with equal devices, every point of the disk is attained by some passive hand, and
@@ -69,8 +69,8 @@ _SMALL, _LARGE = 1e-6, 1e3  # bounds of the search for the least share of the da
 def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand makes the loop unstable, by a refined sweep.
 
-    Motors are assumed to be linear. For one channel or equal devices no condition on these devices requires less than
-    this share. Otherwise the share is sufficient, and close to the least one.
+    The motors' dynamics are assumed to be linear. For one channel or equal devices no condition on these devices
+    requires less than this share. Otherwise the share is sufficient, and close to the least one.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels

@@ -96,7 +96,7 @@ def design_with(
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
     **options: Any,
 ) -> Optimal:
-    """Design the optimal coupling for Options(**options); `progress` is called after each basis."""
+    """Design the optimal coupling under `condition` for Options(**options); call `progress` after each basis."""
     chosen, done = program.Options(**options), 0
 
     def reached(result: _BasisResult) -> None:
@@ -186,7 +186,7 @@ def _over_bases(
 
 #: tried shares of the largest beta, the same in all channels, because different shares gain hardly anything
 _ETAS = 0.15, 0.3, 0.5
-_SCALINGS = 6  # most scalings of the forces; each reduces them by at least MARGIN
+_SCALINGS = 6  # largest number of scalings of the forces; each reduces them by at least the share MARGIN
 
 
 def _for_known_devices(
@@ -411,6 +411,10 @@ class _Search:
         heavier: float,
         least: float,
     ) -> Optimal:
+        """Return the optimum over a basis with one limiter, or None for `slip`, scaled so that every sweep passes.
+
+        The proof is not tried if the optimum gains less than `least` [dB] over the solution `before`.
+        """
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])
         problem = program.Problem(self.span(taps, poles), self.cases_with(slip), self.options, soft, heavier=heavier)
@@ -447,11 +451,10 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, need: Callable[[Loop, Coupling], float] = ratio_in
     ) -> tuple[ForceFilter, list[float]]:
-        """Return (the coupling that serves all environments, share of the damping that each environment needs).
+        """Return (coupling, required over available damping in each environment); `need` computes this ratio.
 
-        The program is first solved for the nominal environment. Environments that need too much damping are added, and
-        it is solved again.
-        `need` returns required over available damping in an environment.
+        The program is first solved for the nominal environment. While an environment needs more than 1 + _TOLERATED
+        times the damping, the two worst ones are added, and the program is solved again.
         """
         active = [0]
         while True:

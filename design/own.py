@@ -57,7 +57,7 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
     if other is not None and Path(getattr(other, "__file__", None) or ".").resolve() == file:
         return other
     if other is not None and other not in _LOADED.values():
-        raise InputError(f"{option} is {text!r}: another module of the name {file.stem} is loaded, rename the file")
+        raise InputError(f"{option} is {text!r}: another module with the name {file.stem} is loaded; rename the file")
     reach(str(file.parent))
     spec = spec_from_file_location(file.stem, file)
     assert spec

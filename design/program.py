@@ -1,4 +1,4 @@
-"""Convex program of the optimal coupling: a basis of filters R, the constraints of F = Theta R Psi E, the optimum.
+"""The convex program of the optimal coupling (design.optimal): bases of R, constraints on F = Theta R Psi E, solution.
 
 All constraints are affine in R, and R = kappa I satisfies each of them for a small kappa, so a start always exists.
 Each constraint is a linear matrix inequality at every frequency. design.barrier solves the program on a grid of
@@ -60,7 +60,7 @@ SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch so far, 
 _EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
 _LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
-_DECIMALS = 10
+_DECIMALS = 10  # decimal places of g and of R's coefficients
 # Duality gaps before the first and before each later sweep, relative to the objective, or to the difference between the
 # objectives of zero force and of the solution, whichever is less.
 _GAPS = (0.05, 0.01)
@@ -238,7 +238,7 @@ class Span:
 
     poles: Array  # (n,) real poles; 0 for a tap
     pairs: Array  # (p, 2) coefficients a, b of z^2 + a z + b
-    used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1)
+    used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1) whether an entry is an unknown; the others are 0
 
     @property
     def unknowns(self) -> int:
@@ -353,7 +353,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Program in the unknowns [g, R_1, R_2, .., own unknowns of the constraints]: objective and inequalities."""
+    """Objective and inequalities in the unknowns [g, R_1, R_2, .., own unknowns of the constraints]."""
 
     span: Span
     cases: tuple[Case, ...]

@@ -1,4 +1,4 @@
-"""Records of requirements and designs, and the errors of designs."""
+"""Records of the damping that conditions require, of couplings and of designs, and the errors of designs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
-#: the environments of a certificate
+#: the environments that a certificate covers
 Environments = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the names of all conditions, in the order of tables
@@ -61,7 +61,7 @@ def suffices(ratio: float | Array) -> bool | NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Requirement(Generic[C]):
-    """The damping that a condition requires of the m devices, and the damping that they guarantee.
+    """The damping that a condition requires of the devices' m channels, and the damping that they guarantee.
 
     Attributes:
         condition: The name of the condition.

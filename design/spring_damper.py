@@ -1,7 +1,7 @@
-"""Designs of couplings: the spring-damper (26) of least objective or of largest stiffness, and the moving average.
+"""Design spring-dampers (26) of least objective or of largest stiffness, and moving averages.
 
-The gains that any-environment certifies form a convex set, described here. design.gain_search searches gains for one
-environment.
+The gains that any-environment certifies form a convex set, described here. For this-environment and known-device,
+`design` uses the search of design.gain_search.
 
 `_GainSet` has gains in units of the usable damping d = (1 - RESERVE) delta T/T_max: k = K T/d, b = B/d.
 """
@@ -62,7 +62,7 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # frequencies at which the solution violates it are added. Both methods give the same gains.
 
 
-_MOST_STORED = 180  # largest number of unknowns besides the gains, of all channels
+_MOST_STORED = 180  # largest number of entries of all channels' storage matrices
 _PER_LOBE = 8  # initial frequencies per ripple of a delay
 _MISSED = 2e-6  # allowed violation between frequencies, relative to the usable damping; far below a design's reserve
 
@@ -75,7 +75,7 @@ class _Channel:
     shortage: float  # the channel's phi over its usable damping; 0 if psi = 0
 
     def rows(self, gains: Array) -> Lti:
-        """Return the block c of the condition k/2 + b >= |c|^2 on |z| = 1; only its C and D depend on the gains."""
+        """Return c(z) of the condition k/2 + b >= |c|^2 on |z| = 1; only its matrices C and D depend on the gains."""
         k, b = gains
         late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
         window = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
@@ -84,7 +84,7 @@ class _Channel:
         return vstack(window, (np.eye(1) - window) * (1 / np.sqrt(1 / self.shortage - 1)))
 
     def exactly(self, unknowns: Sequence[int]) -> Inequality:
-        """Return the inequality at all frequencies; the unknowns after the gains are a storage."""
+        """Return the inequality at all frequencies; the unknowns after k and b are entries of a storage matrix."""
 
         def matrix(x: Array) -> Array:
             c = self.rows(x[:2])
@@ -166,8 +166,8 @@ def _gain_block(
 ) -> Inequality:
     """Return the inequality [[base, rows*], [rows, t I]] >= 0, where t is the last of the unknowns.
 
-    rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). For base >= 0 it means
-    rows* rows <= t base.
+    rows (k, p, m) has slopes (q, k, p, m), and base (k, m, m) has slopes (q, k, m, m). If base >= 0, the inequality
+    means rows* rows <= t base.
     """
     q, k, p, m = row_slopes.shape
     constant = np.zeros((k, m + p, m + p), dtype=np.complex128)
@@ -244,7 +244,7 @@ def design(
     Raises:
         Infeasible: Theorem 4 admits no gains.
         DesignFailed: No gains were found, or any-environment or known-device-any does not certify them.
-        ValueError: The condition does not cover an argument.
+        ValueError: The condition does not cover the limiter, varying delays, or another argument.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if loop.varying_delay or limiter:
@@ -343,6 +343,10 @@ def _for_this_environment(
     limiter: bool,
     band_hz: tuple[float, float] | None,
 ) -> Design:
+    """Return the spring-damper of least rms mismatch that this-environment certifies.
+
+    With `limiter` and up to FEW channels a first search ignores the limits, and a second one starts from its gains.
+    """
     each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
     if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
         raise DesignFailed(None, (), reason)
@@ -553,10 +557,10 @@ _STIFF_DIGITS = 6
 def _default_starts(loop: Loop) -> list[SpringDamper]:
     """Return couplings from which a search starts, with 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
 
-    For psi = 0 this is half the largest stiffness for any environment, with the usable damping d [N s/m].
+    d is the usable damping [N s/m]. For psi = 0 the stiffness is half the largest one for any environment.
 
     With delay in the environment, the loop of coupling and environment is stable if the coupling is stiffer than the
-    environment at every frequency. Therefore the last start is stiffer at half the sampling rate.
+    environment at every frequency. A further start is therefore stiffer than it at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))

@@ -14,7 +14,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
-BAND_HZ = (0.5, 80.0)
+BAND_HZ = (0.5, 80.0)  # default band of the mismatch
 _ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
 
 
@@ -57,7 +57,7 @@ class Transparency:
     def reason(self) -> str | None:
         """The reason why a figure is infinite in decibels, or None."""
         if self.relative_mismatch == 0:
-            return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
+            return "the devices feel the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
             return "some motion of the object takes no static force, and tau (25) divides by the least force"
         return None
