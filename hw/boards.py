@@ -21,8 +21,9 @@ from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.monitor import CommandMonitor
 
 _CLEARLY_FASTER = 1e-4  # relative difference of two clocks that stands out from jitter after _COMPARED ticks
-_EARLY = 1 / 16  # [periods] least lead, the time by which a sample precedes the leading board's, so that no step waits
-_TOO_EARLY = 1.5  # [periods] largest lead of a sample; with a longer one, the board's force may come too late
+# The lead of a sample is the time by which it comes before the leading board's sample of the same step.
+_EARLY = 1 / 16  # [periods] least lead; with less, steps may have to wait for the sample
+_TOO_EARLY = 1.5  # [periods] largest lead; with more, the board's force may come too late
 _SMOOTHED = 31  # number of leads whose median is used; a host that freezes for a few ticks does not change the median
 _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
@@ -66,7 +67,7 @@ class _Board:
         self.waited: dict[int, int] = {}  # [us] by source: time from the arrival of a sample to its answer
         self.offset: int | None = None  # the board's tick number minus the step's
         self._shift_at: int | None = None  # step from which on the offset is smaller by one
-        self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
+        self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] leads of its last samples
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
         """Receive a STATE. Raises SafetyStop if the board keeps applying wrong forces, or holds one for too long."""
@@ -99,7 +100,7 @@ class _Board:
         return came[0] if came else None
 
     def follow(self, step: int, at: int, driving: bool) -> None:
-        """Shift the pairing of steps so that samples precede the leading board's by about a period at most.
+        """Shift the pairing of steps and samples where the median lead is outside of its limits.
 
         Raises SafetyStop if this clock is clearly faster than the leading one, or slower by more than CLOCK_TOLERANCE.
         """
@@ -290,8 +291,8 @@ class Boards:
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
         """Return one STATE with the worst phase and margin, the sum of errors, and the axes of all boards in order.
 
-        In each step the misses grow by the largest number of a board. The phases come from the last STATE of every
-        board, not from the samples of the step, so a fault shows at once.
+        In each step the misses grow by those of the board that missed most. The phases come from the last STATE of
+        every board, not from the samples of the step, so a fault shows at once.
         """
         last = [board.last for board in self._boards if board.last]
         worst = min(last, key=lambda state: _FAULTS.index(state.phase) if state.phase in _FAULTS else len(_FAULTS))

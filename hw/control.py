@@ -39,9 +39,9 @@ from haptic_loop.sim.world import START_J, scene_of
 
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
-_SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder is 0.03 m/s
+_SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder in it is 0.03 m/s
 _JOLT = 20.0  # [N] motor and hand together never apply this force for one tick and its opposite for the next
-_FALLBACK = ("spring-damper", "any-environment")  # designs of softer couplings, if the requested kind gives none
+_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves that the requested kind cannot give
 
 
 class Controller(Protocol):
@@ -305,9 +305,9 @@ class Drive:
         self._uneven = deque[float](maxlen=3)  # [s] differences of the last ticks from T
         late = settings.behind or (0,) * config.axes
         axes = zip(expected.mass, expected.mode, still, units.encoder_step, late, strict=True)
-        #: (m,) [m] displacement by such a force, or of a motor that swings on its transmission at the speed limit; by
-        #: noise and rounding of four counts, and by a repeated sample. The mass of a device that is being identified
-        #: is unknown, so that any displacement up to `jump` is possible.
+        #: (m,) [m] largest jolt (`check_jolt`): by the force _JOLT, or by a motor that swings on its transmission at
+        #: the speed limit; plus the noise of the four positions, plus a repeated sample. The mass of a device that is
+        #: being identified is unknown, so that any jolt up to `jump` is possible.
         self._jolts = [
             max(_JOLT * limits.lever * T**2 / mass, 4 * limits.speed / w * math.sin(min(w * T, math.pi) / 2) ** 3)
             + 2 * n * q
@@ -325,7 +325,7 @@ class Drive:
 
     @property
     def request(self) -> str | None:
-        """Return what the person at the device has to do before the last motor test can go on, or None."""
+        """Return what the person at the device must do before the motor test at the end can go on, or None."""
         return self._last_test.request if self._last_test else None
 
     def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
@@ -573,7 +573,7 @@ def certified_coupling(
     else:
         assessment = assessed(alone, case, chosen, limiter=limiter)
     spare = (n - more for n, more in zip(slower.theta, later, strict=True))
-    waits = min(MAX_THETA, *spare) if link else 0  # the host adds the rest of longer delays
+    waits = min(MAX_THETA, *spare) if link else 0  # ticks that the device waits; the host adds the rest of theta
     certified = CertifiedCoupling(waits, slower, case, chosen, assessment, behind)
     if not certified.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"

@@ -1,7 +1,7 @@
-"""The device's side of the link, without clock or port: safety states, and forces latched at tick k + theta.
+"""The device's side of the link, without clock or port: its safety states, and the latch of its forces.
 
-With theta = 0 a force is latched as soon as it comes, within the tick that it answers. The caller must then set the
-motors to `applied` at once.
+A force that answers the sample of tick k is latched at tick k + theta. With theta = 0 it is latched as soon as it
+comes, within tick k, and the caller must then set the motors to `applied` at once.
 
 This state machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
 There are two implementations because each tests the other, and because rehearsals and Force Dimension devices run this

@@ -41,7 +41,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction reaches 3/4 of its maximu
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] assumed if the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed half of the workspace
-_SETTLED = 203  # ticks at the full cap of the device before the person starts to move; the host's gain may rise later
+_SETTLED = 203  # ticks at the device's full cap before the person starts to move; the host's gain may reach 1 later
 _FARTHEST = 2**31 - 1  # [counts] largest count that STATE can carry
 
 
@@ -69,7 +69,7 @@ _DEVICE = {
         0.0,
         0.0,
     ),
-    "period": ("length of a tick in T", 0.5, 4.0, 2.0),
+    "period": ("length of a tick as a multiple of T", 0.5, 4.0, 2.0),
     "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
@@ -467,7 +467,7 @@ class Emulator:
                     self.device.fault()
                 case "letgo":
                     self.device.deadman = False
-                case kind if kind in _AXIS:  # all others of an axis happen to its encoder
+                case kind if kind in _AXIS:  # all other faults of one axis happen to its encoder
                     earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
                     self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
 

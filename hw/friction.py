@@ -15,13 +15,13 @@ parameters except the a before g, so a fit takes milliseconds. A fit needs no in
 
 Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
 vanishes at high speed (Stribeck). The law is not known, so all _SLIPS are tried, and all _BRISTLES longer than an
-encoder step. Each law that fits almost as well as the best counts in the bound. Each fit includes a drag q >= 0; of b
-and q, only b is guaranteed. The periodic term holds forces and encoder errors that repeat with position (a motor's
-poles, an encoder's eccentricity). Their periods are searched in the residual.
+encoder step. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term holds forces and
+encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods are searched in the
+residual.
 
 For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
-the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit,
-less the share SCALE.
+the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit
+almost as well as the best one, less the share SCALE.
 
 The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
 with such friction, b is a lower bound at every speed.
@@ -42,7 +42,7 @@ _WINDOW = 0.012  # [s] least standard deviation of h; this h halves amplitudes a
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] rounding noise allowed in accelerations; a coarse encoder gets a longer window
 _SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that friction depends on; sets the shortest window
 _SPACING = 0.4  # distance of two rows, in standard deviations of h: filtered signals have no finer detail
-_NEARBY = 3.5  # least distance from a row to a tick at which the balance does not hold, in standard deviations of h
+_NEARBY = 3.5  # least distance of a row from a tick at which the balance does not hold, in standard deviations of h
 _REACH = 6  # standard deviations at which a window is cut off
 _STILL = 0.02  # [s] an axis is at rest if its encoder stays within one count for this long
 #: [m/s] speed at which dry friction reaches 3/4 of its maximum

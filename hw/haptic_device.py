@@ -1,8 +1,8 @@
 """The four calls to a device that a session needs. `Driver` in hw/driver.py makes them.
 
 There are three implementations: a device at a serial port (docs/protocol.md), several of them (hw/boards.py), and
-devices that the host clocks (hw/force_dimension.py). A call waits for at most 0.5 ms, or a tick, because keys, signals
-and time-outs are handled between two calls.
+devices that the host clocks (hw/force_dimension.py). A call waits for at most 0.5 ms, or to the end of the tick if the
+host is the clock, because keys, signals and time-outs are handled between two calls.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class HapticDevice(Protocol):
 
 
 class _BytePort(Protocol):
-    """A port for bytes. Where the port is gone, `read` raises PortLost; `write` and `discard` may."""
+    """A port for bytes. If the port is gone, `read` raises PortLost; `write` and `discard` may raise it, too."""
 
     def wait(self, seconds: float) -> bool:
         """Wait for bytes for at most `seconds`, and return whether there are any."""

@@ -363,7 +363,7 @@ def probe_delay(T: float) -> int:
 def watchdog_for(T: float) -> int:
     """Return the allowed silence [us] of a device that ticks every T [s]: five ticks, but at least 6 ms for busy hosts.
 
-    Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a device may push without a new force.
+    Raises ValueError if that is more than MAX_RELEASE_NS, in which a device without new forces must release its force.
     """
     silence = max(6000, math.ceil(round(5e6 * T, 3)))
     if silence > MAX_RELEASE_NS // 1000:

@@ -40,7 +40,7 @@ _IMPULSE = 0.1  # [s] largest time integral of such changes without a motion, in
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
 _PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions are always mixed
-_TEST_SPEED = 0.1  # [m/s] expected in the last test if this takes more force; with a dead direction a block ends at 0.4
+_TEST_SPEED = 0.1  # [m/s] expected in the test at the end, even if it takes more force; 0.4 if one direction is dead
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
@@ -158,8 +158,8 @@ class Measurement:
     A limit on the number of STATEs ends the measurement in any case. Where too many ages are inferred, answers may
     have overtaken each other: a late answer that comes together with a younger one leaves no trace. Then a second
     round measures half as many ages exactly. The host still answers every STATE, so that the load of the link is the
-    same, but it sends most answers for a wrong tick, so that the device ignores them. Accepted answers are at random
-    distances of the longest age (at most theta) or more, so that bursts meet each with the same probability.
+    same, but it sends most answers for a wrong tick, so that the device ignores them. The distances of accepted answers
+    are random and at least the longest age (at most theta), so that bursts meet each answer with the same probability.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:

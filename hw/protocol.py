@@ -366,7 +366,7 @@ class Decoder:
         self.crc_errors = 0
         self.malformed = 0  # frames with inconsistent COBS codes, or a type, length, status or text of no message
         self.oversize = 0  # frames that are longer than any message's
-        self.tail = b""  # bytes of a frame without its end yet, at most _MAX_WIRE
+        self.tail = b""  # bytes of the frame whose end has not come yet, at most _MAX_WIRE
         self.skipping = False  # inside an oversize frame that is already counted
 
     @property

@@ -33,7 +33,7 @@ from haptic_loop.hw.session_report import outcome
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.trace import Trace
 
-_MEASURE = 200  # answers that are timed; few suffice, because virtual time does not scatter
+_MEASURE = 200  # answers that are timed; few suffice, because latencies are constant in virtual time
 #: The delay is chosen as in hw.bridge: it covers this share of the ages of measured answers, plus a guard [us].
 _QUANTILE, _GUARD_US = 0.99, 100.0
 _BEGIN_US = 500  # time from the device's first tick to the start of the session

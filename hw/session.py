@@ -331,7 +331,7 @@ class Session:
     def _answer(
         self, state: wire.State, command: wire.Command, steps: tuple[int, ...] = (), theta: int | None = None
     ) -> Said:
-        """Return the FORCE that answers a STATE: zero without `steps`, for the configured delay without `theta`."""
+        """Return the FORCE that answers a STATE. By default it is zero, and its delay the configured one."""
         assert self.config
         apply_at = (state.tick + (self.config.theta if theta is None else theta)) & 0xFFFF
         return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)

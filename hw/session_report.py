@@ -258,7 +258,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
     files, acted = [], len(recorder) > 0
     for name, written in (("trace.npz", acted), ("trace.csv", acted), ("figure.png", acted and plot)):
         if not written:
-            remove(out / name)  # the file of an earlier session
+            remove(out / name)  # A file of an earlier session must not stand beside this report.
     if acted:
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
         names = session.scenario.channel_names

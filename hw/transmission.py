@@ -22,7 +22,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction
 from haptic_loop.hw.viscosity import Spectra, starts
 
-_BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N moves less than a count of 5 um
+_BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N causes less motion than a count of 5 um
 _TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
 #: largest rms error, in units of the allowed one: play or presliding friction give 3 to 6, dry friction up to 2.1
 _UNEXPLAINED = 2.5
@@ -53,7 +53,7 @@ class _Joint:
     """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay, 0].
 
     m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
-    is the motor's damping, and the forces have a lag and a delay [s]. In Spectra.model, b is called d, and delta b.
+    is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model has d for b, and b for delta.
     """
 
     def __init__(self, records: Sequence[Spectra], step: float) -> None:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
-_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed: dry friction is saturated
+_FAST = 0.25  # a stroke counts if it reaches this share of the highest speed, because dry friction is then saturated
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
 #: [s] time constants of a memory; a shorter memory counts as damping: encoders of 5 um at 0.25 kg do not show 1 ms
@@ -145,7 +145,7 @@ class Spectra:
         band: tuple[float, float] = _BAND_HZ,
         points: int = _POINTS,
     ) -> None:
-        """Compare at about `points` frequencies within `band` [Hz]; `held` if the handle is clamped."""
+        """Take both spectra at about `points` frequencies within `band` [Hz]; `held` if the handle is clamped."""
         self.T, self.ticks, self.held = T, len(x), held
         F, hz = np.fft.rfft(force), np.fft.rfftfreq(len(x), T)
         steps = np.fft.rfft(np.diff(x, append=x[-1]))

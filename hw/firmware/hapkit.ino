@@ -21,12 +21,12 @@ static const float METRES_PER_COUNT = METRES_PER_RADIAN * 3.14159265f / SPAN;
 static const float FULL_TORQUE = 0.03f; /* [N m] of the motor at full PWM: 4.9 N at the handle */
 static const float HOME = -0.045f;      /* [m] position of the handle when it is homed */
 static const ha_limits LIMITS = {0.05f, 1.0f, 4.8f, METRES_PER_COUNT, 0.07f};
-static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* cycles / 8 of timer 1 */
+static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* counts of timer 1, every 8 cycles */
 
 static ha_runner runner;
 static int16_t last;
 static int32_t wrapped, home_counts;
-static uint16_t longest, ticks; /* longest: [cycles / 8] of the longest tick since the last report */
+static uint16_t longest, ticks; /* longest: the longest tick since the last report, in counts of timer 1 */
 
 #ifndef MARK
 #define MARK(what) /* the tests count cycles between marks */
@@ -74,7 +74,7 @@ void setup()
   TCCR0A = _BV(COM0B1) | _BV(WGM01) | _BV(WGM00);     /* fast PWM on pin 5 */
   TCCR0B = _BV(CS00);                                 /* at 62.5 kHz */
   OCR0B = 0;
-  TCCR1A = 0;                                         /* timer 1 counts the period in cycles / 8 */
+  TCCR1A = 0;                                         /* timer 1 counts the period in units of 8 cycles */
   TCCR1B = _BV(WGM12) | _BV(CS11);
   OCR1A = PERIOD_CYCLES - 1;
   last = (int16_t)analogRead(SENSOR);

@@ -181,8 +181,8 @@ static inline void ha_judge(ha_runner *r, const ha_limits *l)
     }
 }
 
-/* Pushes the axis by a force that changes its sign, and sums up its answer; judges it in the tick after a block, because
- * both together take too long for an ATmega328P. */
+/* Pushes the axis by a force that changes its sign, and sums up the motion. In the tick after a block it only judges the
+ * block, because pushing and judging in one tick take too long for an ATmega328P. */
 static inline void ha_test(ha_runner *r, const ha_limits *l, const ha_real *x)
 {
     ha_answer *a = &r->answer;

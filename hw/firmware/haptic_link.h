@@ -25,7 +25,7 @@
 #define HL_MAX_THETA 15
 #define HL_SLOTS 16                 /* forces that wait for their tick: a power of two above HL_MAX_THETA */
 #define HL_MAX_RELEASE_NS 20000000u /* longest sum of hold and ramp */
-#define HL_NO_MARGIN (-32767 - 1)   /* no FORCE came since the last STATE */
+#define HL_NO_MARGIN (-32767 - 1)   /* no usable FORCE came since the last STATE */
 #define HL_MAX_OUT (HL_MAX_FRAME + 1 + 12 + 20 + 6 * HL_MAX_AXES) /* INFO, ACK and STATE in one tick */
 
 enum { HL_HELLO = 1, HL_INFO, HL_CONFIG, HL_ACK, HL_STATE, HL_FORCE, HL_STOP };
