@@ -44,8 +44,8 @@ def theta_hat(theta: Sequence[int]) -> Lti:
 def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
     """Return V-hat without its zero at z = 1, with the paper's two outputs; V(1) must be symmetric.
 
-    With H = V - Theta-hat they are y1 = H u and y2 = H(1)/2 u - (H - H(1))/(z - 1) u. V-hat is Delta-OSP iff
-    He y2/u >= (y1/u)* Delta (y1/u). The result has one state per channel fewer than (16).
+    With H = V - Theta-hat the outputs are y1 = H u and y2 = H(1)/2 u - (H - H(1))/(z - 1) u. V-hat is output strictly
+    passive with level Delta iff He y2/u >= (y1/u)* Delta (y1/u). The result has one state per channel fewer than (16).
     """
     H = V - theta_hat(theta)
     R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
@@ -61,7 +61,7 @@ def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
 class Analysis:
     """The result of `analysis`, in units T = 1, Delta_D = I; matrices are None if V was refused without an LMI."""
 
-    margin: float  # > 0: Theorem 4 holds with this room in every inequality; < 0: it does not; -inf: no V-hat
+    margin: float  # > 0: Theorem 4 holds with this room in every inequality; < 0: it does not; -inf: V was refused
     Phi: Array | None = None  # (N, N) shortage of passivity of E-hat
     Delta_V: Array | None = None  # (N, N) excess of passivity of V-hat
     P_E: Array | None = None  # storage of E-hat's regular part, in balanced coordinates

@@ -1,4 +1,4 @@
-"""Conditions evaluated for a transfer matrix, with dampings, delays and periods as arguments in place of a loop."""
+"""Evaluate conditions for a transfer matrix and data of a loop, and read the requirements in a command's JSON."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def any_environment_per_channel(V, theta, delta):
 
 
 def walls_demand(G, delta, stiffness, a):
-    """Return what walls without dampers demand for the multiplier a (w,) [N/m]; G includes all delays."""
+    """Return the demand of w walls without dampers for the multiplier a (w,) [N/m]; G includes all delays."""
     none = (0,) * (3 * len(stiffness))
     return environments.THIS_ENVIRONMENT.block(G, loop(G.T, delta, walls=stiffness), (*a, *none))
 

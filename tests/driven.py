@@ -1,4 +1,4 @@
-"""Closed loops from given plant states, many at once, for tests of the engines."""
+"""Simulate many closed loops at once from given plant states, for tests of the engines."""
 
 from dataclasses import dataclass
 

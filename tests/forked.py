@@ -76,7 +76,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 
 def draw_once(folder: Path) -> None:
-    """Draw a picture with this name and command once, then an empty one: drawing takes most of a second."""
+    """Draw the first picture of each command and file name only, then empty ones: drawing takes most of a second."""
     from matplotlib.figure import Figure
 
     from haptic_loop.sim import plots
@@ -138,7 +138,7 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
 
 
 def _word(x: Any) -> str:
-    """Return a word for an argument, which equal arguments share. Raises TypeError for an object without one."""
+    """Return a text for an argument: the same for equal arguments. Raises TypeError for an object without a value."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.coupling_file import digest
 
@@ -171,7 +171,7 @@ def run(command: str | list[str], folder: Path, **environment: str) -> subproces
 
 
 def begin(module: str, *options: str, out: Path, err: Path) -> int:
-    """Begin `python -m MODULE ...` in a new session of processes, which writes to `out` and `err`; return its id."""
+    """Begin `python -m MODULE ...` in a new session, with its output in `out` and `err`; return the process id."""
     return _asked_for(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
 
 

@@ -25,7 +25,7 @@ from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, nobody
 from haptic_loop.sim.scenario import load
 
 _PATIENCE = 60.0  # [s] longest wait for the emulator to begin, and to end
-_LINGER_US = 50_000  # the emulator runs on after the cable was pulled: the device comes to rest
+_LINGER_US = 50_000  # after the cable was pulled the emulator runs on, so that the device comes to rest
 
 
 class Terminal:
@@ -85,7 +85,7 @@ class RealTimeEmulator:
                 continue
             if not self.emulator.unplugged:
                 self._hear(self.terminal.read(), due)  # bytes that came in the meantime are on time
-            if now - due > self._period / 2:  # this process was held up, unlike a device's timer
+            if now - due > self._period / 2:  # this process was held up; a device's timer would be on time
                 self.late += 1
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)

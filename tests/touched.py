@@ -20,7 +20,7 @@ def changed() -> list[str]:
 
 
 def tests_of(paths: list[str]) -> list[str]:
-    """Return the arguments of pytest."""
+    """Return the test files and folders that pytest runs for changed paths, in the order of the module docstring."""
     tests = [path for path in paths if path.startswith("tests/") and "/test_" in path and Path(path).exists()]
     found = [path for path in tests if "benchmarks" not in path] + ["tests/project/test_layers.py"]
     mirrors = [_mirror(path) for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES]

@@ -1,4 +1,4 @@
-"""What many tests share: the default pair, couplings for it, formulas written out by hand, and a serial line."""
+"""Define for many tests: the default pair, couplings for it, formulas written out by hand, and a serial line."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ FIGURE_4 = Network(
 
 
 def checkered(*sides):
-    """Return all combinations of the sides' values as parameters; every second one is left to `make validate`.
+    """Return all combinations of one value per side as parameters; every second one runs in `make validate` only.
 
-    `make test` runs each value with at least half of the values of every other side, like fields of one colour.
+    Like the fields of one colour on a chess board, `make test` combines each value with half of the other side's.
     """
     marks = ((), pytest.mark.validate)
     places = product(*(enumerate(side) for side in sides))
@@ -115,11 +115,10 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
 
 
 def contact_by_hand(z, T, mass=0.0, stiffness=0.0, damping=0.0, coupling=None):
-    """Return F, J, H and Y (k,) of a tip that a spring-damper coupling holds.
-
-    The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
+    """Return F, J, H and Y (k,) at k points z: the responses of a tip that a spring-damper coupling holds.
 
     They map a device's displacement and a wall's force at the tip to the sent force and the tip's displacement.
+    The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
     """
     s = (1 - 1 / z) / T
     E = mass * s**2 + damping * s + stiffness
@@ -175,7 +174,7 @@ def least_scaled(block: np.ndarray) -> float:
 
 
 class FakePort:
-    """The host's end of a serial line: `coming` will be read, `sent` was written, `now` is its clock [us]."""
+    """The host's end of a serial line: `coming` will be read, `sent` was written, `now` is the host's clock [us]."""
 
     def __init__(self):
         self.coming, self.sent, self.now = b"", b"", 0

@@ -68,7 +68,7 @@ def test_another_loop_loses_the_guarantee(changes):
 
 
 def test_an_energy_account_covers_no_latency():
-    """A hand that moves only before forces latch gains energy from the last force, which the account does not see."""
+    """A hand that moves only before forces latch takes energy from the last force, and the account misses this work."""
     assert assess(LOOP, HERE_ONLY, energy_budget=0.1).guarantee.condition == "energy-budget"
     late = change(LOOP, latency=((0.0, 2e-4),))
     for accounted in ({"energy_budget": 0.1}, {"environment": lambda x: -100 * x}):
@@ -123,8 +123,8 @@ def test_a_clipped_guarantee_says_where_it_ends():
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
 
 
-def test_own_conditions_meet_the_switching_delays():
-    """A condition that names nothing in `covers` is refused, so that its limiter does not count either."""
+def test_own_conditions_must_name_switching_delays():
+    """A condition whose `covers` does not name switching delays is refused, and then its limiter proves nothing."""
 
     class Own(ThisEnvironment):
         name = "own"
@@ -195,7 +195,7 @@ def test_a_proof_without_the_limiter_is_partial(monkeypatch):
     assert assess(LOOP, HERE_ONLY, limiter=False).guarantee.proof == "rational"
 
 
-def test_a_limiter_on_file_meets_a_longer_loop():
+def test_a_stored_limiter_proof_covers_no_longer_delay():
     """The file's proof is for one sample of delay; the loop has more states than a proof may have."""
     loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
     coupling = SpringDamper([1.0], [0.01])
@@ -215,7 +215,7 @@ def test_lost_packets_end_the_guarantee():
     assert assessed(lossy, "I", chosen).guarantee is None
 
 
-# The shell around a user's own environment.
+# The shell: the passivity layer around a user's own environment.
 
 
 def spring(u):
@@ -226,7 +226,7 @@ def spring(u):
     ("changes", "coupling", "holds"),
     [
         ({}, SOFT, True),
-        ({}, SpringDamper([7000.0, 2900.0], [0.42, 1.69]), False),  # needs 98 % in this environment only
+        ({}, SpringDamper([7000.0, 2900.0], [0.42, 1.69]), False),  # certified in this environment only
         ({"psi": (1, 1)}, SOFT, False),
         ({"theta": (3, 4)}, SOFT, False),
         ({"T_max": 3e-3}, SOFT, False),

@@ -74,7 +74,7 @@ def strict(text: str) -> dict:
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
-    """A wall needs K T/2 + B without delay. A spring with one sample needs 3 K T/2, and 2 K T by Theorem 4."""
+    """A wall needs K T/2 + B without delay. A spring with one sample of delay needs 3 K T/2, and 2 K T by Theorem 4."""
     subject = wall(K, B, theta)
     assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
     assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
@@ -121,7 +121,7 @@ def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
 
 
 def test_the_stiffest_gains_respect_full_levels():
-    """With theta = 0 the certified K are those below 2 (least eigenvalue of Delta - B)/T."""
+    """With theta = 0 the equal K of both axes are certified below 2 (least eigenvalue of Delta - B)/T."""
     level = np.array([[1.0, 0.9], [0.9, 1.0]])
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
     loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.0, 1.0), plane, axes=(2,), levels=(tuple(map(tuple, level.tolist())),))
@@ -135,7 +135,7 @@ def test_the_stiffest_gains_respect_full_levels():
 
 
 def test_axes_of_a_late_device_share_multipliers():
-    """The stiffest K of both axes is certified together, not only axis by axis."""
+    """The stiffest K of the two axes are certified together, not only axis by axis."""
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
     late = {"axes": (2,), "latency": ((0.0, 5e-4),) * 2}
     loop = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.5, 0.9), plane, **late)
@@ -165,7 +165,7 @@ def test_the_largest_period_before_a_wall_is_colgates():
         assert found.largest_T_s == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
 
 
-def test_the_papers_gains_and_their_figures():
+def test_the_papers_gains_are_not_certified():
     outcome = report(*pair(PUBLISHED["I"]))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
     assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
@@ -175,7 +175,7 @@ def test_the_papers_gains_and_their_figures():
     assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["margins"]["any-environment"]["stiffest"]["reason"]
 
 
-def test_rounded_any_environment_gains_of_the_literature():
+def test_rounded_gains_of_the_literature_exceed_the_damping():
     """Theorem 4 needs 0.02 % more damping than is available; the this-environment condition needs far less."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
@@ -222,7 +222,7 @@ def test_figures_that_do_not_exist_say_why():
     assert "not certified" in sensitivity(*pair(PUBLISHED["I"]), "this-environment").reason
 
 
-def test_remedies_are_tried_and_mild():
+def test_remedies_are_evaluated_and_no_larger_than_needed():
     subject = wall(5000, 0.5, 1)
     changes = {r.change.split(":")[0]: r for r in _remedies(*subject, "this-environment")}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
@@ -313,7 +313,7 @@ def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside)
         (["--scenario", "three-rigid", "--K", "300", "--B", "0.2"], 0, None),
     ],
 )
-def test_the_command(run, argv, code, required):
+def test_the_command_reports_verdict_and_requirement(run, argv, code, required):
     exit_code, out, err = run(*argv, "--details", "--json", "-")
     outcome = strict(out)
     assert exit_code == code
@@ -327,7 +327,7 @@ def test_the_command(run, argv, code, required):
     assert "do not cover periods longer than T_max" in " ".join(err.split())
 
 
-def test_the_report_is_kept(run, tmp_path):
+def test_out_stores_the_report(run, tmp_path):
     assert run("--rigid", "--K", "100", "--B", "0", "--theta", "0", "--out", "here")[0] == 0
     assert safe_with(strict((tmp_path / "here" / "report.json").read_text())) == "any passive environment"
 
@@ -341,7 +341,7 @@ def test_gains_of_a_device_name_their_source(run):
 
 @pytest.fixture
 def files(tmp_path):
-    """Write a spring-damper, the same as a state space, an unstable coupling and a malformed file."""
+    """Write a spring-damper, the same coupling as a state space, an unstable coupling and a malformed file."""
     loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
     coupling_file.save(coupling_file.Stored.of(loop, SAFE), tmp_path / "gains.json")
     coupling_file.save(coupling_file.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
@@ -351,7 +351,7 @@ def files(tmp_path):
 
 
 @pytest.mark.usefixtures("files")
-def test_stored_couplings(run):
+def test_stored_couplings_are_audited(run):
     for name in ("gains.json", "space.json"):
         code, out, _ = run("--coupling", name, "--json", "-")
         assert code == 0

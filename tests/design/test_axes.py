@@ -90,8 +90,8 @@ def test_impossible_axes_are_refused(fields: dict[str, object], words: list[str]
 
 
 # ----------------------------------------------------------------------------------------------------
-# A mass between springs in the plane. Its requirements were computed with separate code, by dense sweeps of
-# He[F/(z-1)] + s Delta/T and the like; both devices have full levels.
+# A mass between springs in the plane, at two devices with full levels. Separate code computed the expected ratios s by
+# dense sweeps of each condition's matrix, such as He[F/(z-1)] + s Delta/T.
 
 
 class Plane(Networks):
@@ -119,6 +119,7 @@ def rotated(degrees: float, values: list[float]) -> np.ndarray:
 
 
 def between(first: np.ndarray, second: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Return the matrix (6, 6) of parts that join the mass, the last node, to two devices and to the ground."""
     zero = np.zeros((2, 2))
     return np.block([[first, zero, -first], [zero, second, -second], [-first, -second, first + second + ground]])
 
@@ -509,7 +510,7 @@ def test_turned_filters_keep_a_symmetric_compliance() -> None:
     assert (static == static.T).all()
 
 
-def test_a_matrix_is_symmetric_and_definite() -> None:
+def test_matrix_gains_must_be_symmetric_and_definite() -> None:
     with pytest.raises(ValueError, match="symmetric"):
         _MatrixSpringDamper([[1.0, 2.0], [1.0, 9.0]], np.zeros((2, 2)))
     with pytest.raises(ValueError, match="positive definite"):
@@ -564,7 +565,7 @@ def test_a_vector_has_one_limit() -> None:
 
 
 def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> np.ndarray:
-    """Return the largest energy of lossless hands relative to that at the start, (count,).
+    """Return the largest energy of each of `count` lossless hands, relative to its energy at the start, (count,).
 
     M x'' + share Delta x' + K x = -f with full random M and K is sampled with held forces by the matrix exponential.
     """
@@ -601,7 +602,7 @@ def test_limited_hands_in_space_get_no_energy() -> None:
     assert (most_energy(0.6 * 0.518330, 1, ticks=200) > 1.001).sum() >= 5
 
 
-def test_energy_budget_of_a_level() -> None:
+def test_an_energy_budget_takes_matrix_levels() -> None:
     """The budget reserves r(f) = T f' Delta^-1 f/4 for a force, and does not scale a force that it can pay."""
     budget = EnergyBudget(LOOP.Delta(), LOOP.T, Packets(np.zeros(4, dtype=int)), start=1.0)
     force = np.array([[3.0], [-2.0], [1.0], [4.0]])

@@ -1,4 +1,7 @@
-"""Tests of the bound on linear couplings: its dual matrix is nonnegative on the whole circle, also between samples."""
+"""Tests of the bound on linear couplings: its dual matrix is nonnegative on the whole circle, also between samples.
+
+A value of the bound is charged if the error of the dual matrix between samples was subtracted from it.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -107,9 +110,9 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
 
 @pytest.mark.parametrize(("name", "high"), [("n1-omega-II", 1e4), ("o12-free-mass-late", 100.0)])
 def test_the_integral_errs_by_less_than_its_bound(name, high):
-    """Simpson's rule with 400 steps in each interval gives the same -tr C_0 - 2 <H, Lambda E> - <H, H/rho>.
+    """Simpson's rule with 400 steps per interval and `objective_again` agree on -tr C_0 - 2 <H, Lambda E> - <H, H/rho>.
 
-    The weight rho holds the width of the band up to the Nyquist frequency at most, as in the rms mismatch.
+    The weight rho contains the logarithmic width of the band, which ends at the Nyquist frequency at the latest.
     """
     loop = loop_of(name)
     dual = module._Dual.of(loop, (1.0, high), 16)
@@ -159,7 +162,7 @@ def test_a_bound_holds_between_sharp_bends():
 
 
 def test_a_bound_names_its_condition():
-    """The bound is for this-environment only: known devices are certified here without any coupling."""
+    """A loop without coupling is not bounded where known-device certifies it, but this-environment does not."""
     loop = load("omega-pair-known").loop("I")
     known = haptic_loop.assess(loop, NoCoupling(), limiter=False)
     assert known.guarantee is not None

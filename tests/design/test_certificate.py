@@ -130,7 +130,7 @@ def test_proofs_reach_colgates_condition_within_a_millionth(K, B):
         prove(wall(K, B, needed * (1 - 1e-6)), NoCoupling(), "this-environment")
 
 
-def test_three_channels_with_unequal_delays_and_dampings():
+def test_three_unequal_channels_are_proved():
     springs = tuple(Spring((tip, "hub"), k, 0.5) for tip, k in (("a", 400.0), ("b", 300.0), ("c", 350.0)))
     network = Network(contacts=("a", "b", "c"), springs=springs, masses={"hub": 0.4})
     loop = Loop(1e-3, (0, 3, 1), (0, 0, 0), (0, 3, 1), (2.0, 0.8, 1.37), network)
@@ -181,7 +181,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of one to three contacts and a coupling; delta is 0.5 to 1.5 times the need, capped at 100."""
+    """Return a star of one to three contacts and a coupling; delta is 0.5 to 1.5 times the need, at most 150 N s/m."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]
@@ -542,7 +542,7 @@ def test_no_condition_certifies_at_equality(condition, theta, room, certified):
 
 
 def test_certificates_of_one_object_list_no_ranges():
-    """With psi = 1 Theorem 4 holds for the object in its Phi, here the nominal one."""
+    """With psi = 1 a proof of Theorem 4 covers only the environment for which Phi was found, here the nominal one."""
     pair, coupling = scenario().loop("I"), SpringDamper([2800.0, 1700.0], [1.6, 2.2])
     ranges = ranges_around(pair.environment, 10.0)
     loop = msgspec.structs.replace(pair, psi=(1, 1), delta=(5.0, 5.0), ranges=ranges)

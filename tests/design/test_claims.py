@@ -1,6 +1,6 @@
-"""Tests of what docs/theory.md and docs/reproducibility.md claim, by other means than the code that uses it.
+"""Tests of the claims of docs/theory.md and docs/reproducibility.md.
 
-The means are dense sweeps, closed forms and simulated energies.
+The tests use dense sweeps, closed forms and simulated energies instead of the code that relies on the claims.
 """
 
 import itertools
@@ -54,9 +54,9 @@ def needed(e_hat_inverse, K, B, theta):
 
 
 def test_theorem_1_telescopes():
-    """With y = G-hat g, g y - delta y^2 is the device's balance plus (g[k]^2 - g[k-n]^2)/(4 delta).
+    """With y = D (G + Theta-hat) g, g y - delta y^2 is the device's balance plus (g[k]^2 - g[k-n]^2)/(4 delta).
 
-    Its sums over time are not negative.
+    The sums of g y - delta y^2 over time are not negative.
     """
     rng = np.random.default_rng(0)
     for theta in range(4):
@@ -79,9 +79,9 @@ def test_theorem_1_telescopes():
 
 
 def test_sampled_energy_balance_of_devices_and_hands():
-    """In the default scenario the stored energy never exceeds its start plus what the ports supply.
+    """In the default scenario the stored energy rises by no more than the ports supply less the sampled dissipation.
 
-    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx; with w = 0 (a) of docs/theory.md follows.
+    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, h at the handles; w = 0 gives (a) of docs/theory.md.
     """
     rng = np.random.default_rng(1)
     simulation = assemble(load(), PUBLISHED["I"])
@@ -204,7 +204,7 @@ def test_index_25_of_the_default_environment_is_infinite(case):
 def test_no_reading_of_figure_4_reproduces_tau():
     """In 66 readings each spring joins two of {contacts, mass, ground}, and the mass is free or at a contact.
 
-    A grid makes (25) too small, never too large, and even that is more than 60 dB above the printed figures.
+    A grid makes (25) too small, never too large, but its value is still more than 60 dB above the printed figures.
     """
     hz = np.unique(np.concatenate([np.geomspace(1e-4, 80, 300), np.linspace(0.1, 80, 300)]))
     z = np.exp(2j * np.pi * hz * T)
@@ -234,7 +234,7 @@ def test_a_rigid_wall_is_not_the_worst_environment():
     assert max(masses) == pytest.approx(1.3769, abs=5e-5)
     assert np.geomspace(0.01, 1, 200)[np.argmax(masses)] == pytest.approx(0.0357, rel=0.03)
     assert line(K, B, theta).max() == pytest.approx(1.5160, abs=5e-5)
-    # The project's condition gives the same for the mass. A spring alone needs (theta + 1/2) K T.
+    # this-environment gives the same for the mass. Before the wall a coupling without a damper needs (theta + 1/2) K T.
     E = environment(Network(("a",), masses={"a": 0.0357}), T)
     found = this_environment(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
     assert found == pytest.approx(1.3769, abs=5e-5)
@@ -304,7 +304,7 @@ def test_no_linear_coupling_is_stiffer():
 
 
 def test_theorem_4_excludes_the_loop_shaping_premise():
-    """sigma_max(E(1) V(1)) >= 0.8175 for any V that Theorem 4 admits; SOFT has at least 1.13 at each frequency."""
+    """sigma_max(E(1) V(1)) >= 0.8175 for any V that Theorem 4 admits; SOFT has sigma_max(E V) >= 1.13 up to 80 Hz."""
     E1 = 800 * 700 / 1500 * np.array([[1, -1], [-1, 1]])
     floor = np.array(THETA) + 1.0
     rng = np.random.default_rng(5)
@@ -474,7 +474,7 @@ class Resonant(Environment):
 
 
 def test_an_active_environment_gets_no_guarantee():
-    """A narrow active resonance is not certified for any environment; a passive one as narrow is."""
+    """A narrow active resonance is not certified for any environment; a passive resonance of the same width is."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):
         loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), Resonant(size, angle))

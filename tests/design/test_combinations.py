@@ -55,7 +55,7 @@ def need(loop, coupling, rho=None):
     ],
 )
 def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most):
-    """`most` is from code with the walls' multiplier m = 0 that bounds both parts of a period separately.
+    """The requirement is 4 % below `most`, which bounds both parts of a period separately with the multiplier m = 0.
 
     A wall that never loses contact needs less.
     """
@@ -204,7 +204,10 @@ def test_no_hand_gains_energy_at_the_requirement(names, ticks):
 
 @pytest.mark.parametrize(("share", "some"), [(1.01, False), (0.3, True)])
 def test_periods_latency_and_switching_bound_the_energy(share, some):
-    """With the worst period, latency and age at every tick no hand gains energy at the requirement; below, some do."""
+    """With the worst period, latency and age at every tick no hand gains energy at 1.01 of the requirement.
+
+    At 0.3 of it some hands do.
+    """
     loop = change(combined(("latency", "switching"))[0], T_max=1.5e-3)
     assert (growing(loop, COUPLING, share * need(loop, COUPLING), None, ticks=TICKS // 8) > 0) == some
 
@@ -290,7 +293,7 @@ def test_any_environment_requirements_follow_from_chi():
 def test_periods_latency_and_switching_follow_from_chi():
     """He[V/(1-z)] > c* Q^-1 c/4 + h^2/(2 alpha) with Q = delta diag(1/tau, 1/(T_max - tau)) - alpha d* d/2, d = (z, 1).
 
-    c holds the mean windows of lo + 1 and hi + 1 ticks, and of lo and hi.
+    The entries of c are means over n = lo and n = hi: of 1 + .. + z^-(n+1), and of 1 + .. + z^-n.
     """
     T, longest, tau, lo, hi = 1e-3, 1.4e-3, 0.3e-3, 0, 2
     further = {"varying_delay": DelayRange((lo,), (hi,)), "latency": ((tau, tau),), "T_max": longest}
@@ -383,7 +386,7 @@ def work(first, second):
 
 
 def of_hands(hands, f, z, x, delta, T):
-    """Return the terms of a hands' side, and the displacement dq that f[k] multiplies; x holds its inputs."""
+    """Return the terms of a hands' side, and the displacement dq that f[k] multiplies; x holds the inputs by name."""
     if hands == "periods":
         return work(f, x["dx"]) + delta / 1.4e-3 * abs(x["dx"]) ** 2, x["dx"]
     if hands == "latency":

@@ -1,4 +1,4 @@
-"""Linear matrix inequalities: known optima, another solver, and solvers whose answers are checked."""
+"""Tests of design/cone.py: its solvers find known optima, agree with cvxpy, and have their answers checked."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ def hermitian(rng, *shape):
 def with_known_optimum(rng, p, shapes):
     """Return a problem and its optimum x: S(x) and the multiplier Z of each block have complementary ranges.
 
-    cost_a = <slope_a, Z>. Slopes add up to I and every x_a is bounded, so that both sets have an interior.
+    cost_a = <slope_a, Z>. Slopes add up to I and every x_a is bounded, so that primal and dual set have an interior.
     """
     x, cost, blocks = rng.normal(size=p), np.zeros(p), []
     for count, n, complex_ in shapes:
@@ -137,7 +137,7 @@ def bounds(*of):
     return ConeProgram(np.array([1.0]), [Inequality.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
 
 
-def test_infeasible_is_told_apart():
+def test_an_infeasible_problem_is_no_solver_failure():
     with pytest.raises(Infeasible, match="the request has no solution"):
         bounds(lambda x: x - 1, lambda x: -x).solve("the request")
 

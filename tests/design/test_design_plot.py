@@ -43,7 +43,7 @@ def wall(K, B=0.0, theta=0):
     return Loop(T, (theta,), (0,), (theta,), (DELTA,), network)
 
 
-def test_singular_values_and_effective_impedance_by_hand():
+def test_singular_values_and_impedances_match_the_formulas():
     lines = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ)
     sigma_E, undelayed = ideal(PAIR, HZ)
     for k, (E, F, theta) in enumerate(by_hand(HZ)):
@@ -77,7 +77,7 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
     np.testing.assert_allclose(felt.damping[:, 0], 2 * np.sin(omega * T) / (omega * T), rtol=1e-9)
 
 
-def test_demand_by_hand():
+def test_demands_match_the_formulas():
     """this-environment: -T He[F/(z-1)]/delta; any-environment: max (1 - cos n w)/(2 delta Re[(z-1) V/(Tz)])."""
     demands = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
@@ -105,7 +105,7 @@ def test_the_curves_maximum_is_the_required_damping(coupling):
             assert demand.max() == pytest.approx(ratio, rel=1e-12)  # the binding frequency is in the grid
 
 
-def test_the_curve_with_delay_in_the_environment():
+def test_curves_of_delayed_environments_reach_the_ratio():
     """With psi >= 1 any-environment has a multiplier, and the curve's maximum is still its ratio."""
     soft = Network(
         FIGURE_4.contacts,
@@ -156,7 +156,7 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_other_devices_other_delays_and_no_pictures(tmp_path):
+def test_options_set_three_delays_and_skip_pictures(tmp_path):
     """Three unequal devices get delays of 0, 1 and 2 samples by option."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
     assert main([*args, "--json", str(tmp_path / "r.json")]) == 0

@@ -1,4 +1,4 @@
-"""Coulomb friction that covers encoder steps: the bound on the impulse response, the energy of quantised loops."""
+"""Tests of the Coulomb friction that covers encoder steps: its bound W, and the energy of quantised loops."""
 
 from types import SimpleNamespace
 
@@ -53,9 +53,9 @@ def test_axes_share_the_friction_of_their_device():
 
 
 def test_friction_covers_no_steps_of_known_devices():
-    """Speeds alternate in triangular spikes of height v0 at the ticks, where the errors do work -W on dx + beta dv.
+    """The speed has a triangular spike of height v0 at each tick, with alternating signs: dx = 0 and |dv| = 2 v0.
 
-    Within a period dx = 0 and dv = 2 v0, so friction W and the motor's c2 v'^2 and c0 v^2 dissipate less than they do.
+    Force errors of size W supply W beta |dv| per period, more than friction W and the motor's c2 v'^2 and c0 v^2 take.
     """
     beta, mass, delta, W = 5e-5, 0.06, 1.37, 0.05
     v0, width = 0.1 * beta * W / mass, beta
@@ -69,7 +69,7 @@ def test_friction_covers_no_steps_of_known_devices():
 
 
 def test_steps_are_covered_with_one_object_only():
-    """The friction needed depends on F of the nominal environment, although the guarantee covers every one."""
+    """The friction needed depends on F of the nominal environment; the guarantee covers every passive environment."""
     coupling = SpringDamper([879.0, 552.0], [0.39, 0.52])
     covered = EncoderSteps.of(LOOP, coupling, [STEP, STEP], [0.26, 0.26])
     words = verdict(assess(LOOP, coupling), encoder=covered)
@@ -77,7 +77,7 @@ def test_steps_are_covered_with_one_object_only():
     assert "nominal object only" in words
 
 
-def test_the_bound_is_above_and_close():
+def test_the_l1_gain_is_a_close_upper_bound():
     total, X = np.abs(F.D), F.B
     for _ in range(60_000):
         total, X = total + np.abs(F.C @ X), F.A @ X
@@ -86,7 +86,7 @@ def test_the_bound_is_above_and_close():
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.9, -0.99, 1 - 1e-5])
-def test_first_order_closed_form(pole):
+def test_first_order_gains_match_the_closed_form(pole):
     one = Lti([[pole]], [[1.0]], [[1 - pole]], [[0.5]], T)
     assert _l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
 
@@ -96,7 +96,7 @@ def test_a_gain_that_decays_slowly_is_bounded():
     assert 1e9 <= _l1_gain(slow)[0, 0] < np.inf
 
 
-def test_taps_delays_and_unstable_maps():
+def test_delays_keep_gains_and_integrators_are_unbounded():
     assert _l1_gain(delay((3,), T) @ taps([1.0, -2.0, 0.5], T))[0, 0] == pytest.approx(3.5)
     assert _l1_gain(Lti([[1.0]], [[1.0]], [[1.0]], [[0.0]], T))[0, 0] == np.inf
 

@@ -1,4 +1,4 @@
-"""Exact arithmetic agrees with numpy and with the floating-point blocks, and is symmetric at z = 1."""
+"""Tests of exact arithmetic: it agrees with numpy and floating-point blocks, and F(1) is exactly symmetric."""
 
 import random
 from fractions import Fraction
@@ -121,7 +121,7 @@ def test_definiteness_below_rounding_is_not_proved():
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
 def test_matrices_that_rounding_makes_definite_are_not_proved(monkeypatch, bits):
-    """J + u M (J has ones, |M| <= 1/2) is not definite, but rounded to multiples of u it is J + u I, which is."""
+    """J + u M (J has ones, |M| <= 1/2) is indefinite; rounded to multiples of u it is J + u I, which is definite."""
     monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
     M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
@@ -144,7 +144,7 @@ def test_coarse_rounding_never_proves_what_elimination_refuses(monkeypatch):
     assert proved > 50
 
 
-def test_huge_entries_prove_nothing(recwarn):
+def test_huge_entries_prove_nothing_false(recwarn):
     for size in (10**200, 10**400, 10**4000):
         assert not _strictly_positive(Matrix.of([[1, size], [size, 1]]))
         assert not _strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
@@ -256,7 +256,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
 
 
 def test_the_kyp_matrix_is_the_storage_increase():
-    """The form of this matrix, x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), is supply less storage increase."""
+    """The form of the KYP matrix, x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), is supply less storage increase."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
     P = numbers(half + half.T, Fraction(1)) / 7
@@ -302,7 +302,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
 
 
 def test_floating_point_refuses_no_definite_matrix():
-    """M = e P with ill-conditioned P and e as small as rounding: M is definite, though often not as computed."""
+    """M = e P with ill-conditioned P is definite, but as e is near the rounding unit, the computed M often is not."""
     rng, indefinite = np.random.default_rng(7), 0
     for _ in range(60):
         n = int(rng.integers(2, 6))

@@ -293,7 +293,7 @@ def test_a_wall_that_latches_late(first, last, longest):
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
 def test_a_limited_spring(theta, c):
-    """The damping d enters the block as [1, 1; 1, 1] d/T, 0 on (1, -1), so a Schur complement gives the limit."""
+    """The damping d adds [1, 1; 1, 1] d/T to the block, which is 0 on (1, -1): a Schur complement gives the limit."""
     K, rho = 1000.0, 20.0
 
     def needed(w):

@@ -64,8 +64,8 @@ def run(program):
     return subprocess.run([program], capture_output=True, text=True, check=False)
 
 
-def test_the_order_of_the_sums_in_plain_python():
-    """Python's floats, with one rounding per operation, give the same outputs to the last bit."""
+def test_plain_python_sums_in_the_exported_order():
+    """Python's floats, with one rounding per operation, give the outputs of the test vector to the last bit."""
     block = process_block(Stored.of(PAIR, SOFT))
     test, G = trial(block), block.system
     z = [0.0] * G.order
@@ -107,7 +107,7 @@ def limited_files(tmp_path_factory):
     ("name", "limit"), [("pair", (12.0, 5.0)), ("star", (2.0,) * 5), ("free", (3.0, 2.0, 1.0, 2.0))]
 )
 def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
-    """The simulator solves the same problem another way, with equal forces but for rounding; many ticks are limited."""
+    """The simulator's solver gives the same forces but for rounding, where 20 to 90 % of the ticks reach a limit."""
     stored = limited_files[1][name]
     block = process_block(stored, force_limit=limit)
     test, m = trial(block), len(limit)
@@ -194,6 +194,7 @@ def test_force_limits_are_of_vectors_or_axes(space, tmp_path, capsys):
 
 
 def test_a_vector_without_solution_is_zero(space, monkeypatch):
+    """A force vector that misses its tolerance, here after one step, is set to 0 and stays below its limit of 2 N."""
     block = vectors(space[0], (0,) * 4)
     inputs = trial(block).inputs
     monkeypatch.setattr(export_module, "_MOST_STEPS", 1)
@@ -210,7 +211,7 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_export_and_simulator_differ_by_rounding(data):
-    """BLAS sums in any order: at each tick either side errs by at most gamma_N |row| |v|, which A propagates."""
+    """BLAS sums in any order: export and simulator err by at most gamma_N |row| |v| per tick, and A propagates it."""
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)

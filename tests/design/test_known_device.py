@@ -102,7 +102,7 @@ def test_constants_of_one_period():
 
 @cache
 def best_for(coupling: str) -> _Best:
-    """Return the best beta for the paper's loop without coupling, or with published gains."""
+    """Return the least requirement, with its beta, of the paper's loop without coupling or with published gains."""
     made, present = {"none": (NoCoupling(), 1.72293), "I": (PUBLISHED["I"], 1.39871)}[coupling]
     return sweep_of(KNOWN.F(made), KNOWN).best(present / 1.37)
 
@@ -232,7 +232,7 @@ def test_the_cost_is_concave_in_damping_and_beta():
 
 
 def test_tangents_bound_a_sweep_over_beta():
-    """Here c2 > 0 limits beta, and the least share of the damping is far below that from which the search begins."""
+    """The search's bound rises to 0.9 of the least share, though the search starts far above it; c2 > 0 limits beta."""
     T, high = 1e-3, 3.0
     loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
     sweep = sweep_of(wall(309.8, 3.44, 1, T), loop)
@@ -368,7 +368,10 @@ def test_the_proof_is_tight_for_the_papers_loop(coupling):
 
 
 def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
-    """Return the spectral radii of the sampled loop; `ladders` (n, links, 2) holds (mass, stiffness), lossless."""
+    """Return the spectral radii of the sampled loop for n hands.
+
+    A hand is a lossless chain of masses, each on a spring to the next; `ladders` (n, links, 2) holds (mass, stiffness).
+    """
     (device,), T = loop.known_devices, loop.T
     m, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_min
     n, links, _ = ladders.shape
@@ -398,14 +401,14 @@ def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
 
 
 def ladders(rng, n: int, links: int, T: float) -> np.ndarray:
-    """Draw ladders; the frequency of each mass on its spring is between 1 Hz and four times the sampling rate."""
+    """Draw chains for `radii`; each mass on its spring has a frequency from 1 Hz to four times the sampling rate."""
     mass = np.exp(rng.uniform(np.log(1e-4), np.log(3.0), (n, links)))
     rate = 2 * np.pi * np.exp(rng.uniform(0, np.log(4 / T), (n, links)))
     return np.stack([mass, mass * rate**2], axis=2)
 
 
 def worst_hand(F, loop, delta, rng) -> float:
-    """Return the largest spectral radius of random ladders and of a local search from the worst of them."""
+    """Return the largest spectral radius for random chains and for a local search from the worst chain."""
     worst = 0.0
     for links in (1, 2):
         drawn = ladders(rng, 400, links, loop.T)
@@ -658,7 +661,7 @@ def test_the_slope_of_the_sampled_condition():
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
     steps = 1e-6 * np.eye(x.size)
     slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
-    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta: a finite difference
+    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta's slope is a difference
 
 
 @pytest.mark.slow
@@ -772,13 +775,13 @@ def test_designs_refuse_what_known_devices_exclude():
 
 @pytest.mark.parametrize("name", ["known-device", pytest.param("known-device-any", marks=pytest.mark.slow)])
 def test_a_map_agrees_with_single_sweeps(name):
-    """The ratios of two couplings at once agree with single sweeps to 3 % above 0.05, and are at most 2 % below."""
+    """Each ratio of a map is at least 0.98 times that of a single sweep; above 0.05 the two agree to 3 %."""
     loop = one(1e-3, 1.37, environment=RIGID_WALL)
     K, B = np.array([1500.0, 4000.0]), np.array([0.4, 3.0])
     drawn = named(name).ratios(loop, SpringDamper(K[:, None], B[:, None]))
     for k, b, ratio in zip(K, B, drawn, strict=True):
         swept = required_damping(loop, SpringDamper([k], [b]), name).ratio
-        if ratio > 0.05:  # below 0.05 the ratio of a map may exceed the least one
+        if ratio > 0.05:  # below 0.05 the ratio of a map may exceed that of the sweep
             assert ratio == pytest.approx(swept, rel=0.03)
         assert ratio >= swept * 0.98
 
@@ -834,7 +837,7 @@ def needs_by_hand(room, loop, near):
     return brentq(most, near / 2, 2 * near, rtol=1e-5)
 
 
-#: The search settles within 1e-4 of the best beta; between points of these grids a smooth peak rises by 1e-5 at most.
+#: Relative error of a requirement: the search stops 1e-4 from the best beta, and these grids miss 1e-5 of a peak.
 SETTLED = 3e-4
 
 
@@ -905,7 +908,7 @@ def test_no_lossless_hand_grows_under_varying_periods():
 
 
 def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=4000):
-    """Simulate moving lossless hands before one-sided walls, one each, whose force is limited, without delay.
+    """Simulate moving lossless hands, each before a one-sided wall whose force is limited, without delay.
 
     Return the energy of motor, transmission and hand at each tick, (ticks, hands). With rho = 0 the limiter clips the
     force of coupling and wall in series.
@@ -963,7 +966,10 @@ def bounded_needs():
 
 
 def test_unequal_bounds_need_what_a_dense_sweep_needs():
-    """The block written out is positive for some beta; P has the least damping of the transmission, c2 the largest."""
+    """At the requirement some beta makes `block_by_hand` positive.
+
+    P is computed with the least damping of the transmission, c2 with the largest.
+    """
     loop, z = one(1e-3, 1.0, 1, BOUNDS), np.exp(1j * np.linspace(2e-3, np.pi, 600))
     contact = contact_by_hand(z, loop.T, stiffness=800.0, damping=0.6)
 
@@ -1019,7 +1025,7 @@ def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, pla
 
 
 def at_its_multipliers(loop, needs, contact_of, walls=(), rho=None):
-    """Return the least eigenvalues of the block written out at 1.001 and 0.999 of a requirement, with its multipliers.
+    """Return the least eigenvalues of `block_by_hand` at 1.001 and 0.999 of a requirement, with its multipliers.
 
     The frequencies are dense, and one of them is where the requirement binds.
     """
@@ -1042,7 +1048,7 @@ def test_wall_requirements_are_those_of_the_block():
 
 
 def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
-    """Count the lossless hands behind the transmission that have more energy at the end than in the middle.
+    """Count the lossless hands behind the transmission that have 2 % more energy at the end than in the middle.
 
     Where delays switch, the force of the age that gives the most energy acts at every tick.
     """
