@@ -1,4 +1,4 @@
-"""Arm and stop a board without a host: hw/firmware/haptic_alone.h, compiled for this processor.
+"""Boards without a host arm right axes only, and stop: hw/firmware/haptic_alone.h, compiled for this processor.
 
 The handle is a mass with damping, Coulomb friction and a constant force such as gravity, stepped ten times a tick.
 """
@@ -194,7 +194,7 @@ def test_one_invalid_position_drops_the_force(board, wrong, stopping):
 
 
 def test_an_invalid_position_at_rest_is_forgotten(board):
-    """The noise of the sensors is measured anew: a moving handle is not dead after 0.5 s under a force."""
+    """Afterwards the sensors' noise is measured anew, so a moving handle under force is not taken for dead."""
     bench = Bench(board)
     bench.seen[:] = 0.0, np.nan
     board.tick(bench.seen, bench.force)

@@ -117,7 +117,10 @@ HOME, DUTY = f32(-0.045), f32(255) * PER_RADIAN / f32(0.03)
 
 
 def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
-    """Run a session under hand(k) [N]; return counts, the board's four numbers per tick, last phase and cause."""
+    """Run a session under hand(k) [N].
+
+    Return counts, cycles of process and of tick, PWM and its sign per tick, and the last phase and cause.
+    """
     handle, counts, told = Handle(0.07, 0.5, 1.25e-3), [], []
     with (folder / "said.txt").open("w") as said, Board(folder / "board", folder / "hapkit.elf", 1, said=said) as board:
         for k in range(ticks):
@@ -135,7 +138,7 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
 
 
 def swing(k):
-    """Push slowly, and in 30 of 250 ticks by 2.2 N more, at times above the limit."""
+    """Return a slow push [N] that is 2.2 N stronger in 30 of 250 ticks, at times above the limit."""
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 

@@ -88,7 +88,7 @@ def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
     assert session.missed_while_driving <= 1  # only the first tick after CONFIG may be missed
     steps = [row.tick for row in rows]
     assert np.diff(steps).tolist() == [1] * (len(rows) - 1)
-    for axis, theta, slips in ((0, 1, 0), (1, 2, 1)):  # slips: session ticks in which this board has none
+    for axis, theta, slips in ((0, 1, 0), (1, 2, 1)):  # slips: session ticks without a tick of this board
         counts, sent = ([row.state.counts[axis] for row in rows], [row.sent[axis] for row in rows])
         begun = next(k for k in range(len(rows)) if sent[k]) + theta
         host = sum(sent[k - theta] * (counts[k + 1] - counts[k]) for k in range(begun, len(rows) - 1))

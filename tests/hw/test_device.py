@@ -119,7 +119,7 @@ def test_configs_are_refused_while_forces_act():
     assert rig.device.config == CONFIG
 
 
-def test_who_it_is_waits_until_the_motors_rest():
+def test_info_waits_until_the_motors_rest():
     rig = armed()
     rig.say(Hello())
     heard = [type(m) for _ in range(12) for m in rig.tick() if rig.device.phase != Phase.STOPPED]
@@ -431,6 +431,6 @@ def test_other_devices_frames_are_not_obeyed():
     assert (rig.state.crc_errors, rig.forces, rig.device.phase) == (5, (0, 0), Phase.HOLDING)
 
 
-def test_an_info_that_cannot_travel_is_no_device():
+def test_an_info_beyond_the_wires_range_is_refused():
     with pytest.raises(ValueError, match=r"Info.period_ns: 1; 100000 to 100000000"):
         Device(INFO._replace(period_ns=1))

@@ -1,4 +1,4 @@
-"""Find devices that disobey or whose ticks do not last T; do not accuse one that obeys over a bad line."""
+"""Sessions find devices that disobey or whose ticks do not last T, and accuse none that obeys over a bad line."""
 
 from contextlib import nullcontext
 
@@ -54,7 +54,7 @@ def state(tick, applied=(0, 0), phase=Phase.ARMED, t_us=0):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_device_that_obeys_is_never_found_out(seed):
+def test_a_device_that_obeys_is_never_accused(seed):
     """Random forces make the device ramp in, slew, cap and hold, while some forces and STATEs are lost."""
     rng = np.random.default_rng(seed)
     device, told = Device(info_of(scenario_of())), CommandMonitor(CONFIG)
@@ -136,7 +136,7 @@ def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
 
 
 def hand_driven(scenario, rungs, tested=False, behind=()):
-    """Return a session that has begun to arm, and a function that sends it a STATE; `lie` is the device's clock."""
+    """Return a session that has begun to arm, and a function that sends it a STATE; its time is `lie` [us], if any."""
     settings = LinkSettings(measure=50, test_encoders=tested, behind=behind)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)
@@ -298,7 +298,7 @@ def run_clock(ticks):
 
 
 @pytest.mark.parametrize(("factor", "found"), [(1.005, False), (0.995, False), (1.012, True), (0.988, True)])
-def test_a_percent_of_a_block_is_told_apart(factor, found):
+def test_a_clock_off_by_a_percent_is_found(factor, found):
     with pytest.raises(SafetyStop, match="by its own clock") if found else nullcontext():
         run_clock([factor * T_US] * 3 * _BLOCK)
 

@@ -1,4 +1,4 @@
-"""Encoders that do not follow are found on every axis, at arming and under force; still hands stop no session."""
+"""Encoders that do not follow a handle are found at arming and under force; a hand that rests stops no session."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -191,7 +191,7 @@ def rubbing(friction, mass=0.25, q=1e-6, bias=0.0):
 
 @pytest.mark.parametrize(("friction", "closing"), [(0.17, False), (0.34, False), (0.34, True)])
 def test_stronger_forces_overcome_dry_friction(friction, closing):
-    """Friction of 52 % of a test force leaves 0.57 of the motion; after more friction a stronger force is tried."""
+    """Friction of 52 % of a test force leaves 0.57 of the motion; under more friction a stronger force is tried."""
     played(arming_test(closing=closing), rubbing(friction))
 
 
@@ -319,7 +319,7 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
 
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
 def test_handles_that_are_let_go_finish(scenario, rungs, hand):
-    """A hand is asked to let go, and is not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
+    """A firm hand is asked to let go, not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
     session = ended_live(scenario, rungs, hand, lets_go=2.5)
     assert session.stage == Stage.FINISHED, session.cause
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
@@ -407,7 +407,7 @@ def test_noisy_coarse_counts_show_the_motor(strength):
             played(test, noisy)
 
 
-def test_noise_is_the_least_short_range():
+def test_noise_is_the_least_range_of_short_windows():
     noise, draw = EncoderNoise(2, T), np.random.default_rng(2)
     for k in range(400):
         moving = 50 * k if k < 250 else 12_500
@@ -478,7 +478,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_the_impulse_decides(axis, sign, newton, after):
-    """An impulse of 0.1 N s since the last motion raises SafetyStop: 1 N for 100 ms or 5 N for 20 ms, never 0.95 N."""
+    """An impulse of 0.1 N s since the last motion raises SafetyStop: 1 N in 100 ms, 5 N in 20 ms, but 0.95 N never."""
     monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
@@ -568,7 +568,7 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
 
 
 @pytest.mark.parametrize("place", [0.03, -0.03])
-def test_handles_off_centre_are_left_in_peace(scenario, rungs, place):
+def test_handles_off_centre_feel_little_force(scenario, rungs, place):
     """Free handles at 30 mm feel less than 0.5 N if positions count from there; counted from the middle, over 3 N."""
     still = nobody(scenario)
     session, rehearsal = session_with(still, rungs, place=place, seconds=0.6, held=False)

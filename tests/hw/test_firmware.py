@@ -530,6 +530,8 @@ def device(request):
 
 
 class Hand:
+    """A device and its host; a test calls each tick."""
+
     def __init__(self, device) -> None:
         self.device, self.now, self.k = device, 0, 0
 

@@ -1,4 +1,4 @@
-"""Run the adapter through the package forcedimension-core, with a C stub in place of the maker's shared library."""
+"""hw.force_dimension works through the package forcedimension-core; a C stub replaces the maker's shared library."""
 
 import importlib.util
 import json
@@ -143,7 +143,7 @@ def test_three_axes_of_a_device_share_a_limit(session):
         ("5=99", "has switched its forces off, cause 99"),
     ],
 )
-def test_bad_status_takes_every_force_at_once(session, index, words):
+def test_bad_status_removes_every_force_at_once(session, index, words):
     trouble, pushed, then = session[index]
     assert trouble.startswith(f"device sn4712 {words}")
     assert pushed == pytest.approx([0.4, -0.2])

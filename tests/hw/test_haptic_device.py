@@ -209,7 +209,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     constant = certified_coupling(judged.replace(latency=((130e-6, 130e-6),) * 2), "I", None, None, 0, given)
     latest, ranged = (
         max(one.assessment.requirements["this-environment"].required) for one in (constant, host)
-    )  # a range needs at least as much as its latest end, and less than a period of its two longest parts: 0.637433
+    )  # a range needs at least as much as its latest end, and less than a period of 1.33 ms, 0.13 ms late: 0.637433
     assert latest - 1e-6 <= ranged < 0.637433
     assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 
@@ -339,7 +339,7 @@ def test_the_package_without_the_makers_sdk_says_so(monkeypatch):
         ("0x,7x", "device 7"),
     ],
 )
-def test_axes_that_are_none_are_refused(scenario, axes, words):
+def test_wrong_axes_of_a_port_are_refused(scenario, axes, words):
     sdk = StandIn(scenario)
     with pytest.raises(InputError) as error:
         ForceDimension(scenario, axes, sdk)
@@ -359,7 +359,7 @@ def test_exceptions_while_opening_close_every_device(scenario, monkeypatch, call
     assert sdk.enabled == {0: False, 1: False}
 
 
-def test_two_axes_of_one_device(scenario):
+def test_one_device_may_serve_two_channels(scenario):
     sdk = StandIn(scenario)
     with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep) as device:
         assert sdk.open == [0]

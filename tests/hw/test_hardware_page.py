@@ -27,7 +27,7 @@ IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # rows th
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_the_pages_fault_table_is_the_rehearsals(row, scenario, rungs):
+def test_the_pages_fault_table_equals_rehearsals(row, scenario, rungs):
     fault, ends, cause, zero = row
     shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
     names = CALLED.get(fault, (fault,))

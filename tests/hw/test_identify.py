@@ -120,6 +120,7 @@ def test_a_knob_is_identified_in_radians():
     assert 0.95 * 2e-4 < found.friction.delta < 2e-4
 
 
+#: names of benchmark rigs (tests/benchmarks/odd_rigs.py) with viscous friction of 1 N s/m
 ODD = (
     *("ideal", "constant 0.001", "cable 1", "cogging 0.002", "gap 1e-05", "lag 0.3", "eccentric 2e-05", "loss 3"),
     *(
@@ -130,6 +131,7 @@ ODD = (
     ),
     *("drag 0.5", "drift 0.002", "late 0.3", "constant 0.02, coulomb 0.03"),
 )
+#: mass [kg], damping [N s/m] and stiffness [N/m] of hands on the handle
 HANDS = {
     "resting": (0.05, 0.2, 30.0),
     "finger": (0.01, 0.1, 20.0),
@@ -194,7 +196,7 @@ NOT_VISCOUS = {
 def records():
     """Return {name: (rig, positions [m])}, forces (ticks,) [N] and the benchmark, whose plant is not our emulator's.
 
-    Records are a third shorter than those of the command, which has `--seconds 2.5`.
+    Records take 1.5 s, those of the command 2.5 s.
     """
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
     rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"](1.5)
@@ -258,7 +260,7 @@ def test_a_lag_hides_no_memory(odd, records):
 
 @pytest.mark.parametrize(("name", "share"), [("viscous", 0.85), ("viscous, half the mass", 0.93)])
 def test_viscous_friction_keeps_most_of_its_bound(judged, name, share):
-    """The bound excludes a memory of 2 ms that encoder steps of 5 um might hide. A lighter device hides less."""
+    """The bound allows for a memory of 2 ms that encoder steps of 5 um might hide. A lighter device hides less."""
     assert share < judged[name].delta <= 1.0
 
 
@@ -408,7 +410,7 @@ def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     assert session.stage == Stage.ARMING
 
 
-def test_an_axis_that_does_not_move_gives_nothing():
+def test_an_axis_that_does_not_move_is_refused():
     with pytest.raises(ValueError, match="moved by 0 encoder steps"):
         identify(np.zeros(100), np.ones(100), 1e-3, STEP, rigid=True)
 
@@ -472,7 +474,7 @@ def test_bounds_hold_wherever_the_encoder_stands(coarse):
         assert found.viscous == pytest.approx(0.5, rel=0.01)
 
 
-def test_a_bound_never_exceeds_what_is_declared(coarse):
+def test_a_bound_never_exceeds_the_declared_damping(coarse):
     T, step, force, exact = coarse
     x = step * np.round(exact / step)
     found = Estimate(friction(x, force, T, step), None, Viscosity(0.5, 0.0, 0.0, 0.5, 1e-3, False))

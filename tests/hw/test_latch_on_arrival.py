@@ -104,7 +104,7 @@ def test_certificates_cover_the_spread_of_ticks():
     assert timed(known, ages, 0.9, 100.0)[0].T_max == 1.4e-3
 
 
-def test_the_cost_of_one_overlong_tick():
+def test_the_power_of_overlong_ticks_is_bounded():
     """The greatest power -f v - delta v^2 over all v is f^2/(4 delta)."""
     v = np.linspace(-3, 3, 100_001)
     most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))

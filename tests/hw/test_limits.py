@@ -131,7 +131,7 @@ def test_devices_are_sent_limited_forces():
     assert (slow.hold, slow.ramp, slow.ramp_in) == (1, 1, 25)  # at most 20 ms from the last answer to zero
 
 
-def test_no_cap_above_twelve_newtons():
+def test_caps_above_twelve_newtons_are_refused():
     with pytest.raises(ValueError, match=r"cap #2 is 13"):
         SafetyLimits((12.0, 13.0))
 
@@ -165,7 +165,7 @@ def test_the_gain_stays_within_its_ends():
     assert (gain.rise(10_000), gain.rise(), gain.fall(10_000), gain.fall()) == (1.0, 1.0, 0.0, 0.0)
 
 
-def test_the_gain_takes_its_time():
+def test_the_gain_rises_and_falls_in_its_ramps():
     gain = Gain(LIMITS, T)
     ticks = 0
     while gain.value < 1:
@@ -186,7 +186,7 @@ def test_no_stage_is_both_an_end_and_driving():
 @pytest.mark.parametrize(
     ("baud", "microseconds"), [(921_600, 520.8), (2_000_000, 240.0), (115_200, 4166.7)]
 )  # docs/protocol.md has 521 us
-def test_wire_time_is_what_the_frames_take(baud, microseconds):
+def test_wire_time_is_that_of_the_frames(baud, microseconds):
     seconds, text = _wire_time(baud, 2)
     assert 1e6 * seconds == pytest.approx(microseconds, abs=0.1)
     state = State(0, 0, 0, 0, 0, 0, 0, (0, 0), (0, 0))
@@ -397,7 +397,7 @@ def test_too_long_watchdog_periods_are_refused():
         watchdog_for(4.1e-3)
 
 
-def test_force_steps_are_judged_by_the_output():
+def test_force_steps_are_judged_by_the_cap():
     """Eight bits of PWM for 12 N are fine for a cap of 2 N, too coarse for 0.5 N; twelve bits are fine for both."""
     eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
     twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)

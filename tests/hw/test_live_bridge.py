@@ -1,4 +1,4 @@
-"""The bridge through pyserial and a pseudo-terminal, with the emulator in its own process, and its options.
+"""The bridge drives an emulator in another process through pyserial and a pseudo-terminal, and refuses bad options.
 
 On a busy machine the link may be too slow. So tests that need an armed session repeat it at ever slower paces, and
 one attempt must be armed. Every session must end with a named cause, and no device may stay armed.
@@ -159,7 +159,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "stage"), [("SIGINT", Stage.FINISHED), ("SIGTERM", Stage.FINISHED), ("SIGUSR1", Stage.ESTOP)]
 )
-def test_a_signal_while_forces_act(scenario, name, stage):
+def test_signals_end_sessions_while_forces_act(scenario, name, stage):
     """In virtual time SIGINT and SIGTERM end a session by a ramp longer than 90 ms, SIGUSR1 by a latched e-stop."""
 
     def watch(session):

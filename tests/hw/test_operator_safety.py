@@ -68,7 +68,7 @@ def test_holding_the_deadman_continues_the_session(scenario, rungs):
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
 
 
-def test_the_deadman_at_the_device(scenario, rungs):
+def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
     """The session arms only while the switch is held, and ramps out at the first STATE that reports it released."""
     faults = (FaultInjection.parse("letgo@0.7"),)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
@@ -95,7 +95,7 @@ def test_releasing_the_deadman_early_ends_at_once(scenario, rungs):
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
-def test_any_key_is_somebody(scenario, rungs):
+def test_any_key_shows_that_somebody_is_there(scenario, rungs):
     operator = Operator(True, 10.0, lambda: False)
     rehearsal = rehearsal_of(scenario, rungs, operator)
     for _ in range(5):
@@ -105,7 +105,7 @@ def test_any_key_is_somebody(scenario, rungs):
     assert session.stage == Stage.ARMED
 
 
-def test_a_file_that_is_touched(tmp_path):
+def test_a_touched_file_counts_once_per_touch(tmp_path):
     path = tmp_path / "here"
     look = touched(str(path))
     assert not look()
@@ -131,7 +131,7 @@ def test_a_first_session_is_gentle(scenario):
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
 
 
-def test_sessions_stop_outside_the_known_damping(scenario):
+def test_the_identified_speed_limits_sessions(scenario):
     """The speed that hw.identify wrote is the session's default limit, and no option exceeds it."""
     slow = scenario.replace(device=tuple(replace(d, credible_speed=0.5) for d in scenario.device))
     assert limits_from(_parser().parse_args(["--rehearse"]), slow)["speed"] == 0.5
@@ -148,7 +148,7 @@ def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
         assert args.deadman == asked
 
 
-def test_a_reset_lets_go_of_no_deadman(scenario):
+def test_a_reset_device_keeps_the_deadman_held(scenario):
     emulator = Emulator(scenario, (FaultInjection.parse("reset"),))
     before = emulator.device
     emulator.tick(0)
@@ -326,7 +326,7 @@ def test_a_rehearsal_is_the_same_every_time(rehearsed):
     assert {k: v for k, v in first.items() if k != "files"} == {k: v for k, v in second.items() if k != "files"}
 
 
-def test_a_rehearsal_shows_the_faults_that_are_ordered(tmp_path, capsys):
+def test_a_rehearsal_shows_the_injected_fault(tmp_path, capsys):
     options = ["--rehearse", "--no-plot", "--duration", "1", "--fault", "axis2:jump=-5@0.5", "--out", str(tmp_path)]
     assert bridge.main(options) == 1
     assert "encoder 2 jumped by" in capsys.readouterr().out

@@ -98,7 +98,7 @@ messages = st.one_of(small, *[axes.flatmap(kind) for kind in (states, forces, co
 
 
 @given(messages)
-def test_what_is_sent_is_what_arrives(message):
+def test_decoded_frames_equal_sent_messages(message):
     frame, decoder = encode(message), Decoder()
     assert decoder.feed(frame) == [message]
     assert decoder.rejected == 0
@@ -108,19 +108,19 @@ def test_what_is_sent_is_what_arrives(message):
 
 
 @pytest.mark.parametrize("n", range(1, 9))
-def test_sizes_are_the_contract(n):
+def test_frame_sizes_follow_the_formulas(n):
     assert wire_bytes(State, n) == 20 + 6 * n
     assert wire_bytes(Force, n) == 12 + 2 * n
     assert wire_bytes(Stop, n) == 8
 
 
-def test_no_more_axes_than_the_protocol_carries():
+def test_only_one_to_eight_axes_are_accepted():
     for n in (0, 9, -1):
         with pytest.raises(ValueError, match=rf"axes: {n}; the protocol carries 1 to 8"):
             wire_bytes(State, n)
 
 
-def test_two_axes_fit_the_periods_they_should():
+def test_two_axes_need_921600_baud_at_1200_us():
     """At ten bits a byte, 115200 baud cannot carry both frames in 1.2 ms; 921600 baud and 2 Mbaud can."""
     both = wire_bytes(State, 2) + wire_bytes(Force, 2)
     assert [round(both * 10 / baud * 1e6) for baud in (115_200, 921_600, 2_000_000)] == [4167, 521, 240]
@@ -181,13 +181,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("message", "text"), BAD, ids=[text.split(";")[0] for _, text in BAD])
-def test_what_cannot_travel_is_refused_by_name(message, text):
+def test_fields_out_of_range_are_named(message, text):
     with pytest.raises(ValueError, match=rf"^{re.escape(text)}$"):
         encode(message)
 
 
 @given(st.lists(messages, max_size=6), st.randoms(use_true_random=False))
-def test_the_pieces_do_not_matter(sent, rng):
+def test_the_decoder_takes_pieces_of_any_size(sent, rng):
     stream, decoder, got = b"".join(map(encode, sent)), Decoder(), []
     while stream:
         n = rng.randint(1, 40)
@@ -211,7 +211,7 @@ def test_one_and_two_bit_errors_are_detected():
             assert Decoder().feed(damaged.to_bytes(len(frame) - 1, "little") + b"\0") == []
 
 
-def test_it_finds_its_feet_after_garbage():
+def test_the_decoder_recovers_after_garbage():
     good = encode(FORCE)
     for garbage, counted in [
         (b"\x05garbage\0", {"malformed": 1}),

@@ -48,7 +48,7 @@ def trace(scenario, rungs, tmp_path_factory):
     return save(out, session, recorder, report, plot=True), recorder
 
 
-def test_a_trace_is_one_of_sim_run(trace):
+def test_a_sessions_trace_loads_as_a_simulations(trace):
     files, recorder = trace
     result = Trace.load_npz(files[0])
     assert result.t.size == len(recorder)
@@ -95,7 +95,7 @@ def test_a_replay_finds_one_changed_bit(trace):
     assert np.flatnonzero(replay(moved, link).asked)[0] == 200
 
 
-def test_the_replay_command(trace, capsys):
+def test_the_replay_command_says_identical(trace, capsys):
     path = trace[0][0]
     assert replay_command.main([str(path), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"] is True
@@ -316,7 +316,7 @@ def test_an_empty_recording_has_no_ticks():
     assert recorder.link()["x"].shape == (0, 2)
 
 
-def test_result_of_holds_the_last_known_force(trace):
+def test_traces_hold_the_last_known_force(trace):
     """Where no STATE came, the trace shows the last known force."""
     _, recorder = trace
     link = recorder.link()

@@ -59,7 +59,7 @@ def test_rehearsals_wait_for_deaf_devices(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("kind", ["swap", "cross=1"])
-def test_faults_of_two_axes_have_two(kind):
+def test_faults_of_two_axes_need_two(kind):
     with pytest.raises(ValueError, match=rf"--fault {kind[:4]}.* two axes"):
         Emulator(load_scenario("one-wall"), (FaultInjection.parse(kind),))
 
@@ -170,7 +170,7 @@ def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
     assert all(m.command == Command.IDLE and not any(m.force) for m in forces)
 
 
-def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
+def test_a_lost_stop_is_repeated(scenario, rungs):
     session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
     last = session.link.last
     assert last
@@ -357,7 +357,7 @@ def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
     assert "no reserve" not in table
 
 
-def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
+def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_path):
     path = tmp_path / "stiff.json"
     save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
     rungs = certified_couplings(scenario, "I", str(path), None, 1)
@@ -369,7 +369,7 @@ def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
         certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
 
 
-def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
+def test_a_reserve_armed_later_replays_bit_by_bit(scenario, optimal_rungs, tmp_path):
     """After late answers and a ramp, a person arms the reserve. The trace of both couplings replays bit by bit."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
@@ -449,7 +449,7 @@ class _Thief:
 
 
 @pytest.mark.slow
-def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
+def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)

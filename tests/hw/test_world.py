@@ -132,7 +132,7 @@ def read_coupling_of(trace):
 
 
 def in_the_ball_world(name, *faults):
-    """Run a session in the scenario of a ball. Return it and the total energy given at every tick [J]."""
+    """Run a session in the scenario `name`, a world. Return it and the total energy given at every tick [J]."""
     scenario, rows = load(name), []
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_for(scenario, LinkSettings(measure=60), 2.0)
