@@ -107,7 +107,7 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
         off = 100 * (found.viscous / c.viscous - 1)
         print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
     over = sum(e > 0 for e in excess)
-    print(f"{len(excess)} bounds, {over} above the truth, the worst by {max(excess):+.3f} %; none in {none} cases")
+    print(f"{len(excess)} bounds, {over} above the truth, the worst by {max(excess):+.3f} %; no bound in {none} cases")
     print(f"bounds below the truth: median {-np.median(excess):.2f} %, most {-min(excess):.2f} %")
     print(f"errors over standard errors: mean {np.mean(scaled):+.2f}, deviation {np.std(scaled):.2f}")
     print(f"longest case {longest:.1f} s")

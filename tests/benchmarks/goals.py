@@ -2,9 +2,9 @@
 
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
 
-Times are CPU seconds, for cold and first wall seconds, which need an idle machine. Ratios are medians of rounds in
-which both sides alternate. A command runs in a new process, five times or, if long, once, beside the floor: the import
-of NumPy and MuJoCo.
+Times are CPU seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of
+rounds in which both sides alternate. A command runs in a new process, five times or, if long, once. It alternates with
+the floor, a process that only imports NumPy and MuJoCo; goals are multiples of the floor's time.
 `--write` puts the table of cold into docs/accuracy.md; use it on an idle machine.
 """
 

@@ -2,7 +2,7 @@
 
     PYTHONPATH=. python tests/benchmarks/hostile_loops.py --count 20 --seed 1
 
-A loop has one to three devices with dampings of .02 to 5 N s/m, delays of 0 to 16 samples, and 0 to 2 in its object.
+A loop has one to three devices with dampings of .02 to 5 N s/m, theta of 0 to 16 samples, and psi of 0 to 2 samples.
 The object has masses of 1 g to 100 kg, stiffnesses of .01 to 1e6 N/m, and dampings from none to critical.
 """
 
@@ -22,7 +22,7 @@ from haptic_loop.design.optimal import design
 
 
 def hostile(rng: np.random.Generator) -> Loop:
-    """Return a loop with evenly drawn figures; masses, stiffnesses and dampings are even in their logarithms."""
+    """Return a random loop; masses, stiffnesses and the devices' dampings are uniform in their logarithms."""
 
     def drawn(low: float, high: float) -> float:
         return float(f"{np.exp(rng.uniform(np.log(low), np.log(high))):.3g}")

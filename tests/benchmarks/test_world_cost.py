@@ -1,4 +1,4 @@
-"""Measure a tick of MuJoCo worlds of 1, 10 and 50 bodies, and how far its step is from the contact law.
+"""Measure a tick of MuJoCo worlds of 1, 10 and 50 bodies, and how far contact forces are from their law.
 
 make bench    (or: python -m pytest tests/benchmarks/test_world_cost.py --benchmark-only -s)
 """

@@ -1,4 +1,4 @@
-"""Attack each guarantee beyond the plain linear loop at its edge: `make validate`.
+"""Attack guarantees for limited forces, budgets, walls and encoder steps, as a part of `make validate`.
 
 A loop is drawn; its devices get a little more or much less damping (or friction) than its guarantee requires. Then two
 adversaries try to take energy out of the loop, from rest. One moves the devices as it likes: waves, noise, and at every
@@ -36,7 +36,7 @@ from haptic_loop.sim.scenario import Scenario
 ENOUGH = 1.02  # times the damping or friction that a guarantee requires
 _GIVEN = 0.005  # [J] that a budget may give
 _PUSHED = 24  # motions that are simulated at once
-_GROWN = 1.5  # a hand grows if its rms speed in the last quarter of a run is this many times the first's
+_GROWN = 1.5  # a hand's motion grows if its rms speed in the last quarter exceeds this many times that in the first
 _ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
 
@@ -51,7 +51,7 @@ class _Challenge:
     took: int  # motions that took more energy than the guarantee allows
     least_J: float  # the lowest energy balance plus `given` of all motions and hands
     hands: int  # hands tried in each generation
-    grew: int  # hands that grew, or took more energy than the guarantee allows
+    grew: int  # hands whose motion grew, or that took more energy than the guarantee allows
     limited: float  # share of ticks with limited forces or contact, largest over the three values of greed
     holds: bool  # no adversary succeeded, or nothing is guaranteed (factor < 1)
 
@@ -87,7 +87,7 @@ def challenges(
     ticks: int = 700,
     names: Sequence[str] | None = None,
 ) -> Iterator[_Challenge]:
-    """Yield each guarantee on `loops` random loops, at ENOUGH and at too little of what it requires.
+    """Yield the findings on `loops` random loops for each guarantee, with ENOUGH and too little of what it requires.
 
     Motions last `ticks`, and hands move for `seconds`.
     """
@@ -132,7 +132,7 @@ def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: 
 def _moved(case: _Case, pushed: Array, greed: float) -> tuple[Array, float]:
     """Return the lowest balance of each motion plus `given`, at most 0, and the share of limited ticks.
 
-    Each step is `pushed` plus `greed` times the step that takes the most energy in this tick, -f/(2 D).
+    Each step is `pushed` plus `greed` times the step that takes the most energy in this tick, -f/(2 D), D = delta/T.
     """
     ticks, _, nsim = pushed.shape
     process, D = case.process(nsim, ticks + 1), case.delta[:, None] / case.T
@@ -152,7 +152,7 @@ def _moved(case: _Case, pushed: Array, greed: float) -> tuple[Array, float]:
 
 
 def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> tuple[int, float]:
-    """Return (hands that grew or took too much, the lowest balance) over three generations of lossless hands."""
+    """Return (hands counted as `grew`, the lowest balance plus `given`) over three generations of lossless hands."""
     m, grew, lowest = len(case.delta), 0, 0.0
     mass = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (hands, m, 2)))
     stiff = np.exp(rng.uniform(np.log(30.0), np.log(1e4), (hands, m, 2)))

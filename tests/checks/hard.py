@@ -35,7 +35,7 @@ class _Hard:
     name: str
     scenario: Scenario
     fails: _Setting | None  # a setting that does not hold; None if all of _TRIED hold
-    how: str  # what is wrong with it: "refused", "verdict", "growth" or "position"
+    how: str  # what is wrong with `fails`: "refused", "verdict", "growth" or "position"
     coupling: Coupling = PUBLISHED["I"]
     substeps: int | None = None  # RK4 substeps that hold; None: those that the rule picks
 

@@ -1,4 +1,4 @@
-"""Check every packaged MuJoCo world with 100 pairs of hands, and the lemma with 120,000 contacts."""
+"""Check every packaged MuJoCo world with 100 pairs of hands, and the lemma of docs/theory.md with 120,000 contacts."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Measure how tight the condition is: search the worst hand for loops that lack some of the required damping.
+"""Measure how tight this-environment and known-device are: search the worst hand for loops with too little damping.
 
 `make validate` runs the search.
 """

@@ -1,4 +1,4 @@
-"""The classics in examples/classics.py obey their published laws, and docs/energy-budget.md has their figures."""
+"""The methods in examples/classics.py obey their published laws, and docs/energy-budget.md has their figures."""
 
 import numpy as np
 import pytest

@@ -137,7 +137,7 @@ def test_pages_get_the_lines_they_request():
     assert fresh == page.replace("old", "is certified")
 
 
-def test_what_counts_as_the_same_line():
+def test_same_lines_differ_by_small_errors_only():
     same_line = regenerate.same_line
     assert same_line("needs 1.370 of 1.37 N s/m", "needs 1.372 of 1.37 N s/m")
     assert not same_line("needs 1.370 of 1.37 N s/m", "needs 1.375 of 1.37 N s/m")

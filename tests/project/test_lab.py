@@ -25,7 +25,7 @@ def go(command: str, *words: str, holds: bool = True) -> None:
 
 
 @pytest.mark.slow
-def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
+def test_commands_lead_from_a_scenario_to_c(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # the smallest basis suffices here
     lab = ("--scenario", LAB)

@@ -1,4 +1,4 @@
-"""Imports between folders go one way, without circles, and each large package is imported in a few files only."""
+"""Imports between folders go one way, without cycles, and each large package is imported in a few files only."""
 
 import ast
 import tomllib
@@ -60,7 +60,7 @@ CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_EN
 AT_HOME = ("design/conditions", "design/environments", "design/result")
 
 
-def test_no_code_asks_for_a_conditions_name():
+def test_no_code_compares_names_of_conditions():
     """A user's own condition works in every command, since no code decides by a condition's name."""
     asking = []
     for path in FILES:
@@ -102,7 +102,7 @@ def file_of(name: str) -> Path | None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_arrows_point_one_way(path):
+def test_folders_import_only_allowed_folders(path):
     world = path.relative_to(ROOT).parts[0]
     for name in imported(path):
         package = name.split(".")[0]
@@ -148,11 +148,11 @@ def between_files() -> dict[str, set[str]]:
     return {name: after for name, after in arrows.items() if not name.endswith("__init__.py")}
 
 
-def test_files_have_no_circle():
+def test_files_have_no_import_cycle():
     assert circle(between_files()) is None
 
 
-def test_folders_have_no_circle():
+def test_folders_have_no_import_cycle():
     folders: dict[str, set[str]] = {}
     for name, after in between_files().items():
         place = Path(name).parent.as_posix()
@@ -160,7 +160,7 @@ def test_folders_have_no_circle():
     assert circle(folders) is None
 
 
-def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
+def test_the_check_sees_forbidden_imports_and_cycles(tmp_path):
     wrong = tmp_path / "wrong.py"
     door = "if __name__ == '__main__':\n    import cli.run\n"
     wrong.write_text(

@@ -177,7 +177,7 @@ def test_a_scenario_file_executes_nothing(line, place):
         ),
     ],
 )
-def test_a_hand_that_fails_after_a_while(force, message, place):
+def test_a_hand_that_fails_later_is_named(force, message, place):
     """The hand is in a module that the file of hands imports."""
     hand = "import numpy as np\nfrom haptic_loop.models.human import Port\n\n\nclass Hand:\n    def port(self):\n"
     hand += "        return Port([0.3], [[-1, 1]], [4.0], [500.0])\n\n"
@@ -199,7 +199,7 @@ def test_a_coupling_must_be_derived_from_ours(place):
 @pytest.mark.parametrize(
     "command", [f"{RUN} --environment mine.py:hard --coupling", "python -m design.audit --coupling"]
 )
-def test_a_coupling_that_is_its_compliance(command, place):
+def test_a_coupling_may_be_given_by_its_compliance(command, place):
     """A run puts walls behind the coupling, and an audit accepts the same option."""
     done = run(f"{command} mine.py:weighted", place)
     assert done.returncode == 0, done.stderr

@@ -88,6 +88,7 @@ def streams() -> Iterator[Case]:
     yield Case("MPLBACKEND=nonsense", ("trace",), (0,), before=backend)
 
 
+#: characters that control a terminal
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")
 TOGETHER = 100  # cases per process: starting a process costs more than most cases
 

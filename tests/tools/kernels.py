@@ -36,7 +36,7 @@ NEEDS = {
     "ZEN": "AVX2",
     "SKYLAKEX": "AVX512_SKX",
 }
-#: asks NumPy for its features, and threadpoolctl for the kernels that its own and SciPy's OpenBLAS use
+#: asks NumPy for its features, and threadpoolctl for the kernels that NumPy's and SciPy's OpenBLAS use
 _ASK = """
 import json, numpy, scipy.linalg
 from threadpoolctl import threadpool_info
@@ -80,8 +80,8 @@ def settings() -> dict[str, dict[str, str]]:
 def foreign(every: dict[str, dict[str, str]]) -> str:
     """Return a kernel other than the native one, chosen by the commit's hash; "native" if there is no other.
 
-    A count of the commits would always be 1 in a shallow clone.
-    PRESCOTT, the kernel of processors before 2008, takes a fifth longer and is left to the run of every setting.
+    The hash is used because a shallow clone has only one commit to count. PRESCOTT, the kernel of processors before
+    2008, takes a fifth longer and is left to the run of every setting.
     """
     others = [name for name in every if name in NEEDS and name != "PRESCOTT"]
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
