@@ -47,7 +47,7 @@ from haptic_loop.controller.lti import Array, Lti
 START_J = 2e-3  # [J] W0 of a MuJoCo world, unless a run says otherwise
 EPS = 0.05  # share of the damping that a budget does not use
 _UNTOLD = 4096  # A tick whose report is missing for longer than this number of ticks keeps its largest loss.
-_HUGE = 1e12  # [N] larger forces count as errors
+_HUGE = 1e12  # [N] A force of this size or more counts as an error and is sent as 0.
 _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 
@@ -274,7 +274,7 @@ class EnergyBudget(_Net):
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
             return
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
-        before = self._last[1] if self._last[0] == tick - 1 else -acted  # if unknown, the most costly force
+        before = self._last[1] if self._last[0] == tick - 1 else -acted  # An unknown force is the costliest.
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:

@@ -293,7 +293,7 @@ class _BallBlock:
         if least < -GROUNDED:
             rows = (at + 1).tolist()
             raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
-        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # regularised, although f is unique without it
+        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # now v is unique; f always is
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
         self._by_tau, self.tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)

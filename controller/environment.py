@@ -1,9 +1,9 @@
-"""Virtual environments: spring-damper-mass networks, discretised by backward Euler.
+"""Virtual environments: networks of springs, dampers, masses and walls, rigid walls, blocks E(z), and MuJoCo scenes.
 
-Nodes are contacts (whose displacements the devices impose), internal nodes (free) and the ground.
-The dynamic stiffness of the network is Z(s) = M s^2 + D s + K, at s = (z-1)/(Tz). With the blocks of contacts (c) and
-internal nodes (i), the map from contact displacements to forces is E = Z_cc - Z_ci Z_ii^-1 Z_ic. The devices feel these
-forces with a minus sign.
+A network is discretised by backward Euler. Its nodes are contacts (whose displacements the devices impose), internal
+nodes (free) and the ground. The dynamic stiffness of the network is Z(s) = M s^2 + D s + K, at s = (z-1)/(Tz). With the
+blocks of contacts (c) and internal nodes (i), the map from contact displacements to forces is
+E = Z_cc - Z_ci Z_ii^-1 Z_ic. The devices feel these forces with a minus sign.
 """
 
 from __future__ import annotations
@@ -371,7 +371,7 @@ class Network(
         for name, mass in self.masses.items():
             _check_amount(f"mass of {name!r}", mass, "kg")
             if name == GROUND or not set(self.coordinates(name)) <= {*nodes, GROUND}:
-                raise ValueError(f"masses names {name!r}, which no spring or wall reaches; nodes: {', '.join(nodes)}")
+                raise ValueError(f"masses lists {name!r}, which no spring or wall reaches; nodes: {', '.join(nodes)}")
         ends = [node for part in (*self.springs, *self.walls) for node in part.between]
         held = {node for end in (*ends, *self.masses) for node in self.coordinates(end)}
         loose = [n for n in self.contacts if n not in held and not self.block]
@@ -550,7 +550,7 @@ def environment(network: Network, T: Number) -> Lti:
     return E + network.block.at(T) if network.block else E
 
 
-#: E(z), without blocks, of the networks seen last. A design asks for the same E(z) about eighty times.
+#: E(z), without blocks, of the networks used last. A design needs the same E(z) about eighty times.
 _computed: dict[Any, Lti] = {}
 _MOST_COMPUTED = 32
 

@@ -50,7 +50,7 @@ class Law(ReadOnly):
     Raises SingularLoop if the walls' forces are not unique.
     """
 
-    sent: Lti  # m + w inputs and outputs
+    sent: Lti  # m + w inputs and outputs, for w walls
     theta: tuple[int, ...] = ()  # (m,) delays of the forces [samples]; () means no delay
     walls: tuple[Wall, ...] = ()
 

@@ -170,7 +170,7 @@ def _parts(network: Network, ranges: Ranges) -> list[_Part]:
     named = [frozenset(one.between) for one in ranges.springs]
     for one, ends in zip(ranges.springs, named, strict=True):
         if named.count(ends) > 1:
-            raise ValueError(f"ranges.springs names {' and '.join(one.between)} twice")
+            raise ValueError(f"ranges.springs lists {' and '.join(one.between)} twice")
     return [
         *(_spring_part(network, one) for one in ranges.springs),
         *(_mass_part(network, *m) for m in ranges.masses.items()),
@@ -232,7 +232,7 @@ def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
 def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
     if node not in (*network.points, *network.nodes()):
         names = network.points or network.nodes()
-        raise ValueError(f"ranges.masses names {node!r}, which no spring or wall reaches; nodes: {', '.join(names)}")
+        raise ValueError(f"ranges.masses lists {node!r}, which no spring or wall reaches; nodes: {', '.join(names)}")
     own = network.masses.get(node, 0.0)
     _require_inside(f"ranges.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:

@@ -30,7 +30,7 @@ from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.law import Law, Transition
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
 
-RunBlock = Callable[[int], None]  # runs a number of ticks from row 0
+RunBlock = Callable[[int], None]  # runs a number of ticks from row 0 of a `StepBuffer`
 
 _PART = 128  # number of ticks whose rows fit into the cache
 _ROUNDED = 1e-14  # relative rounding error of a force vector that was scaled to its limit

@@ -72,7 +72,7 @@ class _FixedOrder:
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
         self.shaping, self.order, self.units = shaping, order, _Units(shaping, phi)
         one, row = np.eye(shaping.loop.channels), np.eye(order)[:1]
-        self.F = np.kron(one, row)  # reads the first state of every channel
+        self.F = np.kron(one, row)  # F reads the first state of every channel.
         masks = [np.kron(one, np.ones((order, order))), np.kron(one, np.ones((order, 1))), one]
         masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
         self._shapes = [mask.shape for mask in masks]

@@ -365,7 +365,7 @@ class LimiterLoop(SampledLoop):
     """The loop with limited forces: x = (log K, B/delta, c), with the limiter's weight c of lag 1 per channel."""
 
     bounds = (0.0, 5.0)
-    _first = 0.5  # first value of the weight
+    _first = 0.5  # first value of c
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)

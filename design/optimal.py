@@ -33,9 +33,9 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-_SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
+_SETTLED_DB = 0.05  # [dB] A smaller gain ends the search; in `design` only from _FEWEST_TAPS taps on.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
-#: A basis of more than 26 taps is skipped if the basis before it was certified and gained less than 0.1 dB.
+#: The search ends before a basis of more than 26 taps if the last basis was certified and gained less than 0.1 dB.
 _LARGE, _PROMISING_DB = 26, 0.1
 _FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
 _KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below this share of an accepted solution's.
@@ -57,7 +57,7 @@ class _BasisResult:
     taps: int
     poles: int
     states: int  # order of the loop
-    mismatch_db: float  # objective
+    mismatch_db: float  # [dB] objective
     g: float  # rendered share of the static stiffness
     # None, _SETTLED, or why the sweep (with a limiter or known devices: the proof) does not certify the coupling
     reason: str | None

@@ -43,12 +43,12 @@ from haptic_loop.design.transparency import BAND_HZ
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
 _BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
-_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
+_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # largest and least distances of the real poles to 1
 _FASTER = 0.25  # With many channels, real modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius are left out of the basis.
 _RICH = 8  # largest number of channels for which the basis has second-order sections at the band's end
-_EDGED = {1: 20, 2: 20}  # number of channels: least number of taps of a basis with sections at the band's end
+_EDGED = {1: 20, 2: 20}  # least number of taps of a basis with sections at the band's end, by number of channels
 _EDGED_OF_MANY = 6  # the same least number for more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of the sections; small, because the error may jump at the band's end
 # Up to FULL channels every force has a filter to every device. With further constraints,

@@ -203,7 +203,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
     g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # slopes of g: diagonals (2N, k, N)
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
-    scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
+    scale = 1 / np.abs(g0)  # Columns are divided by |g0|, and W1 L g W2 also by the norm.
     rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
     row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
     tangent = 2 * (np.conj(g0) * g).real * scale**2
@@ -414,7 +414,7 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
 
-_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried beta over the largest
+_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # tried beta/(largest beta)
 _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 

@@ -26,7 +26,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
         raise ValueError(f"{field} is {value:g}, allowed are {low:g} to {high:g} {unit}")
 
 
-MOST_DAMPING = 1e4  # [N s/m]
+MOST_DAMPING = 1e4  # [N s/m] largest damping of a device
 _LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below the damping of any device, above rounding errors
 AXES = ("x", "y", "z")
 
@@ -280,7 +280,7 @@ def _check_axes(self: Any) -> None:
     for axis in self.clamped:
         if axis not in names:
             raise ValueError(
-                f"clamped names {axis!r}, allowed are {', '.join(names)}: the device has axes = {self.axes}"
+                f"clamped lists {axis!r}, allowed are {', '.join(names)}: the device has axes = {self.axes}"
             )
     if len(set(self.clamped)) < len(self.clamped):
         raise ValueError(f"clamped is {list(self.clamped)}, expected each axis of {', '.join(names)} at most once")

@@ -62,7 +62,7 @@ _Array = NDArray[np.floating[Any]]
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies
-DRAWN = "drawn transmission"
+DRAWN = "drawn transmission"  # end of the names of tendons that are only drawn
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # left by attached files
 _FORCE = "/force"  # part of the names of the motors' actuators
@@ -702,8 +702,8 @@ def draw(population: Population, devices: int, seed: int, index: int, links: int
     """Draw the links (devices, links, 3 or more) of the humans with this index, one per device, as in Crowd.
 
     The links do not depend on other indices. With `links` = MIXED all humans have one link, or all have two.
-    With `axes` a link has random amounts of damping and stiffness along `directions`. Their weights w make the sum of
-    w d d' over all directions d the identity. So the damping and the stiffness in any direction lie within the
+    With `axes` a link has random amounts of damping and stiffness along `directions`. Each direction d has a weight w
+    such that w d d' sums to the identity. So the damping and the stiffness in any direction lie within the
     population's ranges.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))

@@ -71,7 +71,7 @@ class _Part:
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
-    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read, is no
+    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read, is not
     XML, or is included twice.
     """
     files: dict[Path, None] = {}
@@ -561,9 +561,10 @@ class WorldPort:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Repeat the step, up to _MOST_REPETITIONS times, until the same forces limit the same contacts twice.
+        """Repeat the step until two in a row limit the same contacts with the same forces.
 
-        On a limited contact the limited force acts instead of the spring.
+        At most _MOST_REPETITIONS repetitions are made. On a limited contact
+        the limited force acts instead of the spring.
         """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)
@@ -666,7 +667,7 @@ _NONE = "no energy (lemma)"
 _BOUNDED = "lemma, up to what contacts create (printed by a run)"
 _ROW = "lemma with the row term: may create energy; the shell"
 _SMALL = "measured: small; the shell"
-_VARYING = "measured: small unless made at speed; the shell"
+_VARYING = "measured: small unless contact is made fast; the shell"
 _TURNING = "measured: small for slow motion; the shell"
 _SHELL = "the shell only"
 

@@ -163,7 +163,7 @@ def test_random_networks_dissipate(seed):
     ("build", "message"),
     [
         (lambda: Network(("a", "a")), "contacts must be different names"),
-        (lambda: Network(("a",), (Spring(("a", "b"), 1.0),), {"c": 1.0}), "masses names 'c'"),
+        (lambda: Network(("a",), (Spring(("a", "b"), 1.0),), {"c": 1.0}), "masses lists 'c'"),
         (lambda: Network(("a", "b"), (Spring(("a", GROUND), 1.0),)), "contact 'b' has neither spring nor mass"),
         (lambda: Spring(("a", "a"), 1.0), "to itself"),
         (lambda: Spring(("a", "b"), -1.0), "stiffness between a and b is -1.0"),

@@ -185,7 +185,7 @@ def test_the_number_of_parameters_is_limited():
     [
         ("[ranges]", "ranges are empty"),
         ("[ranges]\nmass = 1", "unknown field `mass`"),
-        ("[ranges]\nmasses = { mas = [0.5, 2.0] }", "ranges.masses names 'mas', which no spring or wall reaches"),
+        ("[ranges]\nmasses = { mas = [0.5, 2.0] }", "ranges.masses lists 'mas', which no spring or wall reaches"),
         (
             "[ranges]\nmasses = { mass = [2.0, 3.0] }",
             "ranges.masses.mass is 2 to 3 kg, which leaves out the environment's own 1",

@@ -81,7 +81,7 @@ def rows(matrix: Array) -> str:
     ("first", "more", "words"),
     [
         ('clamped = ["x", "y", "z"]', "", ("device #1: clamped", "leaves no axis")),
-        ('clamped = ["w"]', "", ("clamped names 'w'", "allowed are x, y, z")),
+        ('clamped = ["w"]', "", ("clamped lists 'w'", "allowed are x, y, z")),
         ('clamped = ["y", "y"]', "", ("clamped is ['y', 'y']", "at most once")),
         ("damping = [[1, nan, 0], [nan, 1, 0], [0, 0, 1]]", "", ("damping is [[1", "finite numbers")),
         ("damping = [[1, 1, 0], [1, 1.00000000000001, 0], [0, 0, 1]]", "", ("damping is [[1", "eigenvalues in [1e-09")),

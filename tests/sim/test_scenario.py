@@ -44,7 +44,7 @@ BAD = [
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
     ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed are 0 and"),
-    ("mass = 1.0 }", "mas = 1.0 }", "masses names 'mas', which no spring or wall reaches"),
+    ("mass = 1.0 }", "mas = 1.0 }", "masses lists 'mas', which no spring or wall reaches"),
     ("channel = 1", "channel = 3", "tap.channel is 3, allowed are 1 to 2"),
     ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
     ("duration = 15.0", "duration = 0.0", "duration is 0"),
