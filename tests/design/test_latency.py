@@ -40,7 +40,7 @@ def spring(theta=0) -> Lti:
 @pytest.mark.parametrize(
     ("theta", "range", "needs"), [(0, (TAU, TAU), 0.774878), (0, (0.0, TAU), 0.841354), (1, (TAU, TAU), 1.947854)]
 )
-def test_a_wall_that_latches_late(theta, range, needs):
+def test_late_walls_need_the_known_damping(theta, range, needs):
     found = this_environment(spring(theta), [1.0], latency=[range])
     assert found.required[0] == pytest.approx(needs, abs=2e-6)
     if theta == 0:  # the condition binds as w -> 0: (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2
@@ -50,7 +50,7 @@ def test_a_wall_that_latches_late(theta, range, needs):
         assert found.frequency_hz == 0
 
 
-def test_the_block_at_a_frequency():
+def test_the_block_has_the_known_entries():
     demand = latency_demand(spring(), [1.0], [(TAU, TAU)])
     z = on_circle(np.array([0.5]))
     block = hermitian(demand.free.at(z) + demand.gain.at(z))[0]
@@ -64,8 +64,8 @@ def test_the_block_at_a_frequency():
     ("range", "needs"),
     [((1e-10, 1e-10), 0.584731), ((TAU, TAU), 0.574622), ((0.0, TAU), 0.611902), ((T - 1e-12, T - 1e-12), 0.714344)],
 )
-def test_a_pair_of_devices_between_two_whole_samples(range, needs):
-    """No latency needs the damping of theta = (0, 1), a latency of a whole sample that of theta = (1, 2)."""
+def test_pairs_with_latency_need_the_known_damping(range, needs):
+    """A latency of almost 0 needs the damping of theta = (0, 1), a latency of almost T that of theta = (1, 2)."""
     found = required_damping(change(PAIR, latency=(range, range)), SOFT, "this-environment")
     assert max(found.required) == pytest.approx(needs, abs=2e-6)
     assert this_environment(PAIR.F(SOFT), PAIR.delta).required[0] == pytest.approx(0.584731, abs=1e-6)
@@ -227,7 +227,7 @@ def grown(damping, latencies, mean, seed=3):
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass  # under a constant force
     steps = []
     latch, force = np.diag([1.0, 1.0, 0.0]), np.zeros((3, 3))
-    force[2, 0] = K  # computed from the position at the tick
+    force[2, 0] = K  # the new force follows from the position at the tick
     for tau in latencies:
         steps.append(expm(A * (T - tau)) @ (latch @ expm(A * tau) + force))
     steps, energy = np.stack(steps), np.stack([stiff, mass], axis=1)

@@ -94,7 +94,7 @@ def test_closed_forms_of_a_spring(theta):
 
 
 @pytest.mark.parametrize(("c", "factor"), [(0.0, 2.0), (0.25, 1.6875), (0.5, 1.5625), (1.0, 1.5), (2.0, 1.6)])
-def test_a_delayed_spring_by_its_multiplier(c, factor):
+def test_the_multiplier_sets_a_delayed_springs_need(c, factor):
     G = Lti.constant([[1000.0]], T)
     assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
 
@@ -137,7 +137,7 @@ def test_no_multiplier_on_a_grid_is_better():
 
 
 def test_many_devices_use_the_zero_multiplier(monkeypatch):
-    """Above `MULTIPLIER_ROWS` one sweep at c = 0 replaces the search, and may need more damping."""
+    """With more than `MULTIPLIER_ROWS` rows one sweep at c = 0 replaces the search, and may need more damping."""
     best = required_damping(PAIR, BUILT, LIMITER)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 3)
     monkeypatch.setattr(environments._Search, "best", None)

@@ -1,4 +1,4 @@
-"""Tests of the matrix inequalities: realisations, agreement with the frequency domain, infeasible printed forms."""
+"""Tests of the matrix inequalities: realisations, agreement with frequency responses, the paper's infeasible forms."""
 
 import cvxpy as cp
 import numpy as np
@@ -46,7 +46,7 @@ def random_stable(rng, order, m=2):
 
 
 def near_the_boundary(rng, V, theta, delta):
-    """Return V, scaled in up to 60 trials until its required damping is within a factor of 2 of `delta`."""
+    """Return V, scaled in up to 60 trials until it needs half to twice the damping `delta`, and not within 1 %."""
     for _ in range(60):
         ratio = any_environment(V, theta, delta).ratio
         if not np.isfinite(ratio):

@@ -201,7 +201,7 @@ def test_supremum_finds_a_needle():
 
 
 def test_rounding_elsewhere_hides_no_peak():
-    """Fifty ripples of 1e-9, as rounding makes them, exceed all grid values beside the peak, but it is found."""
+    """Fifty ripples of 1e-9, as rounding makes them, exceed all grid values beside the peak, which is still found."""
 
     def response(w):
         return np.where(w < 0.5, 1 + 1e-9 * np.cos(200 * np.pi * w), 1.001 - 200 * (w - 0.7525) ** 2)

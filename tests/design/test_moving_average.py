@@ -1,4 +1,4 @@
-"""The moving average, the stiffest coupling for any environment: its zeros, its design and its file."""
+"""Tests of the moving average, the stiffest coupling for any environment: its zeros, its design and its file."""
 
 import numpy as np
 import pytest
@@ -30,8 +30,8 @@ def test_scaled_moving_averages_need_less_damping(theta, factor):
     assert needs.certified == (factor > 1)
 
 
-def test_channels_whose_zeros_differ():
-    """Channels have different zeros. With three, the permutation to singular vectors is not its own inverse."""
+def test_channels_with_different_zeros_need_one_ratio():
+    """The ratio is 1/1.02. With three channels the permutation to singular vectors is not its own inverse."""
     theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
     for m in (2, 3):
         V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])
@@ -72,7 +72,7 @@ def test_delay_in_the_environment():
     assert simulate(scenario.replace(duration=1.0), made, "exact").meta["stability"]["exact_verdict"] == "stable"
 
 
-def test_stored_proved_and_read_again(tmp_path):
+def test_a_moving_average_is_stored_and_proved(tmp_path):
     loop = scenario_of("omega-pair").loop("I")
     made = design_coupling(loop, "moving-average").coupling
     file = tmp_path / "coupling.json"

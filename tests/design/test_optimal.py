@@ -208,6 +208,7 @@ def test_every_basis_is_reported_as_it_is_finished():
     ],
 )
 def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
+    """`script` holds the mismatch and the share g of static stiffness of each basis; number `taken` is the design."""
     one, steps = best("n3"), iter(script)
 
     def over_basis(search, taps, poles, before, floor, least):
@@ -253,7 +254,10 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition number of 1e15, and all its digits are stored; a second solve weighs g more, or g = 0.017."""
+    """P has a condition number of 1e15, and all its digits are stored.
+
+    Without the second solve, which weighs g more, the design would have g = 0.017.
+    """
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
@@ -300,7 +304,7 @@ def test_random_loops_get_a_proved_design(seed):
 
 
 def test_ties_prefer_less_error_at_small_forces():
-    """At 0.6 Hz, hands that move together should feel under 2 % of the largest force; its error is below 5 %."""
+    """At 0.6 Hz hands that move together should feel under 2 % of the largest force; they feel it to 5 %."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -327,7 +331,7 @@ def test_scaled_walls_need_the_closed_form(theta):
 
 @pytest.mark.parametrize("theta", [1, 16])
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
-    """F(1) T/2 is the mass at z = 1 of a measure of total delta with zero moments 1 .. theta: <= delta/(theta + 1).
+    """F(1) T/2 <= delta/(theta + 1): it is the mass at z = 1 of a measure of total delta with zero moments 1 .. theta.
 
     A plain spring reaches delta/(2 theta + 1); a designed filter reaches more, but less than delta/(theta + 1).
     """
@@ -398,7 +402,7 @@ def test_ranges_fall_back_to_a_proved_basis():
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     found = design(ranged, replace(SMALLEST, seconds=5.0))
     assert found.proved
-    assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
+    assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment, only scaled down, reaches -3.05 dB
 
 
 @pytest.mark.validate
@@ -594,7 +598,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     root = np.sqrt(loop.T / np.asarray(loop.delta))
     He = hermitian(root[:, None] * map_of(z) / (z - 1)[:, None, None] * root)
     _, size, axes = np.linalg.svd(np.vstack([part.reshape(len(He), -1).T for part in (He.real, He.imag)]), False)
-    change = axes.T / np.maximum(size, 1e-7 * size[0])  # the functions of a basis are nearly dependent
+    change = axes.T / np.maximum(size, 1e-7 * size[0])  # x is badly conditioned, y is not
     x = change @ y
     if m == 1:
         held = [He[:, :, 0, 0].real.T @ x >= -0.998]
@@ -772,7 +776,7 @@ def test_late_walls_match_their_closed_form():
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n2", "n4"))]
 )
 def test_limited_forces_are_part_of_designs(name):
-    """[[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] is positive real on a dense grid."""
+    """[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] is positive real on a dense grid."""
     loop = loop_of(name)
     found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
     assert found.proved

@@ -1,4 +1,4 @@
-"""User-written conditions with wrong code or an empty multiplier, and files with wrong multipliers."""
+"""Tests of user-written conditions with wrong code or an empty multiplier, and of files with wrong multipliers."""
 
 from dataclasses import replace
 

@@ -30,7 +30,7 @@ change = msgspec.structs.replace
 
 @pytest.mark.slow
 def test_switching_reports_use_the_longest_period(tmp_path):
-    """The damping reported for a buffer, which makes every delay the largest one, counts T_max."""
+    """The damping reported for a playout buffer, which makes every delay the largest one, is that of T_max."""
     (tmp_path / "one.toml").write_text(ONE_MASS)
     file, more = tmp_path / "r.json", ["--condition", "this-environment", "--T-max", "1.8e-3"]
     more += ["--scenario", str(tmp_path / "one.toml")]

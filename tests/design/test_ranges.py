@@ -92,7 +92,7 @@ def test_vertices_are_range_ends_and_absences():
 
 
 def test_an_added_spring_may_be_absent():
-    """The environment has no spring to the ground, the vertices have one. Without it, one would be the environment."""
+    """The environment has no spring to the ground; a vertex without this spring would repeat it, so both have one."""
     ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
     nominal, *vertices = members(FIGURE_4, ranges)
     assert len(nominal.network.springs) == 2
@@ -148,7 +148,7 @@ def absences(links: int) -> tuple[Network, Ranges]:
 
 @pytest.mark.parametrize("links", [5, 6, 8])
 def test_absent_springs_leave_128_different_vertices(links):
-    """The orthogonal array alone gave only 41, 41 and 81 different vertices of 243, 729 and 6561."""
+    """The orthogonal array alone would give only 41, 41 and 81 different vertices of 243, 729 and 6561."""
     chosen = members(*absences(links))[1:]
     ends = {tuple(spring.stiffness for spring in member.network.springs) for member in chosen}
     assert len(chosen) == len(ends) == 128
@@ -364,7 +364,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
-    # The design also weighs each motion's relative error: on a slow machine, with one basis, this cost 0.014 dB.
+    # A design also weighs each motion's relative error, which with one basis cost the nominal design 0.014 dB.
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == "these ranges"
 

@@ -125,7 +125,7 @@ def test_the_stiffness_scales_with_damping_and_rate():
 
 
 def gains_of_least(cost, theta, sigma):
-    """Return (k, b) of least cost by cvxpy, with the inequality as second-order cones at 2001 frequencies."""
+    """Return the least cost of (k, b) in the set (e) of docs/theory.md, by cvxpy with cones at 2001 frequencies."""
     k, b = cp.Variable(), cp.Variable()
     w = np.linspace(0, np.pi, 2001)
     of_k = sum(np.exp(-1j * w * j) for j in range(theta + 1))
@@ -156,7 +156,7 @@ def test_the_gain_set_is_exact(theta, sigma, most_stored):
 def test_the_gain_set_equals_its_block(theta, phi):
     """k/2 + b - |c|^2, which the search keeps positive, is |W|^2 times the block of any-environment for V = 1/W.
 
-    With phi > 0 it is that times the Schur complement of the row of the multiplier phi.
+    With phi > 0 it is |W|^2 times the Schur complement of the row of the multiplier phi.
     """
     loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
@@ -171,7 +171,7 @@ def test_the_gain_set_equals_its_block(theta, phi):
         np.testing.assert_allclose(found, whole / np.abs(V.G[0, :, 0, 0]) ** 2, rtol=1e-8, atol=1e-9)
 
 
-def test_three_channels_with_different_devices():
+def test_unlike_channels_are_as_stiff_as_alone():
     springs = tuple(Spring((name, "m"), k, 1.0) for name, k in (("a", 800.0), ("b", 700.0), ("c", 300.0)))
     network = Network(("a", "b", "c"), (*springs, Spring(("m", "ground"), 100.0, 0.1)), {"m": 1.0})
     loop = asked((0, 3, 1), network, (0, 3, 1), (0, 0, 0), (2.0, 0.8, 1.37), 1e-3)
@@ -183,7 +183,7 @@ def test_three_channels_with_different_devices():
 
 
 def test_weights_shift_the_optimum():
-    """Measured by a flat weight, its own design is at least as good as that for the default low-pass."""
+    """By the norm with a flat weight, the design for this weight is no worse than that for the default low-pass."""
     flat = Lti.constant(np.eye(2), T)
     loop = asked((0, 0))
     found, default = design(loop, W2=flat), design(loop).coupling.compliance(T)
@@ -192,7 +192,7 @@ def test_weights_shift_the_optimum():
 
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0), (0, 2)])
-def test_delay_in_the_environment(psi):
+def test_designs_for_delayed_environments_are_certified(psi):
     loop = asked((0, 0), SOFT_NETWORK, psi=psi)
     found = design(loop)
     V = found.coupling.compliance(T)
@@ -294,7 +294,7 @@ def test_an_unknown_condition_is_refused():
 
 
 def test_long_delay_designs_pass_a_dense_sweep():
-    """With 50 samples of delay |y|^2 <= 4 delta (K T/2 + B) holds at 200001 frequencies, about 7800 per ripple of y."""
+    """With 50 samples of delay (e) of docs/theory.md holds at 200001 frequencies, 7800 per ripple of its left side."""
     made = stiffest(asked(theta=(50, 50)))
     z, n = np.exp(1j * np.linspace(0, np.pi, 200_001)), 51
     for K, B in zip(made.K, made.B, strict=True):
@@ -359,7 +359,7 @@ def test_no_limiter_search_follows_a_failed_linear_one() -> None:
 @pytest.mark.parametrize("steps", [7, 100])
 @pytest.mark.parametrize("release", [scipy.__version__, "1.15.0"])
 def test_slsqp_is_that_of_scipy(monkeypatch, release, steps):
-    """`_slsqp` and SciPy end Rosenbrock's function in a disc at the same bits, also when 7 steps are too few."""
+    """`_slsqp` and SciPy minimise Rosenbrock's function in a disc to the same bits, also when 7 steps are too few."""
     disc = {"type": "ineq", "fun": lambda x: [2 - x @ x], "jac": lambda x: [-2 * x]}
     bounds, options = [(-1.5, 0.9)] * 2, {"maxiter": steps, "ftol": 1e-7}
     start = [-1.6, 1.0]  # outside the bounds

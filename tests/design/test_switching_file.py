@@ -207,7 +207,7 @@ def ranged() -> Certificate:
 
 
 def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
-    """With the stored damping the condition by hand, at 4000 frequencies, is zero at the worst member only."""
+    """At the stored requirement the least eigenvalue by hand over 4000 frequencies is zero at the worst member only."""
     assert (ranged.facts, ranged.guarantee, len(ranged.matrices)) == (("switching", "ranges"), "these ranges", 4)
     save(Stored.of(RANGED, SOFT, ranged), tmp_path / "ranges.json")
     assert verify(load(tmp_path / "ranges.json")).proved
@@ -423,7 +423,7 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve is made
+    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve is found
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST

@@ -243,7 +243,7 @@ def test_the_multiplier_is_best_in_random_loops():
 
 
 def test_many_devices_use_the_springs_multiplier(monkeypatch):
-    """This multiplier is the best for springs. For these gains it needs less than 10 % more damping than the best."""
+    """Many devices get the multiplier that is best for springs. For SOFT it needs up to 10 % more than the best."""
     best, spring = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING), Lti.constant([[800.0]], T)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 1)
     simple = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING)

@@ -1,4 +1,4 @@
-"""The mismatch figures equal recorded figures, dense sweeps and closed forms."""
+"""Tests of the mismatch figures: they equal recorded figures, dense sweeps and closed forms."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_agreed_figures(coupling, lam, sup, rms):
 
 
 @pytest.mark.slow
-def test_against_a_dense_sweep():
+def test_figures_match_a_dense_sweep():
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = np.geomspace(0.5, 80, 100_001)
     z = np.exp(2j * np.pi * hz * T)
@@ -48,7 +48,7 @@ def test_against_a_dense_sweep():
 
 @pytest.mark.parametrize("lam", [(1, 2), (0, 0)])
 @pytest.mark.parametrize("coupling", [SOFT, STIFF, NoCoupling()])
-def test_rms_against_a_dense_grid(coupling, lam):
+def test_rms_matches_a_dense_grid(coupling, lam):
     """The trapezoidal rule on 100 001 points errs by 1e-8 here, estimated from its change with 200 001 points."""
     F = force_map(E, coupling, THETA, (0, 0))
     hz = np.geomspace(0.5, 80, 100_001)
@@ -73,12 +73,12 @@ def test_integral_of_a_sharp_peak():
     assert found == pytest.approx(quad(peak, 0, 1, points=[0.3], epsrel=1e-10)[0], rel=1e-6)
 
 
-def test_integral_of_nothing():
+def test_the_integral_of_zero_is_zero():
     assert integral(np.zeros_like, np.linspace(0, 1, 5)) == 0
 
 
 def test_integrals_of_rounding_noise_end():
-    """Halving intervals gains nothing in noise: the work stays bounded, and the integral is near the mean."""
+    """Halving intervals gains nothing in noise: the work stays bounded, and the integral is near the noise's mean."""
     noise, asked = np.random.default_rng(1), []
 
     def rounding(x):

@@ -96,7 +96,7 @@ def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
 
 
 def test_without_m_closed_forms_hold():
-    """Multipliers with m = 0 need at least (k/2 + b) T without delay, and (k/2 + b + k^2/(4 b)) T one sample late."""
+    """With m = 0 the need is at least (k/2 + b) T at theta = 0, (k/2 + b + k^2/(4 b)) T at 1, and 7.5 N s/m at 2."""
     k, damping = 3000.0, 2.0
     b = damping / T
     for theta, need in ((0, (k / 2 + b) * T), (1, (k / 2 + b + k**2 / (4 * b)) * T), (2, 7.5)):
@@ -107,7 +107,7 @@ def test_without_m_closed_forms_hold():
 
 
 def test_the_block_is_the_definition():
-    """The block equals the inequality written out at four frequencies, for two channels and three walls."""
+    """The block equals (f) of docs/theory.md at four frequencies, for two channels and three walls."""
     G, s = DAMPED.walled(BOTH), 0.9
     k, b, _, _ = walls_by_hand(DAMPED)
     a, both, d, m = np.array([900.0, 500.0, 200.0]), np.array([700.0, 0, 900.0]), np.array([50.0, 0, 80]), [0.3, 0, 0.7]

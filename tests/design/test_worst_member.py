@@ -1,4 +1,4 @@
-"""The search for the worst environment of ranges, and what a violation between the vertices does to a guarantee."""
+"""Tests of the search for the worst environment of ranges, and of guarantees after violations between the vertices."""
 
 import json
 from itertools import product
