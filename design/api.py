@@ -42,7 +42,7 @@ class DesignOptions(TypedDict, total=False):
     order: int  # ccl: states per channel
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
-    limiter: bool  # cover limited forces in this-environment; by default a spring-damper tries, optimal does not
+    limiter: bool  # cover limited forces by this-environment; the default is to try for spring-damper only
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal, spring-damper for this-environment: band of the mismatch
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: a soft penalty instead
@@ -61,9 +61,9 @@ def design_coupling(
     Args:
         loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions). The coupling satisfies your own
-            condition and the kind's usual one. None selects the usual condition (design.designs.usual_condition), as
-            the commands do.
+        condition: The name of a condition, or your own Condition (design.conditions). With your own one the coupling is
+            designed by the kind's usual condition and judged by yours. None selects the usual condition
+            (design.designs.usual_condition), as the commands do.
         options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
     Returns:
@@ -84,12 +84,12 @@ def design_coupling(
 
 
 def certified_for(loop: Loop, certified: bool) -> str:
-    """Return the linear network of a MuJoCo scene for which a coupling is certified, in words, or "" for none."""
+    """Return "the linear network of SCENE" if this is the loop's environment and `certified` is True, else ""."""
     scene = getattr(loop.environment, "linear_model_of", "")
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: Designs that take little time. `seconds` = 0 limits the optimal coupling to its smallest basis.
+#: Quick designs that `instead` tries. `seconds` = 0 limits the optimal coupling to its smallest basis.
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
@@ -104,9 +104,9 @@ def instead(
     condition: str | Condition | None = None,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> str:
-    """Return certified alternatives to a failed design in words, least rms mismatch first, or "".
+    """Return certified alternatives to a failed design in words, least rms mismatch first, or "" if there are none.
 
-    Each candidate is designed and judged here. None is tried for varying delays.
+    The candidates of _QUICK are designed and judged here; with varying delays no candidate is tried.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for i, (other, target, options) in enumerate(_QUICK):
@@ -135,8 +135,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
-    every vertex is proved and the search finds no violation, the requirement is the largest of these environments.
-    Otherwise it is the largest of these and of the search's worst environment, and it is not proved.
+    all of these environments are proved and the search finds no violation, the largest of their requirements is
+    returned. Otherwise the requirement at the search's worst environment counts, too, and the result is not proved.
 
     Returns:
         A Requirement for each condition: `required` and `available` (m,) [N s/m], `certified` (required < available),
@@ -164,7 +164,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
 
 def _over_ranges(loop: Loop, coupling: Coupling, condition: Condition, here: Requirement) -> Requirement[str]:
-    """Return the largest requirement over the ranges; `here` is that of the nominal environment."""
+    """Return the largest requirement over the ranges; `here` is the requirement in the nominal environment."""
     ranges = check_ranges(loop, coupling, samples=0, condition=condition)
     assert ranges  # The caller passes only loops with ranges.
     _, worst = ranges.worst if ranges.proved else ranges.worst_found
@@ -188,7 +188,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
 @dataclass(frozen=True)
 class _SwitchingFiled:
-    """The guarantee for varying delays, with its proof or the reason why there is none."""
+    """The guarantee for varying delays, and the kind of its proof or the reason why there is no proof."""
 
     guarantee: str = off_table()
     proof: str | None = off_table()
@@ -197,7 +197,7 @@ class _SwitchingFiled:
 
 @dataclass(frozen=True)
 class Filed:
-    """The file of a design and its proof; `reason` says why a proof is missing."""
+    """A summary of a stored design: its file, and the kind of its proof or the `reason` why there is no proof."""
 
     file: Path
     proof: str | None
@@ -265,7 +265,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
 
 def _certificate(loop: Loop, design: Design) -> Certificate:
-    """Return the certificate of a design; it covers limited forces if the design has `c`. Raises NotProved."""
+    """Return the certificate of a design; it covers limited forces if Design.c has multipliers. Raises NotProved."""
     if design.c:
         limiter = LimitedForces(lags=len(design.c[0]))
         return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])

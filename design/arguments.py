@@ -44,7 +44,7 @@ def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
 
 
 def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
-    """Raise TypeError for an option that `what` does not have."""
+    """Raise TypeError for an option that is not allowed; `what` names the owner of the options in the message."""
     for option in options:
         if option not in allowed:
             close = difflib.get_close_matches(option, allowed, n=1)

@@ -64,7 +64,8 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-PluggedEnvironment = Callable[[Array], Array]  # positions of its port at zero force (m,) [m] -> force (m,) [N]
+#: A user's function u -> force (m,) [N], where u (m,) [m] are the displacements at the environment for zero force now.
+PluggedEnvironment = Callable[[Array], Array]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -192,7 +193,7 @@ def check_ranges(
     if loop.ranges is None:
         return None
     certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
-    simple = condition.extensible and not multiplier  # Fast sweeps of members exist for this case only.
+    simple = condition.extensible and not multiplier  # `in_each` sweeps this-environment without multipliers.
 
     def need(there: Loop) -> Requirement:
         return required_damping(there, coupling, condition, multiplier)
@@ -288,7 +289,7 @@ class ForceLimits:
 
     @property
     def words(self) -> str:
-        """One line for a report."""
+        """The limits and what covers them, in one line for a report."""
         amounts = [f"{f:.4g}" for f in self.force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         how = "clipped" if self.rho is None else "limited"
@@ -326,7 +327,7 @@ def _covered_limits(
 
     A condition that covers a limiter without a further proof is preferred. Otherwise this-environment or known-device
     is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise multipliers
-    are searched for a limiter of the same beta. `known` is a certificate that has been verified.
+    are searched for a limiter of the same beta (LimitedForces). `known` is a certificate that has been verified.
     """
     covering = [each for each in requirements.values() if each.certified and each.lag is not None]
     for each in sorted(covering, key=lambda each: each.proof != "rational"):
@@ -349,7 +350,7 @@ _EXTENDED = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name  # conditions that have a b
 def _by_its_own_block(
     loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None, base: str
 ) -> ForceLimits:
-    """Return the limiter that extends the condition `base` to limited forces, or clipping with the reason."""
+    """Return the limiter that the condition `base` covers after its extension, or clipping with the reason."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
@@ -398,7 +399,7 @@ class Guarantee:
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers. For an energy account it is "no passive hand", which begins `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
-        forces: "also while they are limited", the restriction, or the account that scales them.
+        forces: Whether limited forces are covered, in words that follow "forces", or what scales the forces.
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
         energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
@@ -554,8 +555,8 @@ def assess(
         coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
-        energy_budget: W0 [J] of the shell; the default is 0 for a function and 2 mJ for a MuJoCo world. Without a
-            shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
+        energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
+            world. Without a shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
         certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
         condition: The condition that must hold, by name or a user's own. The default is this-environment, or
@@ -565,7 +566,7 @@ def assess(
         searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
-        force_limit: (m,) [N], for reports; no proof depends on it.
+        force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
         progress: Called with (points done, number of points) of the search over ranges.
 
@@ -624,7 +625,7 @@ def assess(
         wanted_condition.name,
     )
     guarantee, reason = _guarantee(assessment)
-    # No search between vertices covers the limiter's own block.
+    # The search between the vertices does not evaluate the limiter's block, so the limiter is not proved for ranges.
     by_itself = limits.requirement is not None and limits.rho is not None
     if guarantee and guarantee.environments == RANGES and by_itself:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
@@ -652,7 +653,7 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
     """Return the mismatch, with all walls touching, or None if it cannot be computed."""
     try:
         F, E = loop.F(coupling), loop.E()
-    except ValueError:  # A rigid wall has no E(z), and a singular loop has no F.
+    except ValueError:  # A rigid wall or a world has no E(z), and a singular loop has no F.
         return None
     if too_long(F) or silent(E):
         return None
@@ -726,7 +727,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 
 def _over_ranges(assessment: Assessment) -> Guarantee | None:
-    """Return the guarantee for the ranges, or None if they are not proved or no member of them runs."""
+    """Return the guarantee for the ranges, or None if they are not proved or the environment that runs is no member."""
     ranges = assessment.ranges
     if not (ranges and ranges.proved) or all(assessment.environment != each.network for each in ranges.members):
         return None

@@ -88,8 +88,9 @@ def check_loop(loop: Loop) -> None:
 # ----------------------------------------------------------------------------------------------------
 # Margins: the stiffest K, and the errors of the loop's data that the certificate tolerates.
 #
-# The loop is varied and the conditions are evaluated again. A search varies one value in steps and narrows the first
-# step that meets the edge, so it can miss a gap narrower than a step. The result is certified.
+# The loop is varied and the conditions are evaluated again. A search varies one value in steps until the certificate
+# begins or ends, and narrows the last step down to this edge. It can miss an uncertified interval narrower than a step.
+# The value that it returns is certified.
 
 
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
@@ -104,7 +105,7 @@ _NOT_CERTIFIED = "not certified, so there are no margins"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest stiffnesses [N/m] that are certified together, one for each channel; None and the reason if none."""
+    """The largest stiffnesses [N/m] that are certified together, by channel; None, with a reason, if none is known."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)
@@ -112,7 +113,7 @@ class _Stiffest:
 
 @dataclass(frozen=True)
 class _Sensitivity:
-    """The tolerated error of each value alone, or None and the reason.
+    """The tolerated error of each value if only this value changes; None, with the reason, if it is not known.
 
     Errors are relative: the certificate holds for (1 - delta_error) delta, and for (1 + T_error) T.
     """
@@ -245,10 +246,11 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
     """Return an argument at which the damping suffices, within a relative _EDGE of the edge between the two arguments.
 
-    The damping must suffice at `inside`. If it suffices at `outside`, that is the result. The distance to the edge is
-    at most the width of the bracket; a secant estimates it. The steps are bisection, or inverse quadratic interpolation
-    where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997). They aim half of _EDGE inside the edge, so that
-    the last one is usually the result. Five values of `ratio` take less time than importing scipy.optimize.brentq.
+    The damping must suffice at `inside`. If it also suffices at `outside`, the result is `outside`. The distance to the
+    edge is at most the width of the bracket; a secant estimates it. The steps are bisection, or inverse quadratic
+    interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997). They aim half of _EDGE inside the
+    edge, so that the last argument is usually the result. Five values of `ratio` take less time than importing
+    scipy.optimize.brentq.
     """
     if suffices(ratio(outside)):
         return outside
@@ -287,7 +289,7 @@ _FACTORS = (0.75, 0.5, 0.25, 0.1)  # factors on B and T that are tried
 
 @dataclass(frozen=True, eq=False)
 class _Remedy:
-    """The mildest change that certifies, or the change that lowers the required damping most."""
+    """The mildest change of one kind that certifies the coupling, or else the one that lowers the requirement most."""
 
     change: str
     requirement: Requirement
@@ -296,7 +298,7 @@ class _Remedy:
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
     """Return single changes that certify the coupling or lower the requirement by more than 10 %.
 
-    Return [] if the coupling is certified, or if the condition is not varied.
+    Return [] if the coupling is certified, or if the condition cannot be evaluated in varied loops (`not_varied`).
     """
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
@@ -320,7 +322,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Return the least reduction of the delays `name` that certifies, or the one with the least requirement.
+    """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
 
     All channels are shortened by the same number of samples, and lam is 0 in the shortened loop.
     """
@@ -335,7 +337,7 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the remedy of the largest factor that certifies, rounded down to 0.001, or that requires least."""
+    """Return the remedy of the largest factor that certifies, rounded down to 0.001, or else that requires least."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:

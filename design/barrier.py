@@ -24,7 +24,7 @@ from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
-_CENTRED = 0.5  # largest squared Newton decrement of a point that counts as central
+_CENTRED = 0.5  # largest squared Newton decrement of a point that counts as the minimiser x(t)
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # least share of every eigenvalue of S that remains after a step
 _LONGEST = 1e3  # largest step, in Newton steps, if no eigenvalue of S falls
@@ -83,9 +83,10 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The unknowns are the entries of X (for each entry all n), followed by the x_a. At each frequency a second derivative
-    in two entries of X is a sum of products t_n t_l and t_n t_l*, with weights from S^-1 that do not depend on n and l.
-    The Hessian is therefore a matrix product over the frequencies: (pairs of functions) times (pairs of entries).
+    The unknowns are the entries of the X_n (for each entry those of all n), followed by the x_a. At each frequency the
+    second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
+    S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)
+    times (pairs of entries).
     """
 
     constant: Array  # (k, r^2): `packed`
@@ -117,7 +118,7 @@ class EntryInequality:
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Pairs of functions t, u: both indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
+        """For pairs of functions t, u: both indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
         first, second = _upper(self.functions.shape[1])
         t, u = self.functions.T[first], self.functions.T[second]
         along, against = t * u, t * np.conj(u)
@@ -172,7 +173,7 @@ class Program:
 
     @cached_property
     def square(self) -> Array:
-        """A'A."""
+        """The matrix A'A."""
         return self.A.T @ self.A
 
     @property
@@ -197,8 +198,8 @@ class Program:
     def conditioned(self, x: Array) -> tuple[Program, Array]:
         """Return the program in y = U x, and the upper triangular U that balances objective and barrier at x.
 
-        U is the factor R of a QR decomposition of the stacked rows of objective and barrier. Inner products of these
-        rows would lose digits, because the coordinates x of a basis of filters are ill-conditioned.
+        U is the factor R of a QR decomposition of the stacked rows of objective and barrier. A Cholesky factor of the
+        inner products would lose digits, because the coordinates x of a basis of filters are ill-conditioned.
         """
         dense = [block for block in self.blocks if isinstance(block, MatrixInequality)]
         assert len(dense) == len(self.blocks)
@@ -247,7 +248,7 @@ def _solve_positive(H: Array, b: Array) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The path.
+# The path x(t) of the barrier method.
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
@@ -296,9 +297,9 @@ def _solved(hessian: Array, right: Array) -> Array:
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """Return the step length that minimises the barrier function and leaves a share _KEPT of every eigenvalue of S.
+    """Return the step length that minimises the barrier function and leaves at least _KEPT of every eigenvalue of S.
 
-    With this share the points stay away from the boundary, where Newton's method would be slow.
+    So the points stay away from the boundary, where Newton's method would be slow.
     """
     along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
     residual, slope = program.A @ x - program.b, program.A @ step

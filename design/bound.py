@@ -6,8 +6,8 @@ The coupling may have any order. The bound uses only one property of a certified
 analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the
 circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
 no force has arrived yet).
-Let <X, Y> be the mean of Re tr X*Y over the circle, and rho the weight of the mean square relative
-mismatch J = <M, rho M>, M = F - Lambda E. Any H(z) that vanishes outside the band has
+Let <X, Y> be the mean of Re tr X*Y over the circle, and rho(w) the weight with which J = <M, rho M> is the mean square
+of the relative mismatch over the band, M = F - Lambda E. Any H(z) that vanishes outside the band has
 |M|^2 rho >= 2 Re tr H*M - |H|^2/rho, so that
     J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/rho>.
 F's coefficients are differences of the s_k. Choose C_k that weigh only the zero combinations, such that
@@ -19,9 +19,9 @@ where the mean is over log frequency in the band. H is piecewise linear, so that
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
 D >= 0, which lowers the bound on J. The bound on J is then proved.
 The result is only an estimate, with D positive at the frequencies of a sweep, in two cases: the proved bound is zero
-and the estimate is not, or the psi differ, so that the zero combinations are known up to rounding only. The integrals
-over the band are computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) and _QUADRATURE are
-subtracted.
+and the estimate is not, or the psi of the channels differ, so that the zero combinations are known up to rounding only.
+The integrals over the band are computed by Gauss's rule. A bound of the rule's error (`_Dual.objective_again`) is
+subtracted from the proved bound, and _QUADRATURE from both.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.transparency import BAND_HZ, decibels
 
-_GRID = 250  # points of the grid with equal steps, and as many with equal ratios. H is linear between them.
+_GRID = 250  # points of the grid with equal steps, and as many with equal ratios; H is linear between grid points
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # channels -> number of knots of h, even in log frequency
 MOST = max(_KNOTS)  # largest number of channels for which there is a bound
 _NO_BOUND = f"no bound for more than {MOST} channels: it would take half a minute and be 1 dB off"
@@ -61,7 +61,7 @@ _AROUND = np.array(
 )  # distances of frequencies from a mode, in widths of the mode
 _DEGREE = 3  # degree of the splines of h
 _FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in units of degree/objective, and the factor by which t grows
-_GAP = 0.004  # gap that the barrier leaves, relative to the bound
+_GAP = 0.004  # largest gap to the optimum at which the barrier method ends, relative to the bound
 _LEAST = 1e-9  # mean square below which a bound is useless
 _WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative to the bound
 _QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimate's rule has no error bound
@@ -89,9 +89,9 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
-    T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1 the
-    condition has the damping Delta/(T_max - t1) on the displacements after the latch alone (design.facts.Latency). So
-    it implies this-environment without latency for more damping, which counts here.
+    T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1, the
+    condition's rows for the displacements after the latch have at most the damping Delta/(T_max - t1)
+    (design.facts.Latency). They alone are this-environment without latency for more damping, which the bound uses.
     """
     started, level = time.perf_counter(), even_level(loop)
     if loop.latency:
@@ -116,9 +116,9 @@ class _Dual:
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner) basis functions of H on the grid; over the band, those of h are orthonormal
+    heights: Array  # (k, inner): `inner` basis functions of H on the grid; over the band, those of h are orthonormal
     target: Array  # (2 inner, m^2) coefficients of -Lambda E/|E| in the functions of h, real and then imaginary parts
-    knots: Array
+    knots: Array  # [rad/sample] of the splines h
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
     exact: bool  # whether these sums are exactly zero, not only up to rounding
     band: tuple[float, float]  # [rad/sample]
@@ -186,7 +186,7 @@ class _Dual:
         return w[w <= np.pi]
 
     def swept(self) -> Array:
-        """Return the frequencies at which D > 0 is checked."""
+        """Return the frequencies at which D > 0 is checked after each round."""
         low, high = self.grid[0], self.grid[-1]
         beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
         swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
@@ -223,7 +223,7 @@ class _Dual:
         return DualMatrix.of(self.grid, self.h(x), 4 / self.loop.T * np.outer(root, root), sums)
 
     def h(self, x: Array) -> Complex:
-        """Return H at the point x, on the grid (k, m, m)."""
+        """Return H, not h, at the dual point x, on the grid (k, m, m)."""
         m, inner = self.loop.channels, self.heights.shape[1]
         parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
         return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
@@ -492,7 +492,7 @@ class BoundBeside:
 
     @property
     def words(self) -> str:
-        """One line for a report."""
+        """The bound and the gap, or the reason, in one line for a report."""
         if self.reason or self.rms_mismatch_db is None:
             return self.reason or ""
         sup = (
@@ -501,7 +501,7 @@ class BoundBeside:
             else ""
         )
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
-        left = f": {self.gap_db:z.2f} dB left" if self.gap_db is not None else ""
+        left = f": {self.gap_db:z.2f} dB below this design" if self.gap_db is not None else ""
         rest = f"{self.rms_mismatch_db:z.2f} dB rms{sup}{without}{left}"
         certified = "that this-environment certifies"  # known-device may certify better couplings
         if self.proved:

@@ -21,8 +21,7 @@ SWEEPS = 60.0
 #: The search over larger bases of an optimal coupling. The slowest of the 23 loops take 19 (o11), 17 (o08) and 15 (n6,
 #: n7).
 GROWTH = 60.0
-#: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of
-#: springs that are present.
+#: The search between the vertices of ranges, for one coupling: about 500 sweeps for each set of present springs.
 RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
@@ -44,20 +43,21 @@ RANGED_BASES = 3
 
 # Sizes of proofs, and rounds of searches that normally converge earlier, with the measured numbers -------------------
 
-#: Largest number of states of a proved block: 0.3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800.
+#: Largest number of states of a proved block. A proof takes 0.3 s at 100, 1 s at 200, 5 s at 400 and 30 s at 800.
 PROOF_STATES = 800
 #: Rounds of cutting planes for a multiplier (one-wall takes 8), and rounds without progress after which they end.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have that many.
 MULTIPLIER_ROWS = 24
 #: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many channels
-#: every start has the first number, and the best starts have the second. With few channels every start has the third.
+#: the search takes the first number from every start, and the second from the best starts. With few channels it takes
+#: the third from every start.
 GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 #: Rounds that add frequencies to a design by Theorem 4. Only delays of a hundred samples and more need them.
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains. Case I takes 2.
 SEQUENCE_STEPS = 60
-#: Designs for less damping until a second condition holds. one-wall takes 2.
+#: Designs, each for less damping, until the coupling satisfies a second condition. one-wall takes 2.
 LESS_DAMPING_ROUNDS = 6
 #: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6

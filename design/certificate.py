@@ -60,7 +60,8 @@ def _in_time() -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The certificate of a coupling is proved once, stored, and proved again from the file alone without a solver.
+# The certificate of a coupling is proved once and stored. `verify` repeats the proof from the file alone, without a
+# solver.
 #
 # The blocks over the rationals come from the condition (design.environments, design.known_device, or the user's own).
 # The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that each block
@@ -68,8 +69,8 @@ def _in_time() -> Iterator[None]:
 # any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the environment is passive
 # (Environment.active is None). Other multipliers are stored.
 #
-# With ranges, a condition on the environment is proved for the nominal one (P) and for at most 128 vertices (P1, P2,
-# ..). There is no proof for an environment between the vertices, or for one that changes with time.
+# With ranges, a condition that uses the environment is proved for the nominal one (matrix P) and for at most 128
+# vertices (P1, P2, ..). There is no proof for an environment between the vertices, or for one that changes with time.
 #
 # A certificate names its base condition and the facts that it covers: latency, walls, limiter, switching, ranges.
 
@@ -97,7 +98,7 @@ def prove(
         coupling: The coupling.
         condition: A name or a condition. design.environments.LimitedForces covers limited forces, too; under
             any-environment without delay in the environment the limiter has rho = 0 and needs no further proof.
-        multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None for the best ones.
+        multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None to search for them.
         swept: The result of `required_damping` for these arguments, if the caller has it.
 
     Raises:
@@ -196,9 +197,9 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
     return replace(needs, proof="rational")
 
 
-# Larger problems are refused at once: a proof would take minutes.
+# Problems beyond these limits are refused at once, because a proof would take minutes.
 _MOST_BITS = 400  # largest number of bits of a coefficient's denominator; a decimal of 120 places has 399
-_MOST_COST = 2  # total cost of the members of ranges, in units of one proof with PROOF_STATES states
+_MOST_COST = 2  # largest total cost of the proofs for all members, in units of one proof over PROOF_STATES states
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -215,7 +216,8 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     except SingularLoop:
         return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
-    states += sum(loop.theta) if members else 0  # Blocks of any-environment, which have no members, omit Theta.
+    # Conditions for any environment have no members and add the delays to the size of their own maps.
+    states += sum(loop.theta) if members else 0
     budgets.require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
@@ -237,11 +239,11 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
     At the frequencies of a sweep the difference of the responses, plus the rounding errors, may be at most _MOST_LOST
-    of the largest response or, except in a world, of the least delta/T. Terms that cancel and are far larger than the
-    forces increase the rounding errors.
+    times the larger of two numbers: the largest response and, except in a world, the least delta/T. Terms that cancel
+    and are far larger than the forces increase the rounding errors.
     """
     try:
-        if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the direct part of V.
+        if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the feedthrough of V.
             running, exact = coupling.compliance(loop.T), coupling.compliance(loop.period(exact=True))
         else:
             running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
@@ -277,7 +279,8 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:
     """Return whether the certificate belongs to exactly this loop and coupling and holds.
 
-    It is verified unless this process has proved it before. `condition` is needed for a user's own condition.
+    The certificate is verified unless this process has proved or verified it before. `condition` is needed for a user's
+    own condition.
     """
     if certificate.scenario != digest(loop, coupling.form()):
         return False
@@ -346,8 +349,9 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
 def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
     """Return the requirement of a certificate's condition and multipliers in this loop, proved with its matrices.
 
-    `known` is a certificate that this process has proved for this loop and coupling; for it the exact proof is not
-    repeated. Raises NotProved if the certificate does not hold in the loop, or if the proof would take minutes.
+    `known` is a certificate that this process has proved or verified; if it is `certificate` and belongs to this loop
+    and coupling, the exact proof is not repeated. Raises NotProved if the certificate does not hold in the loop, or if
+    the proof would take minutes.
     """
     is_proved = known is certificate and certificate.scenario == digest(loop, coupling.form())
     try:
@@ -486,7 +490,7 @@ def requirements_of(
     known: Certificate | None = None,
     own: Condition | None = None,
 ) -> dict[str, Requirement]:
-    """Return the requirement of each named condition, and of the user's `own` condition if there is one.
+    """Return the requirement of each condition of the package, and of the user's `own` condition if there is one.
 
     Each condition is proved exactly if possible. `known` is a certificate that holds; its proof is not repeated. A loop
     without bounds of its devices gets no known-device conditions. The environment is the nominal one and the delays

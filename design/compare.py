@@ -44,7 +44,7 @@ class Demands:
 
     F: Lti
     requirements: dict[str, Requirement]
-    demands: dict[str, Response | None]  # w -> required over available damping; None without a curve
+    demands: dict[str, Response | None]  # by condition: w -> required over available damping, or None for no curve
 
 
 @dataclass(frozen=True, eq=False)

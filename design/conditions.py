@@ -1,7 +1,7 @@
 """Conditions under which no passive human can make a loop oscillate.
 
-A condition is a block that must be strictly positive real: its Hermitian part is He[block] > 0 on |z| = 1. `Demand`
-(design.facts) holds the block as free + s gain, where s multiplies the damping Delta_D that the devices guarantee.
+A condition is a block that must be strictly positive real: stable, with the Hermitian part He[block] > 0 on |z| = 1.
+`Demand` (design.facts) holds it as free + s gain, where s multiplies the damping Delta_D that the devices guarantee.
 Poles at z = 1 are split off by `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the
 required damping), over Fractions (an exact proof), over stacks and over sampled responses (maps and designs).
 docs/theory.md derives the conditions; numbers such as (12) are equations of the paper.
@@ -154,16 +154,16 @@ def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
     return hermitian_floor(demand.free + demand.gain, -slack / 2, -slack)[0] >= -slack
 
 
-#: A 2 x 2 gain is singular if its determinant is below _SINGULAR times the product of its diagonal. Diagonal entries
-#: below _NOTHING times the largest one count as rounding errors.
+#: A 2 x 2 gain counts as singular if its determinant is below _SINGULAR times the product of its diagonal. Diagonal
+#: entries below _NOTHING times the largest one count as rounding errors.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
-_CELLS = 2**19  # entries of a response that are processed together
+_CELLS = 2**19  # entries of a response that are processed together, because they fit into the processor's cache
 
 
 def least_scale(demand: Demand[Any], w: Array) -> Array:
     """Return the least s (k,) with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample], or inf."""
     step = max(_CELLS // demand.gain.outputs**2, 64)
-    if w.size > step:  # Pieces fit into the processor's cache.
+    if w.size > step:
         return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -291,7 +291,7 @@ class Condition(ABC):
         return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
-        """Return the function w (k,) [rad/sample] -> required over available damping (k,), or None if there is none."""
+        """Return the function w (k,) [rad/sample] -> required over available damping (k,), or None if it is unknown."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         return partial(least_scale, self.demand(loop, coupling, **more))
 
@@ -648,7 +648,10 @@ def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array
 def any_environment_ratios(
     V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
 ) -> Array:
-    """Return required over available damping (count,) of any-environment for `count` compliances V."""
+    """Return required over available damping (count,) of any-environment for `count` compliances V.
+
+    V returns their responses, and `demand` the block of any-environment for these.
+    """
 
     def needed(w: Array) -> Array:
         return _least_scales(demand(V(on_circle(w))))

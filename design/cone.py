@@ -1,8 +1,8 @@
 """Minimise c'x under linear matrix inequalities: each block constant + sum_a x_a slope_a is positive semidefinite.
 
-The status "solved" of a solver is not enough: a result is used only if it is also finite, if its blocks are
-semidefinite to rounding when they are evaluated again, and if the caller's `accept` agrees. Otherwise the next of the
-solver settings is tried.
+The status "solved" of a solver is not enough. A result is used only if it is also finite, if its blocks are
+semidefinite to rounding when they are evaluated again, and if the caller's `accept` returns True for it. Otherwise the
+next of the solver settings is tried.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class _Attempt:
 
 @dataclass(frozen=True, eq=False)
 class Inequality:
-    """constant + sum_a x[unknowns[a]] slopes[a] >= 0, k Hermitian matrices."""
+    """The inequalities constant + sum_a x[unknowns[a]] slopes[a] >= 0 for k Hermitian matrices."""
 
     constant: Array | Complex  # (k, n, n)
     slopes: Array | Complex  # (q, k, n, n)
@@ -71,7 +71,7 @@ class Inequality:
 
     @classmethod
     def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
-        """Build function(x[unknowns]) >= 0 by evaluating an affine function with values (n, n) or (k, n, n)."""
+        """Build function(x[unknowns]) >= 0 from values (n, n) or (k, n, n) of this affine function."""
         constant, *values = (function(x) for x in np.eye(len(unknowns) + 1, len(unknowns), k=-1))
         slopes = np.stack(values) - constant
         one = constant.ndim == 2
@@ -145,7 +145,7 @@ class ConeProgram:
         raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 
     def violation(self, x: Array) -> float:
-        """Return minus the least eigenvalue of all blocks; a positive number is a violation."""
+        """Return minus the least eigenvalue of all blocks; x violates an inequality if it is positive."""
         least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
         return float(-min(least, default=np.inf))
 
@@ -223,8 +223,8 @@ def _columns(shape: tuple[int, int], starts: Any, rows: Any, values: Array) -> A
 # second-order term dZ dS (Mehrotra). The start may be infeasible.
 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
-_ENOUGH = 1e-6  # the best point counts as solved below this error; growth of the error by 1/_ENOUGH ends the iteration
-_KEPT = 0.98  # largest step, relative to the distance to the boundary
+_ENOUGH = 1e-6  # The best point counts as solved below this error. A growth by 1/_ENOUGH ends the iteration.
+_KEPT = 0.98  # length of a step, relative to the distance to the boundary
 _SHORT, _CENTRING = 0.2, 0.8  # A step shorter than _SHORT is replaced by one towards S Z = _CENTRING mu I.
 
 
@@ -321,7 +321,7 @@ def _inner(problem: ConeProgram, Z: _Parts) -> Array:
 
 
 def _longest(roots: _Parts, steps: _Parts) -> float:
-    """Return _KEPT of the step to the boundary, at most 1; `roots` are inverse Cholesky factors of the matrices."""
+    """Return _KEPT times the step to the boundary, at most 1; `roots` are inverse Cholesky factors of the matrices."""
     pairs = zip(roots, steps, strict=True)
     least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
     return min(1.0, _KEPT / max(-least, 1e-300))

@@ -32,14 +32,14 @@ class Certificate(Strict, frozen=True):
     """The claim about a coupling in its loop and its proof: base condition, facts, multipliers, matrices."""
 
     condition: str  # base condition: a name of design.result.CONDITIONS, or the name of a user's own condition
-    facts: tuple[str, ...]  # covered properties beyond one linear network with constant delays (conditions.FACTS)
+    facts: tuple[str, ...]  # properties covered beyond one linear network with constant delays (conditions.FACTS)
     required: tuple[float, ...]  # (m,) [N s/m] required damping, from a refined sweep with `multipliers`
     available: tuple[float, ...]  # (m,) [N s/m] damping for which the condition is proved
     margin: float  # available / required
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
     multipliers: dict[str, tuple[float, ...]]  # by name, exact decimals; "rho" is the limiter's stiffness [N/m]
-    matrices: dict[str, Rows]  # of KYP inequalities: P; P1, P2, .. of further environments; P_E of a delayed one
+    matrices: dict[str, Rows]  # of KYP inequalities: P; P1, P2, .. for vertices; P_E for a delayed environment's block
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields
@@ -69,11 +69,11 @@ class Stored(Strict, frozen=True):
         return stored
 
     def built(self) -> Coupling:
-        """Return the coupling."""
+        """Return the coupling, built from its form."""
         return self.coupling.build(self.loop.T)
 
 
-_SAME = 1e-9  # allowed difference between the responses of a coupling and its form, relative to the largest
+_SAME = 1e-9  # allowed difference between the responses of a coupling and its form, relative to the largest response
 
 
 def filed(loop: Loop, coupling: Coupling) -> Coupling:

@@ -76,10 +76,10 @@ class NominalWorst:
 
 @dataclass(frozen=True)
 class OverRanges:
-    """Requirement and mismatch of a coupling over ranges; a mismatch of minus infinity dB is null in JSON."""
+    """Requirement of this-environment and mismatch of a coupling over ranges; minus infinity dB is null in JSON."""
 
     coupling: str
-    violated: int  # number of members that violate the condition
+    violated: int  # number of members in which this-environment is violated
     required_over_available: NominalWorst
     rms_mismatch_db: NominalWorst
     relative_mismatch_db: NominalWorst

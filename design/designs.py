@@ -67,7 +67,7 @@ _OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # for a user's own fu
 
 
 def kind_of(name: str) -> _Kind:
-    """Return the kind of that name, or the kind of a user's own function."""
+    """Return the kind of that name, or _OWN for a user's own function."""
     return KINDS.get(name, _OWN)
 
 
@@ -75,10 +75,11 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """Return the name of the default condition of a design.
 
     The default of a spring-damper or a user's own function is this-environment, which gives the least transparency
-    error. In loops with walls, worlds, ranges or varying delays, but without a latency, it is any-environment. If
-    bounds of the devices are known, two conditions of KINDS that never require more damping take precedence:
-    known-device replaces this-environment in loops without a latency, and known-device-any is chosen with walls if it
-    covers the loop. Apart from these two, each of the other kinds has only one condition.
+    error. In loops with walls, worlds, ranges or varying delays, but without a latency, the default is any-environment.
+    Each of the other kinds has one condition, except for the two that need bounds of the devices. If these bounds are
+    known, the two take precedence where KINDS allows them, because they never require more damping: known-device
+    replaces this-environment in loops without a latency, and known-device-any is chosen if walls exist and it covers
+    the loop.
     """
     conditions = kind_of(kind).conditions
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
@@ -93,7 +94,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
-    """Return (the condition's name or None, the condition if it is the user's own)."""
+    """Return (the condition's name or None, the condition itself if it is the user's own, else None)."""
     if condition is None or isinstance(condition, str):
         return condition, None
     ours = (*_OWN.conditions, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -112,8 +113,8 @@ def design_by_kind(
     Args:
         loop: The loop.
         kind: A name of KINDS, or FILE.py:NAME of a function of the user's own.
-        condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed for
-            the kind's usual condition, with the largest share of the damping for which the coupling satisfies both.
+        condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed by the
+            kind's usual condition, with the largest share of the damping for which it satisfies the user's own.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
             forces if LIMITER has designs for the loop and one is found; `limiter` True requires it. `switching`
@@ -285,7 +286,7 @@ def own_coupling(name: str, loop: Loop) -> Any:
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
-_UNUSED = 0.005  # largest unused share of the damping at which `_with_less_damping` ends
+_UNUSED = 0.005  # `_with_less_damping` ends if the coupling leaves less than this share of the damping unused.
 
 
 def _with_less_damping(

@@ -33,7 +33,7 @@ from haptic_loop.design.frequency import hermitian
 
 _UNIT = 2.0**-53
 _EVALUATION = 6e-8  # units of counted work for one bend at one frequency
-_MOST = 40_000_000  # bends times frequencies of one matrix: about two seconds
+_MOST = 40_000_000  # largest number of bends times frequencies for one matrix, which takes about two seconds
 _CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache
 _FAR = 2.0  # distance beyond which a bend counts as far, in lengths of the interval
 _COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, rounded up
@@ -44,13 +44,13 @@ _SHARE = 8
 
 @dataclass(frozen=True, eq=False)
 class DualMatrix:
-    """The matrix D of one dual point, for m channels, n bends of H, and C_k up to the step K."""
+    """The matrix D at one point of the dual problem, for m channels, n bends of H, and C_k up to the step K."""
 
     points: Array  # (n,) x_i [rad/sample], in (0, pi)
     bends: Complex  # (n, m, m) c_i times 4/T, scaled
     slopes: Array  # (n, m, m) sum of the absolute values of the two slopes beside each bend, in units of `bends`
     mean: Array  # (m, m) H_0 times 4/T, scaled
-    sums: Array  # (K + 1, m, m): C_0 and C_k
+    sums: Array  # (K + 1, m, m): C_0, .., C_K, scaled
 
     @classmethod
     def of(cls, points: Array, heights: Complex, scale: Array, sums: Array) -> DualMatrix:
@@ -71,8 +71,8 @@ class DualMatrix:
         """Return (a lower bound of D's eigenvalues on the circle, evaluated frequencies, least eigenvalues there).
 
         The intervals between the frequencies `swept` and the bends are halved until each has a bound above -`wanted`,
-        or an error that is small beside the eigenvalues at its ends. The search also ends
-        after _MOST evaluations of bends.
+        or an error that is small compared with the eigenvalues at its ends. The search also ends after _MOST
+        evaluations of bends.
         """
         w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
         budget = _MOST // self.points.size - w.size
@@ -105,10 +105,10 @@ class DualMatrix:
     def rounding(self) -> float:
         """Return a bound of the error of D's eigenvalues by rounding, at any frequency.
 
-        The errors are, in units of u = 2^-53: 3 (n + 6) times the sum of absolute values for a complex sum of n
-        products, with |Li2| <= 2; 300 for Li2, of which 160 come from the rounding of its argument near 2 pi; 8 times
-        the adjacent slopes for a bend; 2 for a, with |a| <= 2; 7 (k + 2) for a power z^-k; 20 m times the norm for an
-        eigenvalue.
+        In units of u = 2^-53 the error of a complex sum of n products is 3 (n + 6) times the sum of absolute values,
+        with |Li2| <= 2. The errors of single numbers are: 300 for Li2, of which 160 come from the rounding of its
+        argument near 2 pi; 8 times the adjacent slopes for a bend; 2 for a, with |a| <= 2; 7 (k + 2) for a power z^-k;
+        20 m times the norm for an eigenvalue.
         """
         m, bends, slopes = len(self.mean), np.abs(self.bends).sum(axis=0), self.slopes.sum(axis=0)
         steps = np.arange(len(self.sums))[:, None, None]

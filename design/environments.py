@@ -89,7 +89,7 @@ from haptic_loop.design.result import (
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers. A subclass defines `map` and `block`."""
+    """A condition whose block is affine in its multipliers, with a search for these. A subclass adds `map`, `block`."""
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""
@@ -97,7 +97,7 @@ class Multiplied(Condition):
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """Return the map G of `block`. Raises SingularLoop, and if `exact` TooLong for a map too large to be proved."""
+        """Return the map G of `block`. Raises SingularLoop; if `exact`, TooLong for a map too large to be proved."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return `block`, affine in s and `multiplier`, in which those of the hands' side are multiplied by s."""
+        """Return the block, affine in s and `multiplier`, which has s times the multipliers of the hands' side."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -136,7 +136,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier; for None, at the best one found, with the `bound` of a search."""
+        """Return the requirement at this multiplier; for None, at the best one found, with the search's `bound`."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -342,8 +342,9 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the first values of each multiplier in a search.
 
-        For a map G, alpha is half the width of a device's range of delays times the largest gain from its displacement
-        to its force. With more than MULTIPLIER_ROWS/2 channels alpha is the best of several shares of this value.
+        For a map G, alpha (`Switching`) is half the width of a device's range of delays times the largest gain from its
+        displacement to its force. With more than MULTIPLIER_ROWS/2 channels, alpha is the best of _SHARES times this
+        value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -418,8 +419,8 @@ class ThisEnvironment(Multiplied):
     def unsound_static(self, G: Lti, loop: Loop, demand: Demand[Lti]) -> str | None:
         """Return the reason why a static map is asymmetric or negative, or None.
 
-        Channels and walls differ in units. So the asymmetry of an entry is compared with the sizes of its row and its
-        column, and a negative eigenvalue with the largest size of all channels, or of all walls.
+        Inputs of channels and of walls have different units. So the asymmetry of an entry is compared with the sizes of
+        its row and its column, and a negative eigenvalue with the largest size of all channels, or of all walls.
         """
         if not loop.environment.walls:
             return super().unsound_static(G, loop, demand)
@@ -454,7 +455,7 @@ _ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map wi
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """Return the requirement of this-environment for each of the members."""
+    """Return the requirement of this-environment, with constant delays and touching walls, for each of the members."""
     return [_in_one(loop, coupling, member) for member in members]
 
 
@@ -489,7 +490,7 @@ class SwitchingDelays(ThisEnvironment):
 
 
 SWITCHING = SwitchingDelays()
-_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # tried shares of the alpha of `ThisEnvironment.usual`
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # factors on alpha that `ThisEnvironment.usual` tries
 
 
 def _half_widths(loop: Loop) -> Array:
@@ -584,7 +585,7 @@ def least_phi(loop: Loop) -> Array | None:
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
     if not positive_definite(even_level(loop) - np.diag(phi)):
-        why = f"the multiplier Phi = {phi.tolist()} is not below the damping: with psi = {loop.psi} nothing is left"
+        why = f"the multiplier Phi = {phi.tolist()} is not below the damping: with psi = {loop.psi} no damping is left"
         raise DesignFailed(None, (), f"{why} for a coupling")
     if not covers(loop, phi):
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} may leave some frequency uncovered")
@@ -599,7 +600,7 @@ def least_multiplier(loop: Loop) -> Array:
 
     Delta_D and delta are multiplied by T/T_max. Phi stays below a level that leaves damping for the coupling. Up to
     _MOST_STATES states the sum of Phi_i/delta_i is least among such Phi. Raises Infeasible, with the damping that would
-    be needed, if no Phi, diagonal or not, is below Delta_D, and DesignFailed if no diagonal Phi is found.
+    be needed, if no such Phi exists, diagonal or not, and DesignFailed if no diagonal Phi is found.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
@@ -759,7 +760,7 @@ class _AnyEnvironment(Multiplied):
         return "Theorem 4 needs a coupling, and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with `multiplier`; for None, with the least Phi or the best other multiplier found."""
+        """Return the requirement with `multiplier`; for None, with `least_phi` or the best other multiplier found."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)
@@ -833,7 +834,7 @@ def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
     """Return the alpha [N/m] that admits the stiffest coupling for any environment; `damping` is delta/T [N/m].
 
     This alpha minimises the mean over frequency of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), where vt is the mean
-    of the windows of the delays lo and hi, and h = (hi - lo)/2 (docs/theory.md, "any environment").
+    of the windows of the delays lo and hi, and h = (hi - lo)/2 (docs/theory.md, "Facts that hold together").
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)

@@ -131,7 +131,7 @@ class _Definiteness:
         return f"the {minor} is {'zero' if self.semidefinite else 'negative'}"
 
 
-_MANY_ROWS = 8  # number of rows above which `_strictly_positive` is tried before the elimination
+_MANY_ROWS = 8  # Above this number of rows `_strictly_positive` is tried first, because elimination is slower.
 
 
 def definiteness(S: Matrix) -> _Definiteness:
@@ -139,8 +139,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
     Each pivot is the principal minor of its row and the rows before it that were not skipped. If a pivot is zero, S is
     semidefinite only if the pivot's entire row in the Schur complement is zero; the row is then skipped. Otherwise an
-    entry e of this row gives the negative minor -e^2/(previous pivot). A large matrix is tested with
-    `_strictly_positive` first. Raises ValueError if S is not exactly symmetric.
+    entry e of this row gives the negative minor -e^2/(previous pivot). Raises ValueError if S is not exactly symmetric.
     """
     if S.shape[0] > _MANY_ROWS and _strictly_positive(S):
         return _Definiteness(True, True)
@@ -166,7 +165,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A proof that a symmetric rational matrix S is positive definite, whose cost is that of a few products.
+# A proof that a symmetric rational matrix S is positive definite, at the cost of a few matrix products.
 #
 # For any square matrix R, R'SR > 0 implies S > 0: x = R y reaches every x, because R'SR could not be definite with a
 # singular R. R is the inverse of the Cholesky factor of S in floating point, rounded to binary fractions. R'SR is then
@@ -174,7 +173,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 # be exact, too, but its numbers grow with every pivot.
 
 
-_BITS = 192  # binary places of the rounded matrix whose definiteness is tested
+_BITS = 192  # binary places to which a matrix is rounded before the test of its definiteness
 _FACTOR_BITS = 46  # bits of the largest entry of R before its rows are scaled; all entries are multiples of one unit
 GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes the factorisation fail
 
@@ -413,10 +412,10 @@ def reached(G: Lti) -> Lti:
 
 
 class Violated(str):
-    """The reason why a block has no proof: it is negative beyond rounding at some frequency."""
+    """The reason why a block cannot have a proof: it is negative beyond rounding at some frequency."""
 
 
-_CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because the block's inputs have size one.
+_CLEARLY = 1e-6  # A margin below -1e-6 is no rounding error, because D of the scaled block has ones on its diagonal.
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
@@ -425,9 +424,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation has an
     added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. The equation is first solved in coordinates in
-    which white noise at the inputs moves all states equally and independently, where P is much better conditioned. The
-    original states are tried next, and then the first coordinates with a larger share of mu. The result is transformed
-    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
+    which white noise at the inputs moves all states equally and independently. P is much better conditioned there. The
+    original states are tried next, and then the white-noise coordinates with a larger share of mu. The result is
+    transformed back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -527,11 +526,11 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 
 
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
-    """Return the solution P (n, n) of the Riccati equation, by doubling and Newton's method.
+    """Return the solution P (n, n) of the Riccati equation of `find_storage`, by doubling and Newton's method.
 
     Newton's steps in extended precision reduce the residual that rounding leaves. They end when it is below _LEFT times
     e, or after RICCATI_STEPS steps. Double precision is not enough where lightly damped modes make the margin small.
-    Raises LinAlgError without a solution.
+    Raises LinAlgError if there is no solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)

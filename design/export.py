@@ -35,20 +35,21 @@ from haptic_loop.design.result import RANGES, listed, switching_guarantee
 # If a force exceeds its limit, the tick solves the box problem f = q - M e of controller.complementarity, where q are
 # the unlimited forces, f the limited forces and e the slips. The tick makes the first wrong limit active or inactive
 # until none is wrong. This takes finitely many switches (docs/theory.md). The elimination keeps the order of the
-# channels and needs no pivots, because all principal minors are positive. The tick then adds KICK e to [y; z+] and sets
-# the sent forces to f.
+# channels and needs no pivoting, because all principal minors are positive. The tick then adds KICK e to [y; z+], with
+# the matrix `kick` of controller.law.Limiter, and sets the sent forces to f.
 #
-# If the force of a device is limited as a vector, the tick first tries a step of Newton's method in u = f + tau e. If
-# this step does not halve the residual, the tick replaces the step by one of the Douglas-Rachford iteration, which
-# converges. A force that misses its tolerance after _MOST_STEPS steps is set to 0; `unsolved` counts these ticks.
+# If the force of a device is limited as a vector, the tick solves controller.complementarity.BallProblem instead. Each
+# step is one of Newton's method in u = f + tau e, or, if this one does not halve the residual, one of the
+# Douglas-Rachford iteration, which converges. Forces that miss their tolerance after _MOST_STEPS steps are set to 0;
+# `unsolved` counts these ticks.
 
 
 _TICKS = 64  # length of a test vector, longer than the fast modes and the usual delays of a loop
-_MOST_TURNS = 100_000  # most switches in a tick's box problem; a handful is usual
+_MOST_TURNS = 100_000  # largest number of switches in a tick's box problem; a handful is usual
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, unless rounding is larger
 _BALL_ROUNDING = 16  # allowed rounding of a block's residual, in epsilons times the largest row sum of absolute terms
-_MOST_STEPS = 1000  # most steps for a force vector; five are usual, well-conditioned random problems took up to 93
+_MOST_STEPS = 1000  # largest number of steps for force vectors; 5 are usual, well-conditioned random ones took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
 
@@ -86,7 +87,7 @@ class ExportedBlock:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A test vector."""
+    """A test vector: the inputs of a block from rest, and the outputs that the exported file must repeat."""
 
     inputs: Array  # (_TICKS, m)
     outputs: Array  # (_TICKS, m)
@@ -298,9 +299,9 @@ class _Balls(NamedTuple):
     at: list[int]  # (m,) channel of each entry
     first: list[int]  # (m,) first entry of the vector to which each entry belongs
     last: list[int]  # (m,) end of the vector to which each entry belongs
-    end: list[int]  # end of each block
+    end: list[int]  # end of each block, whose vectors are solved together
     M: list[list[Any]]
-    resolvent: list[list[Any]]  # (1 + M/tau)^-1 of each block
+    resolvent: list[list[Any]]  # (I + M/tau)^-1 of each block
     tau: list[Any]
     limit: list[Any]
 
@@ -879,7 +880,7 @@ def _row(values: Array, suffix: str) -> str:
 def with_origin(
     block: ExportedBlock, file: str, stored: Stored, verdict: Verdict, claim: str | None = None
 ) -> ExportedBlock:
-    """Add comment lines on the block's file and on its proof; `claim` is a further line."""
+    """Add comment lines on the coupling's `file` and on its proof; `claim` is a further line."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
     proved = _guarantee(stored, verdict, block.limiter is not None)
     return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))
@@ -903,5 +904,5 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
         where = where_proved(stored.loop.network, stored.loop.ranges)
         how += f"; proved at {where} only: design.check searches between them"
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
-        "also while forces are limited." if limited else "linear forces only."
+        "also while forces are limited." if limited else "only while forces stay below their limits."
     )

@@ -117,23 +117,23 @@ class Collected(Generic[Block]):
     def __init__(
         self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
     ) -> None:
-        """Add the hands' inputs and their rows.
+        """Add the hands' inputs and their rows; `path` has the weights of each channel's nominal delay.
 
         With `any_object` the energy that a passive object receives is subtracted, so that f_e[k] multiplies the
-        displacement minus (x[k] - x[k-1]) (docs/theory.md, "Any environment").
+        displacement minus (x[k] - x[k-1]) (docs/theory.md, "Facts that hold together").
         """
         self.T, self.channels, self.walls = T, len(path), walls
-        self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
+        self.path, self.hands = path, hands
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
         self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
         self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
         self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of df_e, scale)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight of dy, whether it is summed)
-        self._terms: list[tuple[int, int, Any]] = []
+        self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
-        self._gain: list[tuple[int, int, Any]] = []
-        self._keep: list[tuple[int, float]] = []
+        self._gain: list[tuple[int, int, Any]] = []  # (row, input, weight) of terms that scale with the damping
+        self._keep: list[tuple[int, float]] = []  # (row, margin of its diagonal entry)
         for i in hands:
             row, weights = self.input(i.name, i.channel), _product(path[i.channel], i.moved)
             if any_object or not i.follows:  # The weights of a speed add up to 0, so there is no pole.
@@ -143,7 +143,7 @@ class Collected(Generic[Block]):
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:
-        """Add the limiter's slip, one more input per channel; inputs with `slips` become displacements less slip."""
+        """Add the limiter's slip as one more input per channel; inputs with `slips` become displacements less slip."""
         for i in self.hands:
             if i.slips:
                 self.input("de", i.channel)
@@ -228,7 +228,7 @@ class Collected(Generic[Block]):
         self._gain.append((row, column, weight))
 
     def keep(self, row: int, amount: float) -> None:
-        """Reserve a margin of the diagonal in a search, so that multipliers may be rounded."""
+        """Subtract a margin from the row's diagonal entry in a search, so that multipliers may be rounded."""
         self._keep.append((row, amount))
 
     @property
@@ -251,7 +251,7 @@ class Collected(Generic[Block]):
         return self._matrix(self._gain)
 
     def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, Weights]]]:
-        """Return (row, scale, summed) of each term with forces, and its (channel, weights)."""
+        """Return (row, scale, whether the force is summed) of each term with forces, and its (channel, weights)."""
         kinds = [*((r, True) for r in self._sums), *((r, False) for r in self._steps)]
         return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
 
@@ -635,7 +635,8 @@ class Walls(Fact):
     """Walls that make and break contact, with the multipliers a, a + c, d, m of each wall's law.
 
     Every wall has the input u, the step of the depth h. A wall with a damper has one more input s >= 0, which is
-    positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z).
+    positive only when the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z)
+    for the k and b of `laws`.
     """
 
     def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:

@@ -373,7 +373,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # The key `from` has the field from_.
+            part[one.name.removesuffix("_")] = plain(value)  # The field from_ gives the key `from`.
     return part
 
 
