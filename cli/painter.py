@@ -1,8 +1,10 @@
 """A picture that a second process draws, because loading matplotlib takes longer than loading NumPy and MuJoCo.
 
-    painter = Painter()                              # The second process begins to load matplotlib.
-    ..                                               # This process computes at the same time.
-    painter.draw(path, "draw_run", signals, title)   # writes the figure of plots.draw_run(signals, title)
+    painter = Painter()                      # The second process begins to load matplotlib.
+    ..                                       # This process computes at the same time.
+    painter.ask("draw_run", signals, title)  # The second process begins to draw plots.draw_run(signals, title).
+    ..
+    painter.save(path)                       # writes the picture
 
 The second process sends the picture back and writes no file. It ends when the first process ends, because its standard
 input is closed then. If it cannot be started, or ends without a picture, the first process draws.
@@ -11,36 +13,47 @@ input is closed then. If it cannot be started, or ends without a picture, the fi
 from __future__ import annotations
 
 import os
-import pickle
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
 
-from haptic_loop.controller.units import speak, spoken
-from haptic_loop.design.files import write
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     import subprocess
+    from pathlib import Path
+    from typing import Any
+
+_begun: subprocess.Popen[bytes] | None = None  # the second process that `begin` has started for the next Painter
+
+
+def begin() -> None:
+    """Start the second process of the next Painter, while this process still loads its own modules."""
+    global _begun
+    _begun = _started()
+
+
+def _started() -> subprocess.Popen[bytes] | None:
+    """Start a second process, unless this process has already loaded matplotlib."""
+    if "matplotlib" in sys.modules or not sys.executable:
+        return None
+    import subprocess  # Commands without a picture do not need it.
+
+    # The second process finds modules in the same folders as this one.
+    command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    pipe, none = subprocess.PIPE, subprocess.DEVNULL
+    try:  # In a new session the process is not ended by Ctrl-C, after which a run still draws its picture.
+        return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=none, start_new_session=True)
+    except OSError:
+        return None
 
 
 class Painter:
     """Draws one picture, in a second process if `wanted` and if this process has not yet loaded matplotlib."""
 
     def __init__(self, wanted: bool = True) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        if wanted and "matplotlib" not in sys.modules and sys.executable:
-            import subprocess  # Commands without a picture do not need it.
-
-            # The second process finds modules in the same folders as this one.
-            command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
-            path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-            pipe, none = subprocess.PIPE, subprocess.DEVNULL
-            try:  # In a new session the process is not ended by Ctrl-C, after which a run still draws its picture.
-                self._process = subprocess.Popen(
-                    command, env=path, stdin=pipe, stdout=pipe, stderr=none, start_new_session=True
-                )
-            except OSError:
-                self._process = None
+        global _begun
+        self._process, _begun = _begun or (_started() if wanted else None), None
+        self._asked: tuple[str, tuple[Any, ...]] | None = None
 
     def __del__(self) -> None:
         """End the second process if the command failed before its picture."""
@@ -48,30 +61,49 @@ class Painter:
             self._process.kill()
             self._process.communicate()
 
-    def draw(self, path: Path, function: str, *arguments: Any) -> Path:
-        """Write the figure that a function of sim.plots returns for these arguments, as a PNG file.
+    def ask(self, function: str, *arguments: Any) -> None:
+        """Let the second process draw the figure that a function of sim.plots returns for these arguments."""
+        self._asked = function, arguments
+        if self._process and self._process.stdin:
+            import pickle
 
-        Raises InputError if the file cannot be written.
-        """
+            from haptic_loop.controller.units import spoken
+
+            request = pickle.dumps((spoken(), function, arguments), pickle.HIGHEST_PROTOCOL)
+            with suppress(BrokenPipeError), self._process.stdin as stdin:
+                stdin.write(request)
+            self._process.stdin = None  # for communicate()
+
+    def save(self, path: Path) -> Path:
+        """Write the figure that was asked for as a PNG file. Raises InputError if the file cannot be written."""
+        assert self._asked
         if self._process:
-            png, _ = self._process.communicate(pickle.dumps((spoken(), function, arguments), pickle.HIGHEST_PROTOCOL))
+            from haptic_loop.design.files import write
+
+            png, _ = self._process.communicate()
             if self._process.returncode == 0:
                 return write(path, png)
         skip_docstrings()
         from haptic_loop.sim import plots
 
+        function, arguments = self._asked
         return plots.save(getattr(plots, function)(*arguments), path)
 
 
 def serve() -> None:
     """Draw the picture that standard input asks for, and write it to standard output. The second process runs this."""
+    import pickle
+
     os.environ["MPLBACKEND"] = "Agg"
     skip_docstrings()
+    from haptic_loop.controller.units import speak
     from haptic_loop.sim import plots
 
     unit, function, arguments = pickle.load(sys.stdin.buffer)
     speak(unit)
     sys.stdout.buffer.write(plots.png(getattr(plots, function)(*arguments)))
+    sys.stdout.flush()
+    os._exit(0)  # without Python's clean-up, for which the other process would wait
 
 
 def skip_docstrings() -> None:

@@ -55,20 +55,24 @@ def main(argv: list[str]) -> int:
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     encoder = encoder_steps(scenario, args.case, assessment)
     render.announce(args, verdicts.verdict(assessment, encoder=encoder))
-    nearby = _nearby(scenario.loop(args.case), chosen, assessment)
-    if lost := verdicts.lost(assessment, nearby):
-        render.announce(args, lost)
     from haptic_loop.sim.run_report import run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
-    report = replace(report, robustness=nearby)
+    drawn = render.is_drawn(args, out / "figure.png", bool(run.trace.t.size))
+    if drawn:
+        painter.ask("draw_run", *_shown(args, run, report))
+    report = replace(report, robustness=_nearby(scenario.loop(args.case), chosen, assessment))
+    if lost := verdicts.lost(assessment, report.robustness):
+        render.announce(args, lost)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
     tables, left_out = _tables(scenario, report)
     render.show(args, tables, [*report.remarks, *left_out], _details(report))
     with render.progress("storing the trace and drawing the picture"):
-        files = _save(args, out, run, report, painter)
+        files = _save(out, run, report)
+        if drawn:
+            files.append(painter.save(out / "figure.png"))
     render.publish(args, report, (), folder=out, files=files)
     return options.exit_code(True, run.trace.interrupted)
 
@@ -162,24 +166,25 @@ def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | 
         return robustness_nearby(loop, chosen.coupling, named(chosen.asked))
 
 
-def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport, painter: Painter) -> list[Path]:
+def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
     from haptic_loop.sim.view.drawn_object import scene_xml
 
-    result, stability = replace(run.trace, meta=render.plain(report)), report.stability
+    result = replace(run.trace, meta=render.plain(report))
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", scene_xml(run.simulation)))
-    if render.is_drawn(args, out / "figure.png", bool(result.t.size)):
-        apart = report.ideal_force.error_percent
-        ideal = None if apart is None else (report.ideal_force.ideal, apart)
-        grows = stability.exact_verdict == "unstable" and run.exact is not None and not report.switched
-        growth = stability.exact_growth_rate_per_s if grows else None
-        onset = Onset(growth, report.run.steady_ticks[0][1], report.credible.until_s)
-        around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
-        title = _title(run.simulation.scenario.title(args.case), report)
-        hertz = stability.exact_frequency_hz
-        shown = Signals.of(result), title, hertz, ideal, onset, around
-        files.append(painter.draw(out / "figure.png", "draw_run", *shown))
     return files
+
+
+def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tuple[Any, ...]:
+    """Return the arguments of plots.draw_run."""
+    stability, apart = report.stability, report.ideal_force.error_percent
+    ideal = None if apart is None else (report.ideal_force.ideal, apart)
+    grows = stability.exact_verdict == "unstable" and run.exact is not None and not report.switched
+    growth = stability.exact_growth_rate_per_s if grows else None
+    onset = Onset(growth, report.run.steady_ticks[0][1], report.credible.until_s)
+    around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
+    title = _title(run.simulation.scenario.title(args.case), report)
+    return Signals.of(run.trace), title, stability.exact_frequency_hz, ideal, onset, around
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:

@@ -233,7 +233,8 @@ def _save(
         what = scenario.title(args.case).removesuffix(", no coupling")
         title = f"{what}, {coupling}: {findings.index.size} random humans"
         shown = findings.mass, findings.damping, findings.exact, title
-        files.append(painter.draw(out / "population.png", "draw_population", *shown))
+        painter.ask("draw_population", *shown)
+        files.append(painter.save(out / "population.png"))
     return files
 
 

@@ -182,7 +182,8 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
     if render.is_drawn(args, out / "figure.png", trace.t.size > 1):
         title, around = f"{scenario.name}: a MuJoCo world", Contacts(scenario.environment.contacts)
         shown = Signals.of(labelled), title, 1.0, None, None, around
-        files.append(painter.draw(out / "figure.png", "draw_run", *shown))
+        painter.ask("draw_run", *shown)
+        files.append(painter.save(out / "figure.png"))
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
     _publish(args, report, title, _run_rows(report, figures, scenario), out, files)
     return options.exit_code(True, trace.interrupted)

@@ -108,7 +108,7 @@ def _leave(number: int, frame: Any) -> NoReturn:
 # takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.main.execute installs it again
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute.execute installs it again
         signal.signal(signal.SIGINT, _leave)
 
 

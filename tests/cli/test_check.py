@@ -8,7 +8,7 @@ import pytest
 from worlds import PAIR, SOFT
 
 from haptic_loop.cli.check import main
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save
 

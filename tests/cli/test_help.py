@@ -91,7 +91,7 @@ def test_help_says_what_every_option_is(module, capsys, monkeypatch):
 COUNT = """
 from threadpoolctl import threadpool_info
 from haptic_loop import design_coupling, load
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.design import api
 def count(*_):
     import scipy.linalg

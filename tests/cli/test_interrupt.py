@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.files import check_file, out_file
@@ -133,9 +133,11 @@ IN_EXEC = "exec('raise KeyboardInterrupt')\n"  # dataclass runs code in this way
 IN_C = "try:\n raise KeyboardInterrupt\nexcept BaseException as error:\n raise ImportError('failed') from error\n"
 
 
-@pytest.mark.parametrize("module", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run", "cli"])
-def test_ctrl_c_while_a_command_is_imported(module, tmp_path):
-    assert interrupted_at(module, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
+@pytest.mark.parametrize(
+    "command", ["hw.bridge", "hw.identify", "hw.replay", "sim.view", "design", "sim.run", "cli run"]
+)
+def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
+    assert interrupted_at(command, "numpy", INTERRUPT, tmp_path) == (130, "interrupted\n")
 
 
 @pytest.mark.parametrize("code", [INTERRUPT, IN_EXEC, IN_C], ids=["signal", "exec", "compiled"])

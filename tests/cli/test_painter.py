@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from haptic_loop.cli.painter import Painter
+from haptic_loop.cli import painter as painter_module
+from haptic_loop.cli.painter import Painter, begin
 from haptic_loop.controller.units import speak, spoken
 from haptic_loop.sim import plots
 from haptic_loop.sim.shown import Signals
@@ -33,7 +34,8 @@ from haptic_loop.cli.painter import Painter
 
 speak("rad")
 painter = Painter()
-painter.draw(Path(sys.argv[1]), "draw_run", *pickle.load(sys.stdin.buffer))
+painter.ask("draw_run", *pickle.load(sys.stdin.buffer))
+painter.save(Path(sys.argv[1]))
 assert "matplotlib" not in sys.modules
 """
 
@@ -53,7 +55,8 @@ def test_without_a_second_process_this_one_draws(program, monkeypatch, tmp_path)
         patch.delitem(sys.modules, "matplotlib")
         patch.setattr(sys, "executable", program)
         painter = Painter()
-    path = painter.draw(tmp_path / "a.png", "draw_run", *SHOWN)
+    painter.ask("draw_run", *SHOWN)
+    path = painter.save(tmp_path / "a.png")
     assert path.read_bytes() == plots.png(plots.draw_run(*SHOWN))
 
 
@@ -76,3 +79,16 @@ def test_a_painter_without_picture_ends_its_process(monkeypatch):
     assert started[0].poll() is None
     del painter
     assert started[0].returncode < 0
+
+
+def test_a_begun_process_draws_for_the_next_painter(monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    begin()
+    begun = painter_module._begun
+    first, second = Painter(wanted=False), Painter(wanted=False)
+    assert begun
+    assert begun.poll() is None
+    assert first._process is begun
+    assert second._process is None
+    del first
+    assert begun.returncode < 0

@@ -12,7 +12,7 @@ import pytest
 from worlds import FIGURE_4, PAIR, SOFT
 
 from haptic_loop.cli.audit import main
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
 from haptic_loop.controller.loop import Loop

@@ -12,7 +12,7 @@ from driven import drive
 from worlds import force_map, loop_of
 
 from haptic_loop.cli import zwidth
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment

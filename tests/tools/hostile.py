@@ -36,7 +36,7 @@ from hostile_cases import BUT, SHORT, Case, furnish, npz, pairs, put
 from matplotlib.figure import Figure
 
 from haptic_loop.cli import options
-from haptic_loop.cli.main import execute
+from haptic_loop.cli.execute import execute
 from haptic_loop.sim import plots
 
 SECONDS = 20  # CPU seconds that a case may take

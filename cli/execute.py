@@ -1,0 +1,134 @@
+"""Running a command: errors become one line on standard error, and the exit code says what happened."""
+
+from __future__ import annotations
+
+import _thread
+import io
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from importlib.util import LazyLoader, find_spec, module_from_spec
+from typing import Any, NoReturn
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from haptic_loop import _leave
+from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.units import in_unit
+from haptic_loop.design.files import nobody_reads, one_command, one_line
+from haptic_loop.design.own import is_refusal, place_of
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.sim.scenario import InputError
+
+
+def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
+    """Run a command and leave with its exit code; bad input is one line on standard error.
+
+    The reader of standard output may stop at any line (`| head -1`) without changing the exit code, also under
+    `set -o pipefail`. SIGTERM ends a command like Ctrl-C: temporary files are removed.
+    """
+    code: str | int | None
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
+    _load_on_first_use("f2py", "testing")  # SciPy's import names both without using them
+    os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown backend would stop the import of matplotlib.
+    _streams()
+    sys.unraisablehook = _repeat_interrupt
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminated)
+    try:
+        if signal.getsignal(signal.SIGINT) is _leave:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        # The matrices are small: more BLAS threads only wait for each other and change the last digits.
+        with threadpool_limits(1, user_api="blas"), one_command():
+            code = _run(main, sys.argv[1:] if argv is None else argv)
+    except (InputError, SingularLoop) as error:
+        code = _say(f"error: {error}", BAD_INPUT)
+    except DesignFailed as error:
+        code = _say(f"not possible: {error}", DOES_NOT_HOLD)
+    except KeyboardInterrupt:
+        code = _say("interrupted", INTERRUPTED)
+    except SystemExit as end:  # raised by --help and by SIGTERM
+        code = end.code
+    except MemoryError:
+        code = _say("error: there is not enough memory for this", UNFINISHED)
+    except OSError as error:  # mostly a full disk
+        code = _cannot(error)
+    except Exception as error:  # The exit code 1 would mean that a claim does not hold.
+        place, code = place_of(error), UNFINISHED  # `place` is None for a mistake in this package
+        if place and is_refusal(error):
+            code = _say(f"error: {place}: {error}", BAD_INPUT)
+        else:
+            traceback.print_exc()
+            if place:
+                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        nobody_reads()
+    except OSError as error:
+        code = _cannot(error)
+    # If Ctrl-C ended a call of exec(), such as that of dataclass, Python would end by sending itself SIGINT. The empty
+    # call below makes Python forget that interrupt.
+    exec("")
+    sys.exit(code)
+
+
+def _run(main: Callable[[list[str]], int], argv: list[str]) -> int:
+    """Run the command. An error raised from KeyboardInterrupt, as by a compiled module at its import, is Ctrl-C."""
+    try:
+        return main(argv)
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause := cause.__cause__:
+            if isinstance(cause, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+        raise
+
+
+def _say(message: str, code: int) -> int:
+    print(in_unit(one_line(message)), file=sys.stderr)
+    return code
+
+
+def _cannot(error: OSError) -> int:
+    """Print an error of the operating system in one line; later output is discarded."""
+    nobody_reads()
+    return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
+
+
+def _streams() -> None:
+    """Replace closed standard streams, and escape characters that a terminal cannot show."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the command runs
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _terminated(number: int, frame: Any) -> NoReturn:
+    raise SystemExit(_say("terminated", 128 + number))
+
+
+def _repeat_interrupt(unraisable: Any) -> None:
+    """Repeat a Ctrl-C that came during Python's clean-up, where Python would ignore it."""
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        _thread.interrupt_main()
+    else:
+        sys.__unraisablehook__(unraisable)
+
+
+def _load_on_first_use(*names: str) -> None:
+    """Load these parts of NumPy only when one of their names is read, which saves a third of SciPy's import time."""
+    for name in names:
+        spec = find_spec(f"numpy.{name}")
+        if spec and spec.loader and spec.name not in sys.modules:
+            loader = spec.loader = LazyLoader(spec.loader)
+            module = sys.modules[spec.name] = module_from_spec(spec)
+            loader.exec_module(module)
+            setattr(np, name, module)
