@@ -101,7 +101,7 @@ def _parser() -> options.Parser:
     parser.add_limiter()
     many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
     add("--humans", type=whole_number(1, 1_000_000), metavar="N", help=many)
-    add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
+    add("--links", choices=tuple(_LINKS), help="masses in each human (default: as in the scenario)")
     add("--engine", choices=ENGINES, default="both", help="engines that judge; mujoco means both (default both)")
     seconds = "length of the traces [s] (default 2; 0: no traces)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)

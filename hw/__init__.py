@@ -1,1 +1,1 @@
-"""The serial link: protocol, device state machine, bridge and emulator."""
+"""Sessions with real and emulated devices: protocol, safety limits, measurements and reports."""

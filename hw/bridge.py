@@ -1,4 +1,4 @@
-"""python -m hw.bridge: a session with a device over a serial port; the command is cli/bridge.py."""
+"""python -m hw.bridge: run a session with a device; the command is cli/bridge.py."""
 
 if __name__ == "__main__":
     from haptic_loop.cli.main import door

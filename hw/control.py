@@ -189,7 +189,7 @@ class WorldController:
         self.least = 0.0  # [J] least sum so far over ticks of f'(u[k] - u[k-1]), with positions u of the contacts
         self.seconds: list[float] = []  # CPU time of each step of the scene
         self._start, self._sent = start, np.zeros((len(waits), 1))
-        self._open = False  # whether the force of the current tick is still to be booked
+        self._open = False  # whether the shell has not yet booked the force of the current tick
         self._lines = [deque([0] * n) for n in waits]
         self._test: SentBudget | None = None
         self._tested = 0.0  # [J] energy charged for motor tests
@@ -320,7 +320,8 @@ class Drive:
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._test_plan = arming.test_plan
-        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # of several boards, each has one
+        # With several boards, each board has its own monitor (hw/boards.py).
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property
@@ -477,7 +478,7 @@ class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
 
     link: int  # [ticks]
-    scenario: Scenario  # has the delays of this loop
+    scenario: Scenario  # the session's scenario with the delays of the certified loop
     case: str
     chosen: Chosen
     assessment: Assessment  # holds for the loop with these delays
@@ -552,7 +553,7 @@ def certified_coupling(
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
     them, with W0 = `start` [J]. With several boards, forces act `behind` (m,) ticks later than `link`, and each board
-    has its own clock. The certificate is then for periods that are longer by CLOCK_TOLERANCE.
+    has its own clock. The longest period that the certificate covers is then longer by the share CLOCK_TOLERANCE.
 
     Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """

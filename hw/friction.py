@@ -8,10 +8,10 @@ with the displacement x, the motor's force f and D = d/dt. The fit estimates the
 term k x stands for a cable, a spring or gravity that changes with position, f0 + f1 t for a constant force and its
 drift. A motor (m1) that drives the handle (m2) by a transmission (k12, d12) gives a = m2/k12, l = d12/k12,
 p = a b + l m, r = a m1. The motor's balance was multiplied by 1 + l D + a D^2, so there are no fractions; small terms
-such as l D g and derivatives of k x are left out. An amplifier's
-lag tau changes l to l - tau and a to about a + tau^2 - l tau, so the fit does not mistake it for negative damping.
-The fit differentiates h, never the counts, and integrates a force held for a tick exactly. The balance is linear in all
-parameters except the a before g, so a fit takes milliseconds. A fit needs no initial state.
+such as l D g and derivatives of k x are left out. An amplifier's lag tau changes l to l - tau and a to about
+a + tau^2 - l tau, so the fit does not mistake it for negative damping. The fit differentiates h, never the counts, and
+integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
+takes milliseconds. A fit needs no initial state.
 
 Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
 vanishes at high speed (Stribeck). The law is not known, so all _SLIPS are tried, and all _BRISTLES longer than an
@@ -47,7 +47,8 @@ _REACH = 6  # standard deviations at which a window is cut off
 _STILL = 0.02  # [s] an axis is at rest if its encoder stays within one count for this long
 #: [m/s] speed at which dry friction reaches 3/4 of its maximum
 _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
-_BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction grows from 0 to its limit (Dahl 1968)
+#: [m] distances over which a bristle's friction grows from 0 to its limit (Dahl 1968)
+_BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)
 _STRIBECK = 0.02  # [m/s] speed at which the Stribeck part has fallen to 37 %
 _SLOW, _WEAK = 0.2, 0.05  # h must pass this share of a force; a force below this share of the strongest is not checked
 _SLIP = 0.002  # [m/s] slip assumed in `dry_friction` if the best law is a bristle
@@ -55,7 +56,7 @@ _BLOCKS = 10  # parts of the record that are left out in turn
 _HIDDEN = 0.03  # the bound is reduced by this share of the damping that the residual could hide
 #: relative error of the encoder's scale, which no record shows; eccentricity of 20 um in a turn of 40 mm gives 3e-3
 SCALE = 5e-3
-_QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
+_QUANTILE = 1.833  # one-sided 95 % quantile of Student's t with 9 degrees of freedom
 _FEW = 200  # least number of ticks of a record at which the balance holds
 _ALMOST = 4.0  # twice the largest log likelihood ratio of the best law to a law that counts in the bound
 _ROUNDS = 3  # iterations for the weight a of friction's second derivative
@@ -74,13 +75,13 @@ class Friction:
     mass: float  # [kg]
     viscous: float  # b [N s/m]
     coulomb: float  # [N]
-    stiffness: float  # [N/m] to ground
+    stiffness: float  # [N/m] of a spring from the handle to ground
     constant: float  # [N] constant force
-    drift: float  # [N/s] of the constant force
+    drift: float  # [N/s] rate at which the constant force changes
     static: float  # [N] Stribeck part of dry friction, which vanishes at high speed
     drag: float  # [N s2/m2]
     slip: float  # [m/s] v0 of the best law of dry friction; 0 where the best law is a bristle
-    reach: float  # [m] over which dry friction grows from 0 to its maximum; 0 where it depends on speed
+    reach: float  # [m] distance over which a bristle's friction grows to its maximum; 0 where friction depends on speed
     periods: tuple[float, ...]  # [m] periods of the disturbances found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b

@@ -74,7 +74,7 @@ class SerialDevice:
         self._port, self._clock, self._patience = port, clock, patience
         self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
         self._question: wire.Hello | wire.Config | None = None
-        self._begun = self._asked = 0.0  # [s] when the question was asked first, and last
+        self._begun = self._asked = 0.0  # [s] times at which the question was sent first, and last
         self.dropped = 0  # bytes that the port did not accept
 
     @property

@@ -544,9 +544,9 @@ class Expected:
         self._states = [np.zeros(len(self._plants[which][0])) for which in (0, -1, 0)]
 
     def advance(self, axis: int, force: float) -> tuple[float, float, float]:
-        """Apply a motor's force [N] for a tick and return its axis' positions [m].
+        """Apply the force [N] of the motor of `axis` for a tick, and return three positions [m] of this axis.
 
-        They are the expected one, that in a heavy hand, and that under the absolute value of all forces.
+        They are the expected position, that in a heavy hand, and that under the absolute value of all forces so far.
         """
         plants, forces = (self._plants[which] for which in (0, -1, 0)), (force, force, abs(force))
         moved = zip(plants, self._states, forces, strict=True)

@@ -160,9 +160,8 @@ class _Comparison:
 def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
     """Replay recorded displacements through controller, gain, limits and rounding, and compare the forces.
 
-    Every arming starts at rest.
-
-    Raises InputError where the trace cannot be replayed, for example without a recipe.
+    The controller starts at rest in every arming. Raises InputError where the trace cannot be replayed, for example
+    without a recipe.
     """
     wanted, sent, arming = np.zeros_like(link["asked"]), np.zeros_like(link["sent"]), link["arming"]
     try:

@@ -39,7 +39,7 @@ _QUANTILE, _GUARD_US = 0.99, 100.0
 _BEGIN_US = 500  # time from the device's first tick to the start of the session
 _GRACE_US = 50_000  # [us] time after the end of a session: a device must rest 30 ms after STOP (hw.session)
 _LONGEST = 60.0  # [s] longest virtual time in which a session connects, is armed and ends, in addition to its run
-_LATENCY_US = 60  # latency of one direction, which gives a median age of about 130 us, as measured
+_LATENCY_US = 60  # latency of one direction, which gives answers a median age of about 130 us
 
 Plan = Callable[[Ages], Sequence[Armable]]
 

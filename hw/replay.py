@@ -1,4 +1,4 @@
-"""python -m hw.replay: a recorded session through the controller again, bit by bit; the command is cli/replay.py."""
+"""python -m hw.replay: feed a recorded session through the controller again; the command is cli/replay.py."""
 
 if __name__ == "__main__":
     from haptic_loop.cli.main import door

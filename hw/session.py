@@ -65,9 +65,9 @@ class Session:
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
         self._expected = Expected(scenario, self.settings.held)
-        self.missed_while_driving = 0  # ticks
+        self.missed_while_driving = 0  # ticks without an answer in time while the session drove
         self.request: str | None = None  # what the person at the device has to do at the moment
-        self.now = self.entered = self.heard = 0  # [us]
+        self.now = self.entered = self.heard = 0  # [us] times of the last call, stage and new STATE
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
         self._shutdown: _Shutdown | None = None

@@ -71,7 +71,7 @@ class IncidentLog:
 class _Event:
     """An entry of the session's log: a stage, and why it began or what happened in it."""
 
-    t_s: float  # since the session began
+    t_s: float  # [s] time since the session began
     stage: str
     cause: str
 

@@ -46,7 +46,7 @@ _STEPS = 30  # largest number of evaluations in a fit
 _VAGUE = 3.0  # prior standard deviation of log m1, log m2, log k and log d
 _B, _C = 4, 7  # places of b and c among the parameters
 _MUCH = 0.15  # largest share of a memory in the damping for which the linear fit suffices
-_QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
+_QUANTILE = 2.0  # one-sided 97.7 % quantile of the normal distribution
 _SURE = 100.0  # log likelihood ratio above which a memory is proved; chance and poor friction models stay below
 
 
