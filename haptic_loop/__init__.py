@@ -4,7 +4,7 @@
 
 load("omega-pair"), parse(text)     Return a Scenario, from a TOML file, a packaged name, or a text.
 Scenario.loop("I")                  Return the Loop of a scenario: all data that a design may use.
-design_coupling(loop, kind)         Return a Design: the best coupling of a kind that was found. See DesignOptions.
+design_coupling(loop, kind)         Return a Design: the best coupling found of the kind `kind`. See DesignOptions.
 certify(loop, coupling)             Return a Requirement per condition: the damping that the coupling needs.
 assess(loop, coupling)              Return an Assessment: requirements, force limits, and the guarantee or a reason.
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
@@ -26,7 +26,7 @@ import signal
 import sys
 from importlib import import_module
 
-TYPE_CHECKING = False  # typing takes time to import, in which Ctrl-C prints a traceback
+TYPE_CHECKING = False  # Importing it from typing takes time; Ctrl-C in this time would print a traceback.
 if TYPE_CHECKING:
     from typing import Any, NoReturn
 
@@ -108,7 +108,7 @@ def _leave(number: int, frame: Any) -> NoReturn:
 # takes longer than the rest of MuJoCo, and fails if it is not installed. A user's script keeps its setting.
 if _command_starts():
     os.environ["MUJOCO_GL"] = "disable"
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute.execute installs it again
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # cli.execute restores this handler
         signal.signal(signal.SIGINT, _leave)
 
 
@@ -119,5 +119,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names, and the attributes that every package has."""
+    """Return the public names, and the names with two underscores that every package has."""
     return [*__all__, *(name for name in globals() if name.startswith("__"))]

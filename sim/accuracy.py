@@ -1,7 +1,7 @@
-"""Errors of runs: of an engine against the exact engine, and of forces against an ideal environment's forces.
+"""Accuracy of runs: errors of engines and of felt forces, and the choice of an integrator and its substeps.
 
-`measure` returns the cost and the errors of one setting of an engine. `compare_engines` runs several settings on a
-scene, and `pick` chooses the cheapest one within a given error.
+`measure` returns the cost and the errors of one setting (engine, integrator, substeps). `compare_engines` runs several
+settings on a scene, and `pick` chooses the cheapest one within a given error. `settle` supplies the defaults.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ class Row:
     growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
-    cycle_frequency_hz: float | None
-    cycle_deviation_error: float | None  # relative
+    cycle_frequency_hz: float | None  # frequency of this force
+    cycle_deviation_error: float | None  # relative error of `cycle_deviation_n`
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
     pareto: bool = False  # whether the setting is on the Pareto front (`_with_front`)
@@ -147,7 +147,7 @@ def measure_all(
 
 
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
-    """Return the row of a setting: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost."""
+    """Run one setting, and return its row with the errors; its cost is the shortest wall time of _REPEATS runs."""
     settings = (engine, integrator, substeps)
     trace, wall = _timed(truth.coupled, *settings)
     for _ in range(_REPEATS - 1):
@@ -158,9 +158,10 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto` for rows with right verdicts that no row of the same engine dominates in cost and both errors.
+    """Set `pareto` for rows with right verdicts that no row of the same engine dominates.
 
-    MuJoCo's settings do not compete with the exact engine, which exists for linear plants only.
+    A dominating row is no worse in cost, position error and growth error, and better in one of them. MuJoCo's settings
+    do not compete with the exact engine, which exists for linear plants only.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -190,7 +191,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
 
 
 def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
-    """Return the larger growth-rate error of the two loops, and whether both verdicts are right."""
+    """Return the larger growth-rate error of coupled and uncoupled loop, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
         held = _measured_hold(simulation, engine, integrator, substeps)
@@ -203,7 +204,7 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
 def _cycle(
     truth: _Reference, engine: str, integrator: str | None, substeps: int | None
 ) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
-    """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors."""
+    """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors [-], [Hz]."""
     if truth.cycle is None:
         return None, None, None, None
     channel, deviation, frequency = truth.cycle
@@ -224,7 +225,7 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """The time at which a run first leaves the limits of the devices' linear model, and the peaks of force and speed.
+    """When a run first leaves the limits of the devices' linear model, its peak forces and speeds, and the limits.
 
     Each list has one entry per channel; the transmission force of a rigid device is None.
     """
@@ -247,7 +248,7 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
     forces: list[float | None] = []
     speeds, outside = [], np.zeros(trace.t.size, bool)
     for i, (device, handle) in enumerate(zip(devices, simulation.scene.handles, strict=True)):
-        if not trace.s.size:  # stopped before its first tick
+        if not trace.s.size:  # The run stopped before its first tick.
             break
         motor, speed = trace.s[:, i], np.abs(trace.s[:, n + i])
         outside |= speed > device.credible_speed
@@ -268,7 +269,7 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
 
 
 def _not_credible(credible: Credible, until: float) -> str:
-    """Return a sentence for report and caption on how far the run leaves the credible limits."""
+    """Return a sentence that says by how much a run exceeds the credible limits."""
     pairs = zip(credible.transmission_force_n, credible.credible_force_n, strict=True)
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
     speeds = zip(credible.motor_speed_m_per_s, credible.credible_speed_m_per_s, strict=True)
@@ -287,7 +288,7 @@ class ForceError:
     """Forces of the coupled loop and of the ideal environment for the same displacements (`force_error`)."""
 
     asked: Array = off_table("left out")  # (N, m) forces of the coupled loop [N]
-    ideal: Array = off_table("left out")  # (N, m) forces of the delay-matched environment, Lambda E x [N]
+    ideal: Array = off_table("left out")  # (N, m) forces Lambda E x of the ideal environment [N]
     error_percent: float | None = off_table()  # 100 rms(asked - ideal)/rms(ideal), over all ticks and channels
     asked_rms_n: float | None = off_table()
     ideal_rms_n: float | None = off_table()
@@ -358,7 +359,7 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # error of the encoders' positions over the run, plus that of a refined reference
+    position_relative_rms: float  # error of the encoders' positions, plus the error bound of a refined reference
     verdict_correct: bool  # whether the simulated loop has the verdict of the exact loop
     cpu_s: float  # CPU time of the run, for the report only
 
@@ -428,8 +429,8 @@ class CrossCheck:
     substeps: int
     position_relative_rms: float  # null in JSON where a run overflowed
     growth_rate_per_s: float
-    growth_rate_difference_per_s: float
-    agrees: bool
+    growth_rate_difference_per_s: float  # the growth rate above minus that of the original run's engine
+    agrees: bool  # whether the verdicts agree, and both runs diverged or neither did
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
@@ -529,14 +530,15 @@ def _apart(own: Array, truth: Array) -> float:
 # ----------------------------------------------------------------------------------------------------
 # The default integrator and number of substeps of a plant, and the map of an engine over one period.
 #
-# On a smooth scene the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
-# the continuous plant decide: a step h must resolve the fastest weakly damped mode (mode h <= 0.2) and follow the
-# strongest damping (rate h < 1). The number of steps is doubled until simulated and exact loop have the same verdict.
+# Without friction the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
+# the continuous plant decide: a step h [s] must resolve the fastest weakly damped mode w [rad/s] (w h <= 0.2), and
+# follow the strongest damping a [1/s] (a h < 1). The number of steps is doubled until the verdict is that of the exact
+# loop.
 
 MOST = 10_000  # largest number of substeps
 _MODE_LOST = "it damps fast modes away"
 _NEUTRAL = 1e-6  # allowed excess of a spectral radius over 1; rounding splits a free plant's eigenvalues at 1 by 1e-8
-_UNIT = 1e-6  # length of basis states and inputs, below every actuator limit; the plant is linear
+_UNIT = 1e-6  # size of basis states and inputs, below every actuator limit; any size serves, as the plant is linear
 
 
 def settle(
@@ -561,7 +563,7 @@ def settle(
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
-    """Return 1 for the exponential integrator on a smooth scene, else a number of steps that resolve the plant.
+    """Return 1 for the exponential integrator without friction, else a number of steps that resolves the plant.
 
     The number is at least 4, and is doubled until the simulated loop has the verdict of the exact loop. Raises
     InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
@@ -585,7 +587,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
 def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
     """Return remarks on the user's number of substeps. Raises InputError outside the stable region."""
     if integrator == EXPONENTIAL:
-        nearer = "of first order with friction; RK4 is more accurate at equal cost (see --cross-check)."
+        nearer = "with friction its error is of first order; RK4 is more accurate at equal cost (see --cross-check)."
         rubs = default_integrator(simulation.scene) != EXPONENTIAL
         return [f"{integrator} x {substeps}: {nearer}"] if rubs else []
     simulation = simulation.smooth.even

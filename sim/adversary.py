@@ -1,14 +1,14 @@
-"""Seeded searches for the passive humans with the largest growth: lossless chains, or hands of the population.
+"""Seeded searches for the passive humans whose loop grows fastest: lossless chains, or hands of the population.
 
 A lossless chain of masses and springs takes no energy out, and can present any reactance at the frequency where the
-loop is weakest. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above 3 kHz, errors of the matrix
-exponential would decide the verdict.
+loop is weakest. Masses and stiffnesses are bounded, so that no mode of a human exceeds about 3 kHz; above it, errors of
+the matrix exponential would decide the verdict.
 
 The conditions assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact it dissipates the
 integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f, |dx|^2 / T is
 (sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore requires too
-much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). No search has found an unstable human
-within this gap; most searches find one if the damping is below the gap.
+much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). With damping inside this gap no
+search has found an unstable human; with less damping most searches find one.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-_WITHIN = 4  # parameters in [-1, 1] that place a device within its guaranteed bounds (models.device.Mechanics)
+_WITHIN = 4  # number of parameters that place a device within its guaranteed bounds (models.device.Mechanics)
 _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
 
 class _Pass(NamedTuple):
-    """One search over modes above a frequency; slower modes of a lossless hand barely decay and hide a growing one."""
+    """One search. Slow modes of a lossless hand barely decay, and would hide faster modes that are about to grow."""
 
     links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
     min_frequency_hz: float  # modes below it are ignored
@@ -58,7 +58,7 @@ class Worst:
     growth: float  # [1/s]
     frequency_hz: float
     evaluated: int  # number of sets of humans
-    mechanics: Sequence[Mechanics] = ()  # of the devices, if all have bounds; () from search_population
+    mechanics: Sequence[Mechanics] = ()  # mechanics of the devices, if all have bounds; () from search_population
 
     @property
     def destabilises(self) -> bool:
@@ -157,7 +157,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
-    """Convert logarithms of masses and stiffnesses, (2 devices links, nsim), to lossless humans.
+    """Convert logarithms of masses and stiffnesses, (2 * devices * links, nsim), to lossless humans.
 
     If one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. If all
     devices have guaranteed bounds, the last rows, _WITHIN per device, are the arguments u of `Mechanics.within`.
@@ -176,7 +176,7 @@ def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
 
 
 def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
-    """Return the loops with the longest period and with forces that latch as late as possible."""
+    """Return the loops of a crowd with the longest period and with forces that latch as late as possible."""
     late = None if scenario.latency is None else [most for _, most in scenario.latency]
     return exact_loops(variants(scenario.device, crowd), F, scenario.longest_period, late)
 

@@ -1,4 +1,4 @@
-"""`simulate` and `validate` for scripts, with the results of the commands sim.run and sim.validate. SI units."""
+"""The functions `simulate` and `validate`, which give scripts what the commands sim.run and sim.validate compute."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def simulate(
 def _net(
     environment: Callable[[Array], Array] | None, energy_budget: float | None, assessment: Assessment, world: bool
 ) -> Wanted | None:
-    """Return the shell of a world or of a function, or the energy budget of the devices, if there is any."""
+    """Return the shell of a MuJoCo scene or of a function, or the devices' energy budget, or None without any."""
     if world:
         from haptic_loop.sim.world import Touched  # Other scenarios start without these modules.
 

@@ -67,7 +67,7 @@ class Alternative:
         return self.coupling
 
     def needs(self, condition: str) -> float | None:
-        """Return required over available damping of the worst channel; None without a figure, or if it is infinite."""
+        """Return required over available damping of the worst channel; None if it is infinite or not judged."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None
@@ -225,7 +225,7 @@ class Comparison:
     def of(
         cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str], seed: int
     ) -> Comparison:
-        """Compare the couplings `chosen`, by name; `failed` has a sentence for each coupling that was not designed."""
+        """Compare the couplings `chosen`, by name; `failed` has a sentence for each failed design."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
         alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # curves show the nominal environment

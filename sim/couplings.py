@@ -1,4 +1,4 @@
-"""The coupling of a command, by name or from a file, and its assessment in the scenario's loop."""
+"""Choose the coupling of a command by name or from a file, and assess it in the scenario's loop."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def choose(
         progress: Called during long searches with (task, steps done, number of steps).
 
     Raises:
-        InputError: Options contradict each other.
+        InputError: Options contradict each other, or a file does not fit.
         DesignFailed: No coupling was found.
     """
     try:
@@ -151,7 +151,7 @@ def from_file(
         stored: The content of the file.
         loop: The loop in which the coupling is used.
         kind: The name of the coupling in reports.
-        own: The user's own condition, which verifies a certificate of the same name.
+        own: The user's own condition, which verifies a certificate with this condition's name.
         coupling: The file's coupling if the caller has built it, for example for another T.
 
     Returns:
@@ -167,7 +167,7 @@ def from_file(
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "varying_delay", "lam")  # lam affects the transparency only
+    delays = ("theta", "varying_delay", "lam")  # The code below compares theta; lam affects no proof.
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = claim is not None and not reason
     switching = stored.loop.varying_delay if proved and not differ else None
@@ -181,7 +181,7 @@ def from_file(
         if loop.varying_delay and proved and not differ:
             made_for_delays = switching_guarantee(switching) if switching else "constant delays"
             here = switching_guarantee(loop.varying_delay)
-            notes.append(f"the file proves {made_for_delays}: {here} are judged anew here")
+            notes.append(f"the file covers only {made_for_delays}, so {here} are judged anew here")
         if differ:
             notes.append(
                 f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
@@ -214,7 +214,7 @@ def assessed(
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
 ) -> Assessment:
-    """Assess the chosen coupling in the loop of a scenario, as it will run.
+    """Assess the chosen coupling in the loop of a scenario before it runs.
 
     Args:
         scenario: The scenario. A guarantee must cover all its ranges, delays, periods and force limits.
@@ -229,7 +229,7 @@ def assessed(
 
     Returns:
         The assessment. A shell gives no guarantee with encoder steps. With lost packets only an energy budget gives
-        one, because forces may become older than any certificate covers.
+        a guarantee, because forces may become older than any certificate covers.
     """
     assessment = assess(
         scenario.loop(case),
@@ -281,7 +281,8 @@ class EncoderSteps:
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` gives the guarantee.
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` names what certifies the
+        loop.
         """
         if not any(steps):
             return None
@@ -291,7 +292,7 @@ class EncoderSteps:
         if loop.environment.walls or condition in KNOWN_CONDITIONS:
             obstacle = "walls" if loop.environment.walls else condition
             return cls(
-                *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved enough"
+                *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved to suffice"
             )
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())

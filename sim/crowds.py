@@ -3,8 +3,8 @@
 Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
 the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4
 integrator, which shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a
-fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates all humans, MuJoCo all or a
-sample (`_witnessed`). Workers end when their parent ends.
+fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates all humans; the other
+engine, MuJoCo or a user's own, all or a sample (`_witnessed`). Workers end when their parent ends.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ class Findings:
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
-        """(n,) whether the other engine, on its map, a deciding trace or `switching`, contradicts the exact one."""
+        """(n,) whether the other engine contradicts the exact one: by its map, a deciding trace or `switching`."""
         switching = disagree(self.switching, self.switching_mujoco)
         trace = np.where(self.trace_decides, self.trace, np.nan)
         return disagree(self.exact, self.mujoco) | disagree(self.exact, trace) | switching
@@ -205,7 +205,7 @@ _COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated",
 
 
 def _merge(parts: Sequence[Findings]) -> Findings:
-    """Merge the findings of groups or batches; without any the columns are empty."""
+    """Merge the findings of groups or batches; without findings the columns are empty."""
     if not parts:
         kinds: dict[str, type] = {"index": int, "witnessed": bool, "clipped": int, "contacts": int}
         empty: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, float)) for name in _COLUMNS}
@@ -222,7 +222,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
-    """Judge and simulate the humans of `indices`, who all meet the same environment.
+    """Judge and simulate the humans of `indices`, who all touch the same environment.
 
     `ticked` is called after each block of ticks that the other engine simulates, with their number.
     """
@@ -240,6 +240,7 @@ def _group(
     crowd: Crowd | HumanSets,
     ticked: Callable[[int], None],
 ) -> Findings:
+    """Judge and simulate the humans `index`, whose ports have the same structure."""
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
     late = scenario.usual_latency
@@ -282,7 +283,7 @@ def _group(
     )
 
 
-#: (numbers of the sets of humans, integrator, timing) -> the other engine
+#: (positions in a group of the simulated sets, integrator, timing) -> the other engine
 _Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
 
 
@@ -335,7 +336,7 @@ def _geometric_mean(values: Array) -> Array:
 def _witnessed(
     validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return the positions in a group of the humans that the other engine simulates, too.
+    """Return the positions in a group of the humans that the other engine also simulates.
 
     These are all sets with a lossless hand, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of
     the random sample; with `all_traces`, all sets. They depend on the validation and the group alone, not on the number

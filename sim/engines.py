@@ -1,4 +1,4 @@
-"""Engines, which move the plant between two samples, for one simulation or for many at once.
+"""Engines advance the plant from one sample to the next, for one simulation or for many at once.
 
 The plant has the state s = [positions; velocities v; states of the hands' impedances], external forces w and forces f
 that are fed back. A step lasts h seconds.
@@ -17,8 +17,8 @@ MuJoCo's own integrators step between two exact half steps, in which impedance a
 are fixed (Strang splitting). The splitting is of second order in the step and generates no energy.
 
 All engines read their inputs from a row of a step buffer and write the next row. With a timing (controller.delay)
-every tick has its own length and latch times. If forces latch late, the plant's state ends with the forces that the
-actuators hold.
+every tick has its own length and latch times. If forces latch late, the last entries of the plant's state are the
+forces that the actuators hold.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class _Exact:
 
 
 class ExactEngine(_Exact):
-    """One matrix product per period, for one plant, or for a stack whose plant j moves simulation j of the buffer."""
+    """An engine with one matrix product per period, for one plant or a stack (plant j moves simulation j)."""
 
     def __init__(self, plant: HeldPlant) -> None:
         self._plant = np.concatenate([plant.A, plant.B], axis=-1)
@@ -250,6 +250,7 @@ class _Access:
         return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
 
     def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+        """Return a function that makes MuJoCo's steps between half steps of the impedances."""
         ctrl, move_by, T = self.ctrl, self._move_by, self.T
 
         def advance(k: int) -> None:
@@ -336,7 +337,7 @@ class _Access:
 
 
 class MujocoEngine:
-    """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
+    """An engine for one simulation in one MjData, which a viewer can show; MuJoCo's ctrl holds the inputs."""
 
     def __init__(
         self, scene: Scene, T: float, integrator: str = "RK4", substeps: int | None = None, timing: Timing | None = None
@@ -431,7 +432,7 @@ class MujocoEngine:
 
 
 class MujocoBatchEngine:
-    """All simulations of a buffer in one mujoco.batch.Batch, one for every set of humans.
+    """An engine for all simulations of a buffer, one per set of humans, in one mujoco.batch.Batch.
 
     Each simulation has the same bits as in MujocoEngine, except with the exponential integrator or with impedances:
     their matrix products are summed in another order and differ by rounding.
@@ -493,7 +494,7 @@ class MujocoBatchEngine:
 
 @lru_cache(64)  # Successive runs often have the same plant.
 def _step_of(plant: Plant, n: int, h: float) -> Array:
-    """Return the step from [s; qacc] to s after h seconds, for one plant with n joints."""
+    """Return the matrix that takes [s; qacc] to s after h seconds, for one plant with n joints."""
     stacked = _stacked(plant)
     return exponential_step(stacked.A, h, n, stacked.felt)[0]
 
@@ -519,7 +520,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Return the product of each matrix of a stack with its column; a single matrix multiplies all columns."""
+    """Return a function that multiplies column j by matrix j; a single matrix multiplies all columns."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 

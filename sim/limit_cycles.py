@@ -1,4 +1,4 @@
-"""Limit cycles of loops in human hands: eigenvalues for every human, and MuJoCo for the worst human.
+"""Search for limit cycles of devices in human hands: eigenvalues for every human, MuJoCo for the worst human.
 
 A cell of a Z-width map has a force map F and a process that computes it. `HeldDevices` closes F around the devices in
 the hands of every human and gives the growth of the dominant mode; here a human is a set of hands, one for each device.
@@ -33,7 +33,7 @@ Cells = NDArray[np.intp]
 
 
 _MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes decay slowly and would hide one about to grow
-_LEADING = 0.1  # share of the humans who are tried first; the others are tried in cells that are stable with all these
+_LEADING = 0.1  # share of the humans who are tried first; the others only in cells that are stable with all of these
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class HeldDevices:
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Return the growth (n,) [1/s] of the dominant mode, and of the dominant fast mode, with every human.
+        """Return the growth (n,) [1/s] of the dominant mode and of the dominant fast mode of F with every human.
 
         A fast mode has at least `min_frequency_hz`. Humans for which `humans` (n,) is false are skipped; their growth
         is -inf.
@@ -119,7 +119,7 @@ class HeldDevices:
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
         """Return a mask (n,) of a tenth of the humans, at least 8.
 
-        First come those who are unstable with most of the force maps `some`, then the least damped.
+        First come those who are unstable with most of the force maps `some`, then those whose loops grow fastest.
         """
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
@@ -143,8 +143,8 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating. The plant starts in the mode of that human, with the motor or
-# handle that moves most at _START. A process with walls or a limiter starts at rest, any other in the mode. The hand
+# whose exact linear loop is nearest to oscillating. Plant and process start in that human's mode, in which the
+# motor or handle that moves most is displaced by _START; a process with walls or a limiter starts at rest. Each hand
 # presses with a force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
 
 
@@ -152,7 +152,7 @@ _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the hand's force grows to its constant value
 _START = 1e-3  # [m] initial displacement of the motor or handle that moves most
-_BLOCK = 64  # ticks in one block
+_BLOCK = 64  # ticks between two calls of `progress`
 DECIDED = 0.2  # [1/s] a linear growth rate closer to zero than this cannot be seen within a trace
 UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear growth is nearer to zero than DECIDED
 

@@ -21,7 +21,7 @@ from haptic_loop.sim.stability import MARGINAL
 from haptic_loop.sim.zwidth import MODEL_KEPT, Map
 from haptic_loop.sim.zwidth_report import MapReport
 
-_STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
+_STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # colours of areas
 
 #: lines in the order of drawing: dashed lines are drawn over solid ones, so that both are visible where they coincide
 _LINES: dict[str, dict[str, Any]] = {
@@ -77,7 +77,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
-        # On the edge the required damping equals the available one; `clip` keeps values far from the edge finite.
+        # On the edge the required damping is 1 - GUARD of the available one; `clip` keeps values far from it finite.
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:
@@ -151,5 +151,5 @@ def _title(report: MapReport) -> str:
 
 
 def _list(values: Sequence[float]) -> str:
-    """Write the numbers, or one number if all are equal."""
+    """Return the numbers as text, or one number if all are equal."""
     return ", ".join(f"{v:g}" for v in (values if len(set(values)) > 1 else values[:1]))

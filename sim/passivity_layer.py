@@ -2,9 +2,9 @@
 
     figures = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
-A net is such a layer. With a net, the linear block of a tick does not contain the delays Theta. The budget scales the
-forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces them by forces of the user's
-environment. Both send their forces through a delay line, for constant and for varying delays.
+The code calls such a layer a net. With a net, the linear block of a tick does not contain the delays Theta. The budget
+scales the forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces them by forces of the
+user's environment. Both send their forces through a delay line, for constant and for varying delays.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class EnergyNet:
 class Plugged:
     """A user's function in place of the environment, behind the coupling and a shell that makes it passive."""
 
-    force: Callable[[Array], Array]  # positions of its port at zero force, (m,) [m] -> force (m,) [N]
+    force: Callable[[Array], Array]  # positions (m,) [m] that its port would have without force -> forces (m,) [N]
     start: float = 0.0  # W0 [J]
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
@@ -78,9 +78,9 @@ class Plugged:
         """Return a fresh shell for `nsim` runs. Raises ValueError if no shell fits the loop, or for a wrong `start`."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
-            raise ValueError("an environment of your own needs a coupling with a compliance V before it")
+            raise ValueError("your own environment needs a coupling with a compliance V")
         if (process.encoder_step > 0).any():
-            raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
+            raise ValueError("your own environment needs ideal encoders: no shell is known for encoder steps")
         return _Shelled(Shell(V, start=self.start, nsim=nsim), self, process)
 
 
@@ -93,7 +93,7 @@ def claim(assessment: Assessment) -> str:
 
 
 class Wanted(Protocol):
-    """The settings of a net: EnergyNet, Plugged, sim.world.Touched, or a class of your own."""
+    """The settings of a net: EnergyNet, Plugged, sim.world.Touched, or a user's own class."""
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """Return a new net for `nsim` runs that are simulated together."""
@@ -136,7 +136,7 @@ def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: Bu
         for each in anywhere
     ):
         return None
-    return f"it never acts from rest: certified for any environment with {100 * EPS:g} % of the damping to spare"
+    return f"it never acts from rest: the certificate for any environment leaves {100 * EPS:g} % of the damping"
 
 
 class _InLoop:

@@ -87,7 +87,7 @@ def _arrange(figure: Figure, axes: Any) -> None:
     )
 
 
-_MARGIN, _TITLE = 0.12, 0.22  # [inch] around panels, labels and legends; height of a line of a title
+_MARGIN, _TITLE = 0.12, 0.22  # [inch] margin around panels, labels and legends; height of a line of a title
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
@@ -496,7 +496,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
-    """Plot errors of position and growth rate over computing time, one line per integrator; a cross: wrong verdict."""
+    """Plot position and growth-rate errors over computing time, by integrator; crosses mark wrong verdicts."""
     errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
     figure, axes = _panels("error over computing time (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
     names = list(dict.fromkeys(row.integrator for row in rows if row.integrator))
@@ -616,7 +616,7 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
                 axis.plot(hz, getattr(values, key)[:, i], label=name, **style)
             axis.axhline(0.0, color="black", linewidth=0.7)
             axis.set_xscale("log")
-            # A symmetric logarithm, which is linear around zero up to the power of ten below the median size.
+            # The scale is linear around zero up to the power of ten below the median size, and logarithmic beyond.
             sizes = np.abs([getattr(values, key)[:, i] for _, values, _ in curves])
             typical = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
             axis.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(typical)))

@@ -37,7 +37,7 @@ from haptic_loop.sim.trace import Trace
 def friction_left_out(devices: Sequence[Device]) -> list[str]:
     """Return a remark for each device whose friction has a published upper bound only."""
     return [
-        f"Friction of device #{i}: at most {device.friction_max:g} N (published), not simulated and not relied upon."
+        f"Friction of device #{i}: at most {device.friction_max:g} N (published); no simulation or proof uses it."
         for i, device in enumerate(devices, start=1)
         if device.friction_max is not None and not np.any(device.friction)
     ]
@@ -53,7 +53,7 @@ _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A number of the paper and its value computed here."""
+    """A number of the paper, its value computed here, and the reason of the difference."""
 
     what: str
     paper: str
@@ -110,12 +110,12 @@ def _figure(case: str, stability: Stability) -> PaperRow:
 
 @dataclass(frozen=True)
 class DelaySpan:
-    """The range of delays and the pattern within it."""
+    """The range of delays [samples] and the pattern within it."""
 
     lo: tuple[int, ...]
     hi: tuple[int, ...]
     pattern: str
-    loss: float
+    loss: float  # probability that a packet is lost
     playout: bool  # whether a buffer in the device makes the delay hi
     constant: bool  # whether every force has the delay theta
 
@@ -135,7 +135,7 @@ class _Age:
 
 @dataclass(frozen=True)
 class _PeriodGrowth:
-    """Growth over one period of the worst switching found."""
+    """Growth over one period of the worst switching that was found."""
 
     ticks: int
     growth_rate_per_s: float

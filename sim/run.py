@@ -1,9 +1,9 @@
-"""Runs: the loop of a scenario's controller and plant, closed tick by tick.
+"""Run the loop of a scenario's controller and plant, tick by tick.
 
     trace = run(assemble(scenario, coupling), "mujoco")
 
 A tick samples the positions, computes the forces, limits and holds them, and advances the plant by T: see
-controller.tick for the order of these steps and sim.engines for what advances the plant.
+controller.tick for the order of these steps, and sim.engines for the last one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from haptic_loop.sim.trace import Trace
 ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, an engine, or a class or function that makes one
 
-_Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
+_Outside = Callable[[int, int], Array]  # (first tick, ticks) -> external forces (ticks, external inputs) [N]
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 
@@ -65,11 +65,11 @@ _AHEAD = 8  # number of blocks for which outside forces are sampled together
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Engine, integrator and steps; None for the default of the plant."""
+    """Engine, integrator and steps; None means the default for the plant."""
 
     engine: AnyEngine = "mujoco"
-    integrator: str | None = None  # of MuJoCo
-    substeps: int | None = None  # per period
+    integrator: str | None = None  # name in sim.engines.INTEGRATORS
+    substeps: int | None = None  # integrator steps per period
     error: float | None = None  # allowed relative rms error of positions, for which the cheapest setting is chosen
 
 
@@ -116,7 +116,7 @@ class Simulation:
     def held_by(
         self, humans: tuple[Hand, ...], persons: tuple[Person, ...], mechanics: Sequence[Mechanics] = ()
     ) -> Simulation:
-        """Return the simulation with other hands; `mechanics` replaces the mechanics of the devices, if given."""
+        """Return the simulation with other hands; `mechanics`, if not empty, replaces the devices' mechanics."""
         devices = self.scenario.device
         if mechanics:
             devices = tuple(map(Mechanics.of, mechanics, devices))
@@ -282,7 +282,7 @@ def run_blocks(
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
     buffer.s[0] = start
-    # A diverging run is reported without warnings.
+    # The trace reports divergence, so warnings are suppressed.
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
         if not callable(getattr(engine, "advance", None)):
@@ -322,7 +322,7 @@ def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array
 def outside_forces(
     scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True, timing: Timing | None = None
 ) -> Array:
-    """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, outside).
+    """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, external inputs).
 
     The voluntary force acts on the end of each human, the tap on one handle. Raises InputError for a voluntary force
     of wrong shape, or one that is not finite.

@@ -50,7 +50,7 @@ class Ran:
     scenario_digest: str
     encoder_step_m: Array
     steady_ticks: list[list[int]]  # [first, stop] of the ticks before the first clipped one
-    environment: str
+    environment: str  # name of the environment that ran
     unsolved: int  # number of times that limited forces were set to 0 because no solution was found
 
 
@@ -60,7 +60,7 @@ class RunReport:
 
     case: str
     scenario: str
-    kind: str  # of the coupling
+    kind: str  # kind of the coupling
     chosen: Chosen = off_table("left out")
     assessment: Assessment
     encoder: EncoderSteps | None
@@ -101,7 +101,7 @@ class RunReport:
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            # The other reason explains tau, which only JSON has.
+            # Any other reason explains tau, which only the JSON shows.
             "transparency": transparency and transparency.relative_mismatch == 0 and transparency.reason,
             "credible": self.credible.reason,
             **{name: part.reason for name, part in certificates.items()},

@@ -95,7 +95,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
-    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; above every latency
+    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; latencies are shorter
     period: Periods | None = None  # the simulated periods; the coupling is computed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 
@@ -302,7 +302,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def longest_period(self) -> float | None:
-        """The period that certificates must cover: T_max, or the longest simulated one; None where all are T."""
+        """The period that certificates must cover: T_max, or the longest simulated one; None if every period is T."""
         if self.T_max is not None or self.period is None:
             return self.T_max
         return max(self.period.longest, self.T)
@@ -341,7 +341,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        newer = {"T_max", "T_min", "latency", "period"}  # left out where not given, so that old digests stay valid
+        newer = {"T_max", "T_min", "latency", "period"}  # left out if None, so that old digests stay valid
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
         if self.unit == "m":
             del contents["unit"], contents["radius"]
@@ -352,7 +352,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
-        """Return Lambda of a case: `lam` if given, else 0 in case II and theta + psi otherwise. Raises InputError."""
+        """Return Lambda of a case: `lam` if set, else 0 in case II and theta + psi otherwise. Raises InputError."""
         if case not in CASES:
             raise InputError(f"case is {case!r}, allowed are {', '.join(CASES)}")
         if self.lam is not None:
@@ -578,9 +578,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
     """Return the humans of a file: measured hands (A, B, C, D) and chains."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     if people.population is not None:
-        raise InputError(
-            f"{source}: [population] belongs into a scenario; a file of humans has [[human]] and [[person]]"
-        )
+        raise InputError(f"{source}: [population] belongs in a scenario; a file of humans has [[human]] and [[person]]")
     humans = []
     for i, human in enumerate(people.human, start=1):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
@@ -598,7 +596,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 def _own_humans(text: str) -> _HumanFile:
     """Return the people of FILE.py:NAME.
 
-    NAME is a list of hands and persons, a population with draw(rng, n), or a function or class that gives one of these.
+    NAME is a list of hands and persons, a population with draw(rng, n), or a function or class that makes one of them.
     """
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
@@ -608,7 +606,7 @@ def _own_humans(text: str) -> _HumanFile:
             raise ValueError("draw(rng, 2) does not return two humans")
         return _HumanFile((), (), people)
     if not isinstance(people, list | tuple):
-        raise ValueError(f"it is {people!r}, neither a list of hands nor a population with draw(rng, n)")
+        raise ValueError(f"the value is {people!r}, neither a list of hands nor a population with draw(rng, n)")
     persons = tuple(person for person in people if isinstance(person, Person))
     return _HumanFile(_checked_own(tuple(hand for hand in people if not isinstance(hand, Person))), persons)
 
@@ -677,7 +675,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 def _require_keys(raw: dict[str, Any]) -> None:
     """Raise ValueError if a key is missing that every scenario or every rotary device needs.
 
-    Missing keys of a scenario pass here if the file has unknown keys, because `msgspec.convert` reports these.
+    Missing keys of a scenario pass here if the file has unknown keys, because `msgspec.convert` reports unknown keys.
     """
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
@@ -718,7 +716,7 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
-    """Place the points of the environment in space if devices have several axes. Raises ValueError."""
+    """Give each point of the environment a node per axis if devices have several axes. Raises ValueError."""
     devices, table = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
@@ -921,7 +919,7 @@ def _lists(value: Any) -> Any:
 
 
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))  # stands for a human of a user's own class while other fields are checked
-_TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's own hand is tried
+_TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's own hand is tested
 
 
 def _is_own(name: str, value: Any) -> bool:
@@ -949,7 +947,7 @@ def _checked_own(value: Any) -> Any:
 
 
 def _given_fields(device: Device) -> dict[str, Any]:
-    """Return the fields of a device, but newer ones only if they are not default, so that old digests stay valid."""
+    """Return the fields of a device, without newer ones of default value, so that old digests stay valid."""
     fields = msgspec.to_builtins(device)
     for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
         if fields.get(name) == default:

@@ -1,4 +1,4 @@
-"""What a picture of a run shows. sim.plots draws it, possibly in another process (cli.painter)."""
+"""The data that a picture of a run shows. sim.plots draws it, possibly in another process (cli.painter)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Run(Protocol):
 
 
 class Signals(NamedTuple):
-    """A Run without the rest of its trace, for another process."""
+    """The signals of a Run alone, which are sent to another process."""
 
     t: Array
     x: Array
@@ -58,5 +58,5 @@ class Onset:
     """The onset of an oscillation: its predicted growth, and the time up to which the run is credible."""
 
     growth: float | None  # [1/s] predicted by the eigenvalues; None where nothing grows
-    steady: int  # ticks before the first clipped one
+    steady: int  # number of ticks before the first clipped one
     until: float | None = None  # [s] at which the motion leaves the devices' credible limits; None if it never does

@@ -56,7 +56,7 @@ def disagree(exact: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """xi+ = A xi + B w with xi = [plant state s; process state z] and w the outside forces."""
+    """xi+ = A xi + B w with xi = [plant state s; process state z] and external forces w."""
 
     A: Array  # (..., n, n)
     B: Array  # (..., n, outside)
@@ -216,7 +216,7 @@ class Ringing:
 
     @property
     def words(self) -> str:
-        """One row of a report."""
+        """The figures as the text of a report's row."""
         speed = f"{'grows' if self.decay_per_s < 0 else 'decays'} {abs(self.decay_per_s):.4g} 1/s"
         slowest = f"{speed} at {self.frequency_hz:.2f} Hz, damping ratio {self.damping_ratio:.4f}"
         if self.least_damping_ratio == self.damping_ratio:
@@ -259,7 +259,7 @@ def _measured_growth(
 ) -> tuple[float | None, str | None]:
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
-    The projection y = left* xi contains the dominant mode alone. With the known outside force subtracted,
+    The projection y = left* xi contains the dominant mode alone. With the known external force subtracted,
     y[k+1] - left* B w[k] = lambda y[k]. A least-squares fit gives lambda. The fit ends `ahead` ticks before the first
     clipped tick, because a limiter acts that long before its force arrives.
     """
@@ -304,7 +304,7 @@ class Eigenvalues(ExactVerdict):
 
 @dataclass(frozen=True, kw_only=True)
 class _Frozen(ExactVerdict):
-    """The linear loop in which exactly these walls touch."""
+    """The verdict of the linear loop in which exactly the walls `touching` touch."""
 
     touching: list[int]  # counted from 1
 
@@ -342,7 +342,7 @@ def _exact(mode: Mode) -> dict[str, Any]:
 
 
 def stability_of(simulation: Simulation, trace: Trace) -> Stability:
-    """Return the verdict on a run."""
+    """Return the verdict on a run by its trace and by eigenvalues."""
     contact = _contact(simulation, trace) if simulation.process.walls else None
     decided: str | None = None
     if contact and contact.ticks:
@@ -363,7 +363,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
         growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead, simulation.process.balls)
         decided = None if growth is None else verdict(growth)
     if trace.diverged:
-        reason = "the simulation left the range of finite numbers: reported as unstable"
+        reason = "the simulation left the range of finite numbers, so it is reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
     decision = "unstable" if trace.diverged else decided
     seconds = len(trace.f) * simulation.scenario.T
@@ -408,7 +408,7 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 # Every axis of every handle is pushed once, from rest at x = 0, and then left alone. Sums are accumulated while the
 # simulation runs, so that no trace is kept.
 
-_IMPULSE = 10e-3  # [s]
+_IMPULSE = 10e-3  # [s] duration of the push
 _TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls; a hand of 0.3 kg then swings over a few centimetres
 _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the engine
 
@@ -438,8 +438,8 @@ class Balance:
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
         """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None.
 
-        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. Longer ones
-        would dissipate less than the multiplier Q of a certificate for a range of latencies (design.facts.Latency).
+        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. For longer
+        parts this bound would be below that of a certificate for a range of latencies (Q in design.facts.Latency).
         """
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
@@ -476,7 +476,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces [N], (ticks, outside), of 10 ms or one tick: `size` on channel 1, -1/2 of it on 2, 1/3 on 3, .."""
+    """Return forces [N], (ticks, outside), that last 10 ms or a tick: `size` on channel 1, -size/2 on 2, size/3 on 3, .."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

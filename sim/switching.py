@@ -38,7 +38,7 @@ from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, unstable
 
 _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
-_LONGEST_PERIOD = 250  # [ticks] of a searched window
+_LONGEST_PERIOD = 250  # [ticks] largest length of a searched window
 _STARTS = 6  # number of windows of the greedy sequence
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
 _SHORTEST = 4  # least number of ticks, because a growth rate compares quarters of the trace
@@ -187,8 +187,8 @@ _LONGER = 5  # factor of the duration of a second trace, for hands whose rate is
 class Switched:
     """The growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
-    exact: Array  # of the linear loop
-    mujoco: Array  # of the other engine's trace; nan without that engine, or if a force reached its limit
+    exact: Array  # growth of the linear loop
+    mujoco: Array  # growth of the other engine's trace; nan without that engine, or if a force reached its limit
 
 
 def switched_crowd(
@@ -289,7 +289,7 @@ class DelaysCovered:
             words = f"certified for switching delays in this environment ({proof}): {cover}{losses}"
             return cls(not lossy, words, figures, on_file)
         buffered = figures.playout is not None and figures.playout.certified
-        verdict = "for which it is certified" if buffered else "for which it is not certified either"
+        verdict = "for which the coupling is certified" if buffered else "which no certificate covers either"
         constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
         advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
         words = f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}"

@@ -119,7 +119,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest frequency from 10 Hz up in the last quarter of the forces; None if short or calm."""
+        """Return the strongest frequency >= 10 Hz in the last quarter of the forces; None for a short or calm trace."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -130,7 +130,7 @@ class Trace(ReadOnly):
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
     def to_frame(self) -> Any:
-        """Return a pandas data frame with the index "t [s]" and columns as "x1 [m]", "f1 [N]", or "x left.y [m]".
+        """Return a pandas data frame with the index "t [s]" and columns such as "x1 [m]", "f1 [N]" or "x left.y [m]".
 
         Raises:
             ImportError: pandas is not installed.
@@ -175,7 +175,7 @@ class Trace(ReadOnly):
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of the trace's file: signals, the metadata as JSON text, and the channels' names if any."""
+        """The arrays of the trace's file: signals, the metadata as JSON text, and the names of named channels."""
         signals = {name: getattr(self, name) for name in _MEASURED}
         names = {"names": np.array(self.names)} if self.names else {}
         return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
@@ -226,7 +226,7 @@ class Trace(ReadOnly):
 
 # ---- octaves, and lasting oscillations
 
-_PERIODS = 4  # least periods of an octave in a window; with fewer the window function mixes neighbouring octaves
+_PERIODS = 4  # least number of periods of an octave in a window; with fewer the window mixes neighbouring octaves
 _TREND = 7  # degree of the subtracted polynomial, which leaves 1 um of a motion of 15 mm at 0.6 Hz in 1 s
 SUSTAINED = 0.95  # least ratio of a lasting oscillation's amplitude in the last window to that in the first
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
@@ -367,8 +367,8 @@ class _Lines(NamedTuple):
     octaves: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m] of each
     brief: bool  # an oscillation is seen in some window; in too few windows for a rate if `octaves` is empty
     gone: bool  # no oscillation is seen in the last window
-    floor: float  # [m] least amplitude that the encoders' rounding explains in no octave
-    slowest: float  # [Hz]
+    floor: float  # [m] least amplitude that is above the encoders' rounding in every octave
+    slowest: float  # [Hz] slower oscillations are not seen
 
 
 def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
@@ -422,7 +422,7 @@ def growths(trace: Trace) -> list[Growth]:
             "the trace's run.steady_ticks are no pairs of ticks, or run.encoder_step_m has no number per channel"
         ) from None
     if np.any(ends[:, 0] < 0) or np.any(ends[:, 1] > n) or np.any(ends[:, 0] > ends[:, 1]):
-        raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, but it has {n} ticks")
+        raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, but the trace has {n} ticks")
     if not all(np.isfinite(values).all() for values in (trace.t, trace.x, steps)):
         raise InputError("the trace has times, displacements or encoder steps that are not finite")
     if not m or np.abs(trace.x).max(initial=0.0) > _FARTHEST:

@@ -30,7 +30,7 @@ class Unstable:
     exact: int
     mujoco: int | None
     own: int | None = off_table("if given", None)  # by a user's own engine
-    others: str = off_table("left out", "")
+    others: str = off_table("left out", "")  # the other engine's count and name
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
@@ -49,7 +49,7 @@ class Unstable:
 class EnvironmentsMet:
     """The environments of the loops, and those in which a loop was unstable."""
 
-    of: str
+    of: str  # "the nominal environment" or "the ranges"
     count: int
     names: list[str] | None = off_table("if given", None)
     unstable_in: list[str] | None = off_table("if given", None)
@@ -194,7 +194,7 @@ class Traces:
 
     def settled(self) -> str:
         undecided = "" if self.settling_decides else f"; no verdict: {self.reason}"
-        return f"{self.stable_and_settling} of {self.stable} stable loops slower at the end{undecided}"
+        return f"{self.stable_and_settling} of {self.stable} stable loops have slower handles at the end{undecided}"
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class EnergyAudit:
         return cls(int(unclipped.sum()), int((~unclipped).sum()), violated, least, not violated)
 
     def __str__(self) -> str:
-        left = f", {self.clipped} clipped left out" if self.clipped else ""
+        left = f", {self.clipped} clipped traces left out" if self.clipped else ""
         return f"{self.audited - self.violated} of {self.audited}{left}"
 
 

@@ -188,13 +188,13 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """The settings of a net that puts the scenario's world behind the coupling and the energy shell."""
+    """The settings of a net (sim.passivity_layer) that puts the scenario's world behind coupling and energy shell."""
 
     start: float = START_J  # W0 [J]
     gravity: bool = True  # False switches the scene's gravity off
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> InWorld:
-        """Make a new net. Raises InputError."""
+        """Return a new net for `nsim` runs. Raises InputError if the loop cannot contain a world."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None or not V.D.any():
             raise InputError(f"environment.world needs a coupling: {_no_spring(simulation.coupling)}")
@@ -244,7 +244,7 @@ class InWorld:
     """A world, its shell, and the energy that hands and devices received."""
 
     def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
-        """`damping` (m, m) [N/m] is Delta over the longest period: devices dissipate dx' damping dx a tick or more."""
+        """`damping` (m, m) [N/m] is Delta over the longest period: devices dissipate at least dx' damping dx a tick."""
         self.ports, self._shell, self._damping = ports, shell, damping
         m, nsim = len(damping), len(ports)
         self._x: Array | None = None

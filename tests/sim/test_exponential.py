@@ -260,7 +260,8 @@ def test_the_default_follows_from_the_scene(simulation):
     assert default_substeps(stiff(1.45e6), "RK4") == 32
     assert _check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
     assert _check_substeps(rubbing, EXPONENTIAL, 8) == [
-        "exponential x 8: of first order with friction; RK4 is more accurate at equal cost (see --cross-check)."
+        "exponential x 8: with friction its error is of first order; RK4 is more accurate at equal cost "
+        "(see --cross-check)."
     ]
     assert default_substeps(rubbing, EXPONENTIAL) == 4
 

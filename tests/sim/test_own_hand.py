@@ -310,7 +310,7 @@ def test_files_define_measured_hands_and_populations(tmp_path):
     for name, message in [
         ("none", "draw(rng, 2) does not return two humans"),
         ("wrong", "human #1 is 1, expected a Human"),
-        ("number", "it is 1, neither a list of hands"),
+        ("number", "the value is 1, neither a list of hands"),
     ]:
         with pytest.raises(InputError) as caught:
             _load_humans(f"{python}:{name}", 2)

@@ -377,7 +377,7 @@ def test_published_friction_reaches_a_scenario_as_a_bound(name, most, kind):
     listed = f'{{ device = "{name}", kind = "{kind}", damping = 0.5 }}'
     scenario = parse(FALCON.format(device=f'[{listed}, "omega.3"]'))
     assert [(d.friction, d.friction_max) for d in scenario.device] == [(0.0, most), (0.0, None)]
-    remark = f"Friction of device #1: at most {most:g} N (published), not simulated and not relied upon."
+    remark = f"Friction of device #1: at most {most:g} N (published); no simulation or proof uses it."
     assert friction_left_out(scenario.device) == [remark]
 
 
