@@ -476,7 +476,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces [N], (ticks, outside), that last 10 ms or a tick: `size` on channel 1, -size/2 on 2, size/3 on 3, .."""
+    """Return forces [N] of 10 ms or one tick, (ticks, outside): `size` on channel 1, -size/2 on 2, size/3 on 3, .."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

@@ -49,7 +49,7 @@ from haptic_loop.sim.stability import MARGINAL
 # Sweeps over K and B.
 
 
-MODEL_KEPT = "model kept"  # pseudo-condition of `EnvironmentSweep`
+MODEL_KEPT = "model kept"  # the second case of `EnvironmentSweep`, listed beside the conditions
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class _Sweep(ABC):
 
     @property
     def decisive(self) -> str:
-        """The name of the condition that judges the couplings of --mark."""
+        """The name of the condition that must hold at every point of --mark."""
         return (self.own or THIS_ENVIRONMENT).name
 
     def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
@@ -97,14 +97,14 @@ class _Sweep(ABC):
 
 @dataclass(frozen=True, eq=False)
 class CouplingSweep(_Sweep):
-    """A sweep over K and B of the coupling, on every channel. Raises ValueError with the name of a wrong field."""
+    """A sweep over the K and B that every channel of the coupling has. Raises ValueError with the name of a wrong field."""
 
     def __post_init__(self) -> None:
         check_loop(self.loop)
 
     @property
     def usual_scale(self) -> str:
-        """Linear against a rigid wall, else logarithmic, because far stiffer couplings can be safe."""
+        """Linear against a rigid wall; else logarithmic, as couplings far above `stiffness_scale` can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
@@ -314,7 +314,7 @@ class _Grid:
 
     @property
     def flat(self) -> tuple[Array, Array]:
-        """K and B of every cell, (n n,): B runs fastest."""
+        """K and B of every cell, (n * n,) each: B runs fastest."""
         K, B = np.meshgrid(self.K, self.B, indexing="ij")
         return K.ravel(), B.ravel()
 
@@ -383,7 +383,7 @@ class Map:
     growth: Array  # [1/s] worst over the tried humans; all humans are tried if no leading one is unstable
     unstable: Array  # number of tried humans that make the cell unstable
     points: limit_cycles.Points
-    seconds: dict[str, float]  # of each stage
+    seconds: dict[str, float]  # wall time of each stage
     interrupted: bool
 
 
@@ -485,7 +485,7 @@ def _in_slices(
 
 _COLUMNS = 4  # columns at which the map's edge is compared with a bisection on single sweeps
 _STEPS = 48  # stiffnesses between the softest and the stiffest of map and mark that are tried to find the edge
-_HALVINGS = 20  # bisections, which give an edge of the population to a relative 1e-6
+_HALVINGS = 20  # bisections, which give an edge of the population with a relative error below 1e-6
 
 
 @dataclass(frozen=True)
@@ -496,7 +496,7 @@ class Mark:
     B: float
     requirement: dict[str, Requirement]
     growth: float  # [1/s] worst over the population
-    unstable: int  # humans
+    unstable: int  # number of humans that make the loop unstable
     stiffest: dict[str, float | None]  # by condition, and "population"
 
 

@@ -29,7 +29,7 @@ _NOT_REACHED = "not reached before the interruption"
 class _Ratio:
     """The figures of one condition over the cells."""
 
-    required_over_available: Array  # (rows, columns)
+    required_over_available: Array  # (rows, columns) of the grid
     certified_cells: int
     contradicted_cells: int | None = off_table("if given")  # certified, but unstable with a human of the population
     reason: str | None = off_table("if given")
@@ -50,7 +50,7 @@ class _Population:
 
 @dataclass(frozen=True)
 class Shown:
-    """The nonlinear effects of the simulated points."""
+    """The nonlinear effects in the simulation of the points."""
 
     encoder_step_m: list[float]
     friction_n: list[float]
@@ -72,7 +72,7 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Marked:
-    """The report of a --mark."""
+    """The report of a point of --mark."""
 
     K: float
     B: float
@@ -116,7 +116,7 @@ class FixedCoupling:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The cells: rows are stiffnesses."""
+    """The cells: rows are stiffnesses K [N/m], columns are dampings B [N s/m]."""
 
     K: Array
     B: Array
@@ -132,7 +132,7 @@ class _Simulated:
     duration_s: float
     press_n: float
     threshold_m: float
-    from_hz: float
+    from_hz: float  # lowest frequency of an oscillation that is seen
     points: list[_Point]
     oscillate: int
     undecided: int
@@ -180,7 +180,7 @@ class MapReport:
     grid: _Grid
     population: _Population
     simulation: _Simulated
-    holds: bool
+    holds: bool  # every mark is certified, and no result contradicts another
     interrupted: bool
     wall_s: dict[str, float]
     axes: str  # whether K and B belong to the "coupling" or the "environment"
