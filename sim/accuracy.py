@@ -6,7 +6,7 @@ settings on a scene, and `pick` chooses the cheapest one within a given error. `
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("accuracy")

@@ -8,7 +8,7 @@ controller.tick for the order of these steps, and sim.engines for the last one.
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("run")

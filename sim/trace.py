@@ -14,7 +14,7 @@ growth        How fast does an oscillation grow? If it grows like exp(g t), the 
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("trace")

@@ -9,7 +9,7 @@ and walls of the scenario.
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does not need
+if __name__ == "__main__":  # This precedes the imports, because --help does not need them.
     from haptic_loop.cli.main import door
 
     door("zwidth")
@@ -97,7 +97,7 @@ class _Sweep(ABC):
 
 @dataclass(frozen=True, eq=False)
 class CouplingSweep(_Sweep):
-    """A sweep over the K and B that every channel of the coupling has. Raises ValueError with the name of a wrong field."""
+    """A sweep over K and B, which all channels of the coupling share. Raises ValueError naming a wrong field."""
 
     def __post_init__(self) -> None:
         check_loop(self.loop)

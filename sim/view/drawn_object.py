@@ -1,7 +1,7 @@
 """The virtual object in pictures: its masses, springs and walls, and the positions of its nodes at each tick.
 
-The displacements of the nodes are computed in addition to the loop and do not affect it. They are further outputs of
-the equations that give the forces of a tick before the delays Theta.
+The displacements of the nodes are computed in addition to the loop and do not affect it. The
+equations of a tick, before the delays Theta, give them as further outputs beside the forces.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class DrawnObject:
     """A network with a position for each of its points, left of the devices."""
 
     network: Network
-    rest: dict[str, Array]  # (3,) [m] of each point at rest
-    contacts: tuple[str, ...]  # points, one per device
+    rest: dict[str, Array]  # position (3,) [m] of each point at rest
+    contacts: tuple[str, ...]  # the points that devices touch, one per device
 
     @classmethod
     def of(cls, network: Network) -> DrawnObject:
@@ -144,7 +144,7 @@ class _Motion:
         if coupling.compliance(T) is not None:  # Otherwise the contacts coincide with the devices.
             late = Lti.diag(delay(psi, T), Lti.constant(np.eye(further), T))
             G = Coupling.around(coupling, late @ G, further)
-        self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # [x; forces on nodes] -> [f; nodes]
+        self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # from [x; forces on nodes] to [f; nodes' places]
         self._tick = self._law.transition()
         ports, order = self._law.channels, self._law.open.order
         self._before, self._after = np.zeros((order + ports, 1)), np.zeros((ports + order, 1))

@@ -302,7 +302,7 @@ def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The contents of one picture."""
+    """The data of one picture."""
 
     t: float  # [s] simulated time
     q: Array  # (n,) positions of all joints [m], motors first
@@ -459,7 +459,7 @@ class LiveLoop:
         self._tick += count
         if not (np.isfinite(buffer.s[: count + 1]).all() and np.isfinite(buffer.z[: count + 1]).all()):
             self._happen(_Restart())
-            self._note = "the loop diverged until numbers overflowed: restarted from rest"
+            self._note = "the loop diverged until numbers overflowed, so it restarts from rest"
             return
         f = buffer.f[:count, :, 0]
         limits = buffer.process.force_limit, buffer.process.balls

@@ -2,8 +2,8 @@
 
 The window is MuJoCo's passive viewer, which shows the frames of a session and passes keys and mouse to the session. The
 window shows a copy of a world's scene, or of the devices' scene with other shapes. These shapes have no mass and
-collide with nothing, so that both models have the same matrices. Pillow draws the pictures of a film; MuJoCo renders
-the scene of a world in them. Pillow writes a GIF, and ffmpeg an MP4.
+collide with nothing, so that the copy has the matrices of the simulated scene. Pillow draws the pictures of a film;
+MuJoCo renders the scene of a world in them. Pillow writes a GIF, and ffmpeg an MP4.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """Return the place of each joint's body [STEP]: motor -1, handle 0, then the arm, then a person's body."""
+    """Return the place of each joint's body in units of STEP: motor -1, handle 0, arm, then a person's body."""
     place = dict.fromkeys(range(scene.channels), -1)
     for i, points in enumerate(scene.points[: _devices(scene)]):
         place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
@@ -151,14 +151,14 @@ def _limited(prepared: PreparedLoop) -> str:
     assessment = prepared.assessment
     if assessment.guarantee is None:
         return "no guarantee"
-    return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee holds there too"
+    return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee holds there, too"
 
 
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
     """Return the row of the energy shell of a world: its label, and its figures in words."""
     W0, given_mJ, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
     most = (
-        f"gave {given_mJ:.2f} mJ of W0 = {W0:g} plus released {released:.1f}"
+        f"gave {given_mJ:.2f} of at most {W0:g} (W0) + {released:.1f} (released) mJ"
         if prepared.assessment.guarantee
         else "no guarantee"
     )

@@ -209,7 +209,7 @@ def test_a_process_that_runs_away_starts_again():
     assert np.abs(prepared.simulation.F.poles()).max() > 1.6
     running = session(prepared)
     noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
-    assert "the loop diverged until numbers overflowed: restarted from rest" in noted[1]
+    assert "the loop diverged until numbers overflowed, so it restarts from rest" in noted[1]
     assert np.isfinite(running.state).all()
 
 
@@ -398,11 +398,11 @@ def test_the_overlay_says_what_limits_and_shells_do():
         return SimpleNamespace(assessment=SimpleNamespace(guarantee=guarantee, force_limits=SimpleNamespace(rho=rho)))
 
     covered, clipped, none = prepared("here", (0.0,)), prepared("here", None), prepared(None, (0.0,))
-    assert _limited(covered) == "limited: the guarantee holds there too"
+    assert _limited(covered) == "limited: the guarantee holds there, too"
     assert (_limited(clipped), _limited(none)) == ("clipped: not covered", "no guarantee")
     shell = SimpleNamespace(start_J=2e-3, given_J=1.5e-3, released_J=0.1, limited_ticks=3, ticks=500)
     acted = "acted on 3 of 500 ticks, "
-    assert _account(shell, covered) == ("energy shell", f"{acted}gave 1.50 mJ of W0 = 2 plus released 100.0")
+    assert _account(shell, covered) == ("energy shell", f"{acted}gave 1.50 of at most 2 (W0) + 100.0 (released) mJ")
     assert _account(shell, none)[1] == f"{acted}no guarantee"
 
 
