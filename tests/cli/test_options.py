@@ -70,7 +70,7 @@ class Report:
 
 
 def test_a_figure_is_a_field(capsys):
-    """Table and JSON follow the declaration of a field, which has its name and format."""
+    """A field's declaration sets its row in tables, and its name is the key in JSON."""
     reports = [Report("a", 1.0), Report("b", None, False)]
     assert list(render.rows_of(reports[0])) == [("loop", "a"), ("growth [1/s]", "+1.00")]
     assert list(render.rows_of(reports[1])) == [("loop", "b"), ("growth [1/s]", None)]

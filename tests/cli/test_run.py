@@ -121,7 +121,7 @@ def test_impossible_settings_are_refused_before_designs(command, words, monkeypa
 
 
 @pytest.mark.slow
-def test_three_devices_of_ones_own(tmp_path):
+def test_three_own_devices_are_certified(tmp_path):
     code, report = run(tmp_path, "--scenario", "three-rigid", "--no-plot", "--duration", "2")
     assert code == 0
     assert len(report["assessment"]["coupling"]["K"]) == 3
@@ -189,7 +189,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("options", "message"), BAD, ids=[" ".join(o) for o, _ in BAD])
-def test_bad_options(options, message, tmp_path, monkeypatch):
+def test_bad_options_leave_no_files(options, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as caught:
         main(options)
@@ -218,7 +218,7 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
+def test_impossible_designs_exit_with_1(tmp_path):
     one_device = str(Path(__file__).parents[2] / "benchmarks/loops/n3-free1.toml")
     words = ["--scenario", one_device, "--psi", "1", "--delta", "0.1", "--condition", "any-environment"]
     done = forked.run(["python", "-m", "sim.run", *words], tmp_path)

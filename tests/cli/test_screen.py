@@ -37,7 +37,7 @@ def test_numbers_are_whole(width, fold):
     assert "…" not in "".join(lines)
 
 
-def test_a_table_that_fits_is_as_it_was():
+def test_text_wraps_at_the_terminals_width():
     table = Table("a", "b")
     table.add_row("1.5", "some words that wrap where the terminal ends")
     assert max(map(len, printed(table, 40).splitlines())) == 40

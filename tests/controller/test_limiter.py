@@ -61,7 +61,7 @@ def test_pivoting_finds_what_the_list_finds(n):
         np.testing.assert_allclose(problem._pivoted(q), problem._listed(q)[0], atol=1e-9)
 
 
-def test_a_force_that_moves_another_one_way_only():
+def test_one_sided_coupling_of_forces_is_solved():
     """The slip of the second force changes the first force, but not conversely."""
     v, f = BoxProblem(np.array([[1.0, 0.5], [0.0, 1.0]]), -np.ones(2), np.ones(2)).solve(np.array([[0.5], [2.0]]))
     np.testing.assert_allclose([v[:, 0], f[:, 0]], [[0.0, 1.0], [0.0, 1.0]], atol=1e-12)
@@ -159,7 +159,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
     np.testing.assert_allclose(f_e, expected, atol=1e-8)
 
 
-def test_many_simulations_are_as_many_runs_of_one():
+def test_many_simulations_equal_separate_runs():
     x = wander(300, 2, 5)
     process = closed(loop_of(WALLED, (1, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0)))
     together = drive(process, x).f[:300]
@@ -169,14 +169,14 @@ def test_many_simulations_are_as_many_runs_of_one():
 
 @pytest.mark.parametrize("weakest", [np.inf, 2.0], ids=["limiter", "actuators"])
 @pytest.mark.parametrize("channels", [1, 2, 4])
-def test_a_tick_alone_is_one_of_many(channels, weakest):
-    """In the second simulation each channel reaches both of its limits."""
+def test_one_simulation_ticks_like_several(channels, weakest):
+    """Of two simulations the second is also run alone; there each channel reaches both of its limits."""
     names, limit = tuple("abcd"[:channels]), np.linspace(2.6, 2.9, channels)
     network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
     coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
     theta = tuple(i % 2 for i in range(channels))
     limiter = loop_of(network, theta, (0,) * channels).law(coupling, limit, (5.0,) * channels)
-    actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first may be weaker than its limiter
+    actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first actuator may be weaker than its limiter
     process = Process(limiter, actuators, np.zeros(channels))
     phases = np.arange(400)[:, None] / 15 + np.arange(channels)
     slow = 5e-3 * np.sin(phases)

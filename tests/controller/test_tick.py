@@ -78,7 +78,7 @@ def test_the_coupling_is_spring_and_damper_in_parallel():
     assert V.order == 1
 
 
-def test_many_simulations_are_each_one_alone():
+def test_many_simulations_equal_separate_runs():
     F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 1])
     x = np.random.default_rng(1).normal(size=(20, 2, 5))
     buffer = StepBuffer(process(F), 20, 2, nsim=5)
@@ -141,7 +141,7 @@ def test_impossible_couplings_and_processes_are_refused(build, message):
         build()
 
 
-def test_delays_are_of_every_channel():
+def test_delays_cover_every_channel():
     F, free = Lti.constant(np.eye(2), 1e-3), (np.full(2, np.inf), np.zeros(2))
     delays = np.ones((5, 2, 1), dtype=int)
     assert Process(Law(F), *free, delays=delays).delays.shape == (5, 2, 1)
@@ -156,7 +156,7 @@ def test_a_step_of_an_encoder_is_finite():
 
 
 def test_passivity_layers_count_ticks_of_the_run():
-    """A later block of a run begins at tick `first`."""
+    """In a later block, which begins at tick `first`, delays and layers still count from the start of the run."""
     heard = []
 
     class Net:

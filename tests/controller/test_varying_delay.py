@@ -106,7 +106,7 @@ def test_patterns_are_what_they_are_called():
     assert recorded.draw(rng, 5).ravel().tolist() == [0, 2, LOST, 0, 2]
 
 
-def test_loss_and_playout():
+def test_playout_delays_all_packets_to_the_largest():
     varying_delay = VaryingDelay((1,), (3,), loss=0.25, playout=True)
     delays = varying_delay.draw(np.random.default_rng(5), 10_000)
     assert set(np.unique(delays)) == {LOST, 3}

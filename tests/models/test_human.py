@@ -57,7 +57,7 @@ def test_every_frequency_is_decided_without_a_grid(seed, n):
 @pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
 @pytest.mark.parametrize("depth", [1e-2, 1.0])
 def test_a_narrow_active_resonance_is_refused(width, depth):
-    """The resonance -c 2 h w0 s/(s^2 + 2 h w0 s + w0^2) makes Re Z < 0 near w0; with the opposite sign Z is passive."""
+    """The resonance -2 c h w0 s/(s^2 + 2 h w0 s + w0^2), of gain c, makes Re Z < 0 near w0; with c < 0 Z is passive."""
     rng = np.random.default_rng(7)
     w = 90.0 * 10 ** np.array([0.0, -1.0, 0.5, 1.2])
     h = np.array([width, 0.3, 0.05, 0.7])

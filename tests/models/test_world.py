@@ -199,7 +199,7 @@ def scene_of_the_lemma(condim, impratio, d, solref, friction) -> str:
 
 
 def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
-    """Push two contacts at random, check each constraint of each tick against its bound, and return their number."""
+    """Push two contacts at random, check every constraint of each tick, and return the number of constraints."""
     along = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     G = ([[800.0, 100.0], [100.0, 300.0]], [[700.0, 0.0], [0.0, 500.0]])
     port = world(folder, scene_of_the_lemma(*scene), G=G, along=along).port()
@@ -348,7 +348,7 @@ def test_masses_are_those_of_the_scene(tmp_path, compiler):
     assert model.body("left").mass == pytest.approx(0.03, abs=1e-15)
 
 
-def test_what_mujoco_cannot_step_is_one_line(tmp_path):
+def test_scenes_mujoco_cannot_step_get_one_line(tmp_path):
     box = '<body name="load"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body><geom type="plane" size="1 1 1"/>'
     text = with_body(f'<body name="left">{FREE}</body>{box}', '<size memory="1K"/>')
     with pytest.raises(ValueError, match=r"increase <size memory") as caught:
@@ -408,7 +408,7 @@ def with_body(body: str, more: str = "") -> str:
         ('<mujoco><include file="missing.xml"/></mujoco>', "missing.xml: No such file"),
     ],
 )
-def test_what_is_no_contact_is_refused(tmp_path, text, message):
+def test_bodies_that_are_no_contacts_are_refused(tmp_path, text, message):
     with pytest.raises(ValueError, match=r".*") as caught:
         world(tmp_path, text)
     assert message in str(caught.value)
@@ -435,7 +435,7 @@ def test_files_without_an_end_are_refused(tmp_path, name):
         touchable_bodies(tmp_path / name)
 
 
-def test_the_digest_covers_what_a_scene_includes(tmp_path):
+def test_the_digest_covers_included_files(tmp_path):
     main, part = tmp_path / "main.xml", tmp_path / "part.xml"
     main.write_text('<mujoco><include file="part.xml"/></mujoco>')
     part.write_text("<mujocoinclude><worldbody/></mujocoinclude>")
