@@ -3,8 +3,8 @@
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
 
 Times are CPU seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of
-rounds in which both sides alternate. A command runs in a new process, five times or, if long, once. It alternates with
-the floor, a process that only imports NumPy and MuJoCo; goals are multiples of the floor's time.
+rounds in which the compared programs alternate. A command runs in a new process, five times or, if long, once. It
+alternates with the floor, a process that only imports NumPy and MuJoCo; goals are multiples of the floor's time.
 `--write` puts the table of cold into docs/accuracy.md; use it on an idle machine.
 """
 
@@ -63,7 +63,7 @@ FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/o
 
 
 def engines() -> Iterator[Sequence[str]]:
-    """Measure the default design with its limiter.
+    """Measure runs of the default design with its limiter.
 
     Goals of the exponential integrator: 3 times as fast as RK4 with 4 substeps, 1.10 times the cost of MuJoCo's calls
     alone ("raw"), and the exact growth rate within 1e-9 1/s.

@@ -37,7 +37,7 @@ class Rig:
     loss: float = 0.5  # [N s/m] of the transmission
     step: float = 5e-6  # [m] encoder
     coulomb: float = 0.0  # [N]
-    slip: float = 0.002  # [m/s]
+    slip: float = 0.002  # [m/s] at which Coulomb friction is at 3/4
     static: float = 0.0  # [N] above Coulomb's
     stribeck: float = 0.02  # [m/s] at which `static` is down to 1/e
     thin: float = np.inf  # [m/s] at which the viscous coefficient is down to a half
@@ -51,7 +51,7 @@ class Rig:
     cogging: float = 0.0  # [N]
     period: float = 0.004  # [m] of cogging
     eccentric: float = 0.0  # [m]
-    turn: float = 0.04  # [m] of eccentricity
+    turn: float = 0.04  # [m] period of the eccentricity
     gap: float = 0.0  # [m] backlash
     lag: float = 0.0  # [T] time constant of the force, first order
     late: float = 0.0  # [T] pure delay of the force

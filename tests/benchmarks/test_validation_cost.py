@@ -127,6 +127,6 @@ def test_how_tight_the_certificate_is(benchmark):
     for name, (_, coupling) in loops.items():
         frequency = this_environment(assemble(scenario, coupling).F, scenario.delta).frequency_hz
         x = np.pi * frequency * scenario.T
-        # The certificate bounds the dissipation by the motion per tick, which misses part of a sinusoid's.
+        # The certificate bounds dissipation by the motion per tick, which misses a part of it in sinusoidal motion.
         print(f"\n{name}: binds at {frequency:.1f} Hz, where a sinusoid loses {1 - (np.sin(x) / x) ** 2:.1%}", end="")
     assert all(row.worst.destabilises for row in rows if row.short >= 0.05)

@@ -1,4 +1,4 @@
-"""Sketches run an exported tick without a host on a simulated ATmega328P and Cortex-M7 (make firmware)."""
+"""Sketches without a host run an exported tick on a simulated ATmega328P and Cortex-M7, as `make firmware` checks."""
 
 import re
 import subprocess

@@ -182,7 +182,7 @@ def test_late_early_and_misaddressed_frames_are_not_used():
     rig.say(*[Force(Command.RUN, a, s, (900, 900)) for a, s in wrong])
     rig.tick()
     assert (rig.forces, rig.device.phase) == ((100, 100), Phase.HOLDING)
-    assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this tick and that of the CONFIG
+    assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this tick and that of the CONFIG had no answer
 
 
 def test_theta_zero_forces_act_on_arrival():
@@ -202,7 +202,7 @@ def test_theta_zero_forces_act_on_arrival():
         assert rig.forces == (10 * k, -10 * k)
         assert (rig.state.echo, rig.state.margin_us) == ((rig.device.k - 1) & 0xFFFF, T - after + 1)
         assert rig.at == (Phase.ARMED, Cause.NONE)
-    assert rig.device.misses == 1  # the tick of the CONFIG
+    assert rig.device.misses == 1  # only the tick of the CONFIG had no answer
 
 
 def test_with_theta_zero_a_force_is_latched_once():

@@ -285,7 +285,7 @@ def test_hands_on_the_handle_are_detected(judged, name):
 
 
 def sitting(odd, *names):
-    """Return the estimates of one sitting, one axis for each name."""
+    """Return the estimates of one sitting, which records each axis once; the names are the rigs of the axes."""
     return [Estimate(odd[name], None, Viscosity(0.5, 0.0, 0.0, odd[name].delta, 1e-3, False)) for name in names]
 
 

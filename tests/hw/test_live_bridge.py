@@ -151,7 +151,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     gain = np.load("out/bridge-I/trace.npz")["link_gain"]
     falling = gain[int(np.flatnonzero(gain == 1.0)[-1]) :]
     falling = falling[falling > 0]  # ticks at gain 0, in which the motors are tested again, are not part of the ramp
-    assert falling.size * 1.2e-3 == pytest.approx(0.1, abs=0.01)  # s
+    assert falling.size * 1.2e-3 == pytest.approx(0.1, abs=0.01)  # [s]
     assert (np.diff(falling) < 0).all()
     assert falling[-1] < 0.02
 

@@ -193,7 +193,7 @@ def test_damaged_traces_are_one_line(trace, tmp_path):
 def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
     """Steady ticks end within two ticks of the first cut that the session's counters saw, by cap or by slew rate.
 
-    The two may differ, since a force that is cut by less than a step is sent unchanged.
+    Trace and counters may differ, since a force that is cut by less than a step is sent unchanged.
     """
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((cap, cap), slew), FAST)

@@ -52,7 +52,7 @@ def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
 
 
 def test_rehearsals_wait_for_deaf_devices(tmp_path, capsys):
-    """A device must rest 30 ms after STOP; a rehearsal that ends before that would call the session finished."""
+    """A device must be at rest 30 ms after STOP; a rehearsal that ended earlier would call the session finished."""
     words = ["--rehearse", "--case", "I", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)]
     assert bridge.main([*words, "--fault", "stuck"]) == 1
     assert re.search(r"stopped .* the device still drives 30 ms after STOP", capsys.readouterr().out)

@@ -173,7 +173,7 @@ def test_the_host_delays_forces_beyond_the_link():
     assert world.later((9, 100), 1) == (9, 50)
 
 
-def test_ticks_without_an_answer_are_booked():
+def test_ticks_without_an_answer_are_counted():
     """The device holds its force in every third tick, which the energy of the shell counts like the others."""
     coupling, unit, T = SpringDamper([800.0, 800.0], [0.4, 0.4]), np.array([4e-4, 4e-4]), 1e-3
     scenario = load("world-ball").replace(T=T)

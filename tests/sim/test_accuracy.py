@@ -18,7 +18,7 @@ from haptic_loop.sim.trace import Trace
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """Return the exit code and the report; each setting runs once, because no test needs precise wall times."""
+    """Return the command's exit code and report; each setting runs once, as no test needs precise wall times."""
     place = tmp_path_factory.mktemp("accuracy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yardstick, "_REPEATS", 1)
@@ -67,7 +67,7 @@ def test_a_duration_without_a_number_is_refused():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """The run of Figure 5 leaves the credible limits at 7.35 s; forces and speeds follow from its positions."""
+    """Forces and speeds follow from positions; in the run of Figure 5 forces exceed the credible limit at 7.35 s."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
@@ -86,7 +86,7 @@ def test_runs_say_when_they_stop_being_credible():
 
 
 def test_a_run_clipping_at_once_has_no_error():
-    """The tip begins 20 mm inside a stiff wall, so the first force is beyond the limit."""
+    """The tip begins 20 mm inside a stiff wall, so the first force is clipped already."""
     scenario = load("one-wall")
     wall = msgspec.structs.replace(scenario.environment.walls[0], gap=-0.02, stiffness=3e4)
     walls = msgspec.structs.replace(scenario.environment, walls=(wall,))

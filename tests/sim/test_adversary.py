@@ -160,7 +160,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_only_a_shortage_of_damping_is_found():
+def test_attacks_succeed_only_at_a_shortage():
     rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 4))
     found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
     assert found == {0: [False, False], 0.2: [True, True]}

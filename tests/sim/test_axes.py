@@ -211,7 +211,7 @@ def test_walls_push_along_their_normals() -> None:
 
 
 def push_along(scene: Scene, direction: Array, first: int, ticks: int) -> Array:
-    """Return forces (ticks, outside) from tick `first`, before tick 50: `direction` on handle 1, -1/2 of it on 2."""
+    """Return outside forces from tick `first` on: until tick 50 `direction` [N] on handle 1, -1/2 of it on handle 2."""
     w = np.zeros((ticks, scene.outside))
     for k, column in enumerate(scene.tapped):
         w[: max(0, 50 - first), column] = (1.0, -0.5)[k // len(direction)] * direction[k % len(direction)]

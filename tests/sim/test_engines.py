@@ -62,7 +62,7 @@ def test_order_of_convergence(simulation, exact, integrator, substeps, order):
 
 
 def test_the_default_is_exact_to_1e_8(simulation):
-    """Without the tap the relative error of the default engine is at most 1e-8, the bound once set for RK4 x 4."""
+    """Without the tap the relative error of the default engine is at most 1e-8, which was chosen for RK4 x 4."""
     quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 

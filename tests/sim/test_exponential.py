@@ -324,7 +324,7 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 @pytest.mark.slow
 def test_friction_keeps_the_error_with_fewest_steps():
-    """The chosen setting keeps the allowed error; RK4 with half its substeps exceeds a quarter of it (by RK4 x 64)."""
+    """Against RK4 x 64 the setting keeps the allowed error; RK4 with half its substeps exceeds a quarter of it."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -354,7 +354,7 @@ def test_gaps_between_runs_bound_the_finest_error():
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
     assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding errors need not contract
     assert _missed([0.0, 0.0, 0.0]) == 0
-    # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the distance from 512 steps.
+    # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the error against 512 substeps.
     gaps = [1.05, 0.167, 0.0794, 0.0849, 0.0183, 0.0117]
     for count, apart in ((3, 9.76e-2), (4, 1.29e-2), (5, 3.11e-2), (6, 1.97e-2)):
         assert _missed(gaps[:count]) > apart

@@ -31,7 +31,7 @@ def test_a_setting_fails_and_the_rule_holds(hard):
 def test_verdicts_are_right_near_the_boundary(side, wrong):
     """The default RK4 gives the right verdict for loops whose exact growth is -0.1 or 0.1 1/s.
 
-    At 0.1 1/s cheaper settings call the loop stable: MuJoCo's integrators err to that side, so at -0.1 none is wrong.
+    At 0.1 1/s cheaper settings call the loop stable. MuJoCo's integrators err towards stable, so none is wrong at -0.1.
     """
     low, high = 1.0, 2.0
     while high - low > 1e-9:

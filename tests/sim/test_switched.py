@@ -92,7 +92,7 @@ def test_constant_delay_lines_equal_constant_loops():
 
 
 def test_switching_can_grow_beyond_constant_delays():
-    """The delays (1, 2) are stable, but delays that switch between 1 and 2 make motions grow with the same hands."""
+    """The loop is stable with delays (1, 2), but with the same hands it grows if delays switch between 1 and 2."""
     worst = _worst_switching(ASSEMBLY, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # the search found 2.05 1/s
     assert set(np.unique(worst.ages)) <= {1, 2}

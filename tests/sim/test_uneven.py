@@ -219,7 +219,7 @@ def test_periods_vary_beside_delays():
 
 @pytest.mark.slow
 def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
-    """This is a short form of the check in `make validate`; it must fail with half the required damping."""
+    """This is a short form of the check in `make validate`, which must fail with half the required damping."""
     rows = list(uneven.uneven_ticks(0, 3, 500))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)

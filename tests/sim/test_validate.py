@@ -141,7 +141,7 @@ def test_both_engines_agree_on_a_person():
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
-    # The tolerances suit RK4 x 4, too: at 90 Hz, at which speeds ring after the tap, it errs by 1.3e-5 of the largest.
+    # The tolerances suit RK4 x 4, too: speeds ring at 90 Hz after the tap, and it errs by 1.3e-5 of the largest speed.
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
 
 

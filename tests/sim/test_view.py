@@ -147,7 +147,7 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 
 
 def test_rest_is_where_a_held_position_leads(published):
-    """At rest z = A z + B x, and the force is F(1) x with F(1) of the transfer function."""
+    """At rest the state z obeys z = A z + B x, and the transfer function F gives the force F(1) x."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
@@ -491,7 +491,7 @@ def test_scene_files_show_the_object_beside_devices(name):
 
 
 def test_a_film_shows_how_the_mass_moves(none):
-    """The mass moves by its displacement; the columns of contacts and masses, 70 mm apart, give the scale."""
+    """The drawn mass moves by its displacement; columns of contacts and masses, 70 mm apart, give the scale."""
     running = session(none)
     pictures = pictures_for(running)
 

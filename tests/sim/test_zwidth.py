@@ -540,7 +540,7 @@ def test_a_seed_gives_the_same_map_again(tmp_path):
 
 
 def test_maps_show_what_known_devices_allow(tmp_path):
-    """With guaranteed bounds of the devices, damped walls are certified that the plain condition refuses."""
+    """With guaranteed bounds of the devices, damped walls are certified that this-environment refuses."""
     file, known = tmp_path / "r.json", ["--rigid", "--scenario", "omega-pair-known", "--T", "1e-3", "--theta", "0"]
     part = ["--K-range", "500,1000", "--B-range", "1.4,2", "--grid", "4", "--points", "0", "--humans", "20"]
     zwidth.main([*known, *part, "--out", str(tmp_path), "--no-plot", "--json", str(file)])

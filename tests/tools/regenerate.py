@@ -1,4 +1,4 @@
-"""python tests/tools/regenerate.py: run the commands of README and docs, and write their output where a block asks.
+"""python tests/tools/regenerate.py: run the commands of README and docs, and write their output where pages ask for it.
 
 `--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output, except for
 measured times, with that on the pages. The exit code is 1 if they differ.
