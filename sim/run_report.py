@@ -149,7 +149,7 @@ def run_report(
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and replace(budget, idle=idle(simulation, requirements.values(), budget)),
+        energy_budget=budget and replace(budget, idle=idle(simulation, requirements, budget)),
         remarks=(*run.remarks, *chosen.remarks(requirements), *friction_left_out(scenario.device)),
     )
     return replace(report, remarks=(*report.remarks, *report.notes()))

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from worlds import checkered
 
-from haptic_loop import design_coupling, load, simulate
+from haptic_loop import certify, design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.budget import EnergyBudget, Packets
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.delay import packet_delays
+from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, idle, netted
 from haptic_loop.sim.run import assemble, run
@@ -40,13 +41,49 @@ def test_budgets_are_idle_with_damping_to_spare():
     clipped, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
     unlimited = replace(clipped, process=clipped.process.unlimited)
 
-    def reason(*shares, guarantee="any passive environment", budget=budget, simulation=unlimited):
+    def reason(*shares, budget=budget, simulation=unlimited):
         required = tuple(share * d for share, d in zip(shares, SHORT.delta, strict=True))
-        return idle(simulation, [Requirement("own", required, SHORT.delta, None, guarantee=guarantee)], budget)
+        needs = Requirement("any-environment", required, SHORT.delta, None)
+        return idle(simulation, {needs.condition: needs}, budget)
 
     assert reason(0.94, 0.94).startswith("it never acts")
-    assert reason(0.94, 0.96) is reason(0.94, 0.94, guarantee="this environment") is None
+    assert reason(0.94, 0.96) is None
     assert reason(0.94, 0.94, budget=replace(budget, cap_J=1.0)) is reason(0.94, 0.94, simulation=clipped) is None
+
+
+def limited_and_idle(scenario, coupling, condition):
+    """Return the ticks that a budget of 0.1 mJ limits, and why it never acts, if `condition` is certified."""
+    free = tuple(msgspec.structs.replace(device, force_limit=1e6) for device in scenario.device)
+    scenario = scenario.replace(device=free, duration=0.5)
+    requirements = certify(scenario.loop("I"), coupling)
+    assert requirements[condition].ratio < 0.95
+    simulation = assemble(scenario, coupling, requirements[condition].lag)
+    figures = run(netted(simulation, EnergyNet(1e-4)), "exact").net.figures()
+    return figures.limited_ticks, idle(simulation, requirements, figures)
+
+
+def test_budgets_act_on_couplings_for_known_devices():
+    """The budget counts the damping alone, which known-device-any does not: it acts in front of stiff springs."""
+    scenario = load("omega-pair-known")
+    ends = scenario.environment.contacts
+    network = Network(ends, tuple(Spring((end, "ground"), 1e6) for end in ends))
+    ticks, why = limited_and_idle(
+        scenario.replace(environment=network), SpringDamper([1327.5, 669.3], [2.12, 1.21]), "known-device-any"
+    )
+    assert ticks > 0
+    assert why is None
+
+
+def test_budgets_act_where_walls_store_energy():
+    """A wall that is pressed at rest holds K gap^2/2 = 0.15 J, which the object may give."""
+    scenario = load("one-wall")
+    pressed = msgspec.structs.replace(scenario.environment.walls[0], gap=-0.01)
+    network = msgspec.structs.replace(scenario.environment, walls=(pressed,))
+    ticks, why = limited_and_idle(
+        scenario.replace(environment=network), SpringDamper([854.0], [0.31]), "any-environment"
+    )
+    assert ticks > 0
+    assert why is None
 
 
 def test_a_budget_acts_on_clipped_forces():
