@@ -338,7 +338,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
 def _subtract(
     row: dict[int, Fraction], other: dict[int, Fraction], factor: Fraction, columns: Any = None, r: int = 0
 ) -> None:
-    """Subtract factor times `other` from a sparse row r, and update `columns`, the rows of each column."""
+    """Subtract factor times `other` from the sparse row r; `columns` holds the rows with an entry in each column."""
     for c, v in other.items():
         entry = row.get(c, _ZERO) - factor * v
         if entry:

@@ -248,7 +248,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) that acted in tick `tick` (from 0). Raises ValueError if no report is missing."""
+        """Report the forces (m, nsim) of tick `tick`, from 0. Raises ValueError unless that report is due."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
@@ -268,7 +268,7 @@ class EnergyBudget(_Net):
         self._untold[tick] = dx.copy(), most
 
     def _settle(self, tick: int, acted: Array, dx: Array, most: Array) -> None:
-        """Replace a tick's largest loss by its actual increment."""
+        """Replace the tick's largest loss, already subtracted from W, by its actual increment of W."""
         self.surprises += int((self._loss(acted) > most * (1 + 1e-9)).any())
         if not self._coarse:
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))

@@ -1,4 +1,4 @@
-"""The nonlinear equations of a tick (controller.tick): complementarity problems of walls and of force limits."""
+"""The nonlinear equations of a tick (controller.law): complementarity problems of walls and of force limits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of
 
 @dataclass(frozen=True, eq=False)
 class _Problem(ReadOnly):
-    """A complementarity problem of a tick. M maps wall forces p to displacements, or slips v to limited forces."""
+    """A complementarity problem of a tick. M maps wall forces p to displacements, or slips v to changes of forces."""
 
     M: Array  # (n, n)
 
@@ -299,7 +299,7 @@ class _BallBlock:
         self._inverse = np.linalg.inv(self.M)
 
     def _missing(self, v: Array, f: Array, q: Array) -> Any:
-        """Return where (nsim,) f + M v - q exceeds its tolerance."""
+        """Return in which columns (nsim,) f + M v - q exceeds its tolerance."""
         terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
         finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
         allowed = np.maximum(_RESIDUAL * finite, _ROUNDED * terms.max(axis=0))

@@ -176,7 +176,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def steady(self) -> bool:
-        """Whether every force has the same delay theta, so that certificates for constant delays hold."""
+        """Whether the delay of each channel is constant, so that certificates for constant delays hold."""
         return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
 
     @property

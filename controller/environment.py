@@ -265,7 +265,7 @@ class Environment:
         return coupling.around(delay(psi, T) @ self.E(T))
 
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
-        """Return G at points z of the circle."""
+        """Return the G of `sent` at points z of the circle."""
         return coupling.around(Sampled.of(delay(psi, T) @ self.E(T), z))
 
     def frozen(self) -> Sequence[Environment]:

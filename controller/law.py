@@ -194,7 +194,7 @@ def _one_by_one(laws: Sequence[Law]) -> Transition:
 
 
 def _one_wall(laws: Sequence[Law]) -> Transition:
-    """Return the function of one tick for several laws with one wall each, whose problems are scalar."""
+    """Return the function of one tick for several laws with one wall each, which have scalar equations."""
     m, blocks = laws[0].channels, [law._block for law in laws]
     linear, order = _side_by_side(laws), blocks[0].order
     reach = _last_axis([np.concatenate([G.C[m], [0.0], G.D[m, :m]]) for G in blocks])

@@ -243,7 +243,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return block
 
     def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
-        """Return G at points z of the circle, (n, k) or (1, k)."""
+        """Return the G of `sent` at points z of the circle, (n, k) or (1, k)."""
         return self.environment.sent_at(coupling, self.psi, z, self.T)
 
     def late(self, G: Block) -> Block:

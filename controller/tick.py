@@ -89,7 +89,7 @@ class Process(ReadOnly):
 
     @property
     def F(self) -> Lti:
-        """The linear block of a tick."""
+        """The linear block of a tick in which no wall touches."""
         return self.ticked.open
 
     @property

@@ -1,6 +1,6 @@
-"""Design state-space couplings of a given order that satisfy Theorem 4 (Remark 5 of the paper).
+"""Design state-space couplings of a given order that satisfy Theorem 4 (`--coupling ccl`, Remark 5 of the paper).
 
-A descent minimises ||W1 L W2||_inf (23) from the structured spring-damper design. Each step solves a convex problem
+A descent from a spring-damper design minimises ||W1 L W2||_inf (23). Each step solves a convex problem
 whose solutions all satisfy the condition. The returned coupling satisfies Theorem 4 on a refined sweep, which is
 computed from the coupling alone. The cone complementarity algorithm of Remark 5 is not offered, because its bisection
 on mu stalls near its start.

@@ -203,7 +203,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return poles with imag >= 0, one for each group within 1 % of their distance to the circle."""
+    """Return poles with imag >= 0, without those nearer to an earlier pole than 1 % of their distance to the circle."""
     distinct = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
         if not (np.abs(distinct - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():

@@ -44,7 +44,7 @@ _DIFFERENCE = 1e-7  # step of finite differences in x
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
-    """Return (z-1)/(Tz) [1/s], the stiffness of a damper of 1 N s/m, in the shape of z."""
+    """Return (z-1)/(Tz) [1/s], the dynamic stiffness of a damper of 1 N s/m, in the shape of z."""
     return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
 
 
@@ -427,7 +427,7 @@ class KnownDeviceLoop(SampledLoop):
         self._z = z
 
     def _complement(self, x: Array) -> tuple[Array, Complex, Complex]:
-        """Return the least eigenvalue (k,) in units of Delta_D/T, its eigenvector v (k, m), and M v/(4 l22) (k, m)."""
+        """Return the least eigenvalue (k,) in units of delta/T, its eigenvector v (k, m), and M v/(4 l22) (k, m)."""
         beta, z = self.beta(x), self._z
         F = self._lines * self._around(x, "conditions").G
         cost = period_cost(self.loop, np.full(z.size, self.share), beta)

@@ -341,7 +341,7 @@ class Sweep:
         return self.form(self.maps[environment], named, KnownMotor(PeriodCost(*np.zeros((4, len(beta)))), beta))
 
     def floor(self, beta: Array) -> float:
-        """Return the least share for which beta is allowed; inf if no damping allows it."""
+        """Return the least share whose largest beta, times _LARGEST_ETA, is at least beta; inf if there is none."""
         if not ((beta > 0) & (beta <= _LARGEST_ETA * self.highest)).all():
             return np.inf
         return float((beta**2 * self.P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
@@ -558,7 +558,7 @@ class _Search:
         return _Best(*self.sweep.required(np.array(beta), self.high, values), beta, values)
 
     def add(self, w: float) -> None:
-        """Add a frequency [rad/sample] to the sampled ones."""
+        """Sample all blocks at a further frequency [rad/sample]."""
         for i, (z, parts) in enumerate(self.sampled):
             more_z, more = self.parts(i, np.array([w]))
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
@@ -844,7 +844,7 @@ class KnownDevice(Condition):
         return loop.sent_at(coupling, z)
 
     def not_varied(self, loop: Loop) -> str | None:
-        return "every variation would need a search for its own beta: not searched"
+        return "every variation would need its own beta, which is not searched"
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
         own = dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)

@@ -1,4 +1,4 @@
-"""The necessary damping of devices with known motor and transmission (Theorem A), by a sweep.
+"""The necessary damping of devices with known motor and transmission (Theorem A), by a sweep, for design.audit.
 
 A motor with linear dynamics (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper
 b in parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
@@ -40,7 +40,7 @@ def _alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: fl
     W2 = np.where(np.abs(W2) < np.abs(W1), low / (high * W1), W2)  # This form of the smaller root avoids cancellation.
 
     def sums(W: Any) -> tuple[Any, Any]:
-        """Return the sums of 1/(w_n^2 - W) and of w_n/(w_n^2 - W)."""
+        """Return the sums of 1/(w_n^2 - W) and of w_n/(w_n^2 - W) over all aliases n."""
         y = np.sqrt(W) * T
         less, more = 1 / np.tan((w - y) / 2), 1 / np.tan((w + y) / 2)
         return T**2 / (4 * y) * (less - more), T / 4 * (less + more)

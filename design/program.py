@@ -122,7 +122,7 @@ class _Constraint:
 
 
 def this_environment(loop: Loop) -> _Constraint:
-    """Return this-environment as a constraint with the share MARGIN of the damping unused, in units of Delta/T."""
+    """Return this-environment as a constraint with the share MARGIN of the damping unused, in units of Delta/T_max."""
 
     def block(G: Sampled, own: Array) -> Sampled:
         demand = this_environment_demand(loop.late(G), loop)
@@ -135,8 +135,8 @@ def this_environment(loop: Loop) -> _Constraint:
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """Return SWITCHING as a constraint for delays that switch within the span.
 
-    Its own unknowns are the multipliers alpha of the devices whose delay varies, in units of the least damping of the
-    device's axes over T.
+    Its own unknowns are the multipliers alpha of the devices whose delay varies, in units of delta/T_max with the least
+    delta of the device's axes.
     """
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)

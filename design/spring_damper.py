@@ -120,7 +120,7 @@ class _Channel:
 
 
 class _GainSet:
-    """The gains of any-environment in units of the usable damping, with phi (m,) [N s/m] if psi >= 1."""
+    """The gains that any-environment certifies, in units of the usable damping, with phi (m,) [N s/m] if psi >= 1."""
 
     def __init__(self, loop: Loop, phi: Array | None = None, most_stored: int = _MOST_STORED) -> None:
         shortage = np.zeros(loop.channels) if phi is None else phi / usable(loop)
@@ -719,7 +719,7 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
 
 
 def _start(loop: Loop, certified: _GainSet, start: SpringDamper | None) -> Array:
-    """Return the gains of the set nearest to `start`, or the stiffest ones of the set."""
+    """Return the gains of the set nearest to `start`; without `start` those with the largest sum of k."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
     if start is not None:  # minimise t with |gains - target| <= t

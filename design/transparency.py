@@ -143,7 +143,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
-    """Compute the rms mismatch over log frequency; equal maps give a rounding error. Raises ValueError if E is 0."""
+    """Compute the rms mismatch over log frequency; equal maps give about 0. Raises ValueError if E is 0."""
     if silent(environment):
         raise ValueError(NO_FORCE)
     target = delay(lam, F.T) @ environment

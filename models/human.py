@@ -134,7 +134,7 @@ class Port:
             if not (getattr(self, name) >= 0).all() or not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"port: {name} has a negative or infinite entry: such a human is not passive")
         if not 1 <= self.handles <= points or not (self.mass[..., self.handles :] > 0).all():
-            raise ValueError("port: a point that is no handle has no mass")
+            raise ValueError("port: expected one or more handles, and a positive mass at every other point")
         groups = len(self.across) // self.axes
         if not self.across[:, : -self.axes].any(axis=1).all() or not -groups <= self.pull < groups:
             raise ValueError("port: expected spring-dampers that touch a point each, and the index of one as `pull`")

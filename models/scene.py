@@ -686,7 +686,7 @@ class Crowd:
 
 
 def _link(row: _Array, axes: int) -> Link:
-    """Return a link from its row in Crowd, on a device with `axes` axes."""
+    """Return a link from its numbers in `Crowd.links`, on a device with `axes` axes."""
     if axes == 1:
         return Link(*row[:3].tolist())
     along, count = directions(axes), axes**2

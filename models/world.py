@@ -528,7 +528,7 @@ class WorldPort:
         )
 
     def _within(self, force: Array) -> Array:
-        """Return `force` (m,) [N] within the motors' limits."""
+        """Return `force` (m,) [N] scaled or clipped to its limits."""
         if self._radial.any():
             force = force / np.repeat(np.where(self._radial, np.maximum(self._used(force), 1.0), 1.0), self._axes)
         return np.clip(force, -self._limits, self._limits)
@@ -563,8 +563,8 @@ class WorldPort:
     def _limited(self, goal: Array, saved: Array) -> Array:
         """Repeat the step until two in a row limit the same contacts with the same forces.
 
-        At most _MOST_REPETITIONS repetitions are made. On a limited contact
-        the limited force acts instead of the spring.
+        At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force acts instead of the
+        spring.
         """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)

@@ -286,7 +286,7 @@ def test_chains_equal_their_classes():
     ("call", "message"),
     [
         (lambda: Port([0.1], [[-1, 1]], [-1.0], [0.0]), "damping has a negative or infinite entry"),
-        (lambda: Port([0.1, 0.0], [[-1, 1, 0]], [1.0], [0.0]), "a point that is no handle has no mass"),
+        (lambda: Port([0.1, 0.0], [[-1, 1, 0]], [1.0], [0.0]), "a positive mass at every other point"),
         (lambda: Port([0.1], [[0, 1]], [1.0], [0.0]), "touch a point each"),
         (lambda: Port([0.1], np.zeros((0, 2)), [], []), "touch a point each"),
         (lambda: Port([0.1], [[-1, 1]], [1.0, 2.0], [0.0]), r"damping has the shape \(2,\), expected \(1,\)"),
