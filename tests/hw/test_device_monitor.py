@@ -343,7 +343,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
 
 
 def test_skipped_answers_are_older_than_the_youngest():
-    """In USB frames of 1 ms with T = 0.3 ms, one margin stands for three FORCEs, none of which is missed."""
+    """In USB frames of 1 ms with T = 0.3 ms, one margin stands for FORCEs of 1, 1.3 and 1.6 ms; none is missed."""
     answers = AnswerAges(15, 300.0)
     for k in range(3, 300, 3):
         answers.note(k - 3, 3500)

@@ -105,7 +105,7 @@ def test_certificates_cover_the_spread_of_ticks():
 
 
 def test_the_power_of_overlong_ticks_is_bounded():
-    """The greatest power -f v - delta v^2 over all v is f^2/(4 delta)."""
+    """The power is the sum over devices of the greatest -f v - delta v^2 over all v, which is f^2/(4 delta)."""
     v = np.linspace(-3, 3, 100_001)
     most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))
     assert _overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)

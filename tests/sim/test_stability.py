@@ -80,7 +80,7 @@ def test_a_trace_that_says_nothing_gives_a_reason():
 
 
 def test_fits_end_before_a_limiter_acts():
-    """A limiter acts `ahead` (here 3) ticks before its force arrives."""
+    """The fit ends `ahead` (here 3) ticks before the first force at its limit: the limiter acts that much earlier."""
     simulation = assemble(load().replace(duration=0.2), PUBLISHED["I"])
     trace, loop = run(simulation), close(simulation.plant, simulation.F)
     first = int(np.argmax(np.abs(trace.f[:, 0])))

@@ -94,7 +94,7 @@ def test_even_ticks_without_latency_are_plain():
 
 
 def test_late_loops_match_their_map():
-    """A latency that is constant makes a linear loop with the held forces as states."""
+    """With constant latency the growth is that of a linear loop that has the held forces as states."""
     tau = 3e-4
     simulation = assemble(PAIR.replace(latency=((tau, tau),) * 2), SOFT)
     P, m, F = plant(simulation.scene.model), 2, simulation.F
@@ -229,7 +229,7 @@ def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
 
 
 def test_latch_positions_follow_the_plants_motion():
-    """One person joins two devices; the second device latches first, and its new force then moves the first."""
+    """Positions at the latches equal those by expm; the device that latches first then moves the other one."""
     rng = np.random.default_rng(4)
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-300 * np.array([[2, -1], [-1, 2]]), -2 * np.eye(2)]])
     B = np.vstack([np.zeros((2, 3)), rng.normal(size=(2, 3))])
