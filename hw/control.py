@@ -23,10 +23,10 @@ import numpy as np
 from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.law import Law
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.certificate import required_damping
+from haptic_loop.design.certificate import lag, required_damping
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
@@ -503,8 +503,10 @@ class CertifiedCoupling:
     @property
     def held(self) -> int:
         """The number of missed answers in a row for which the coupling's file proves that a force may be held."""
-        span = self.chosen.switching
-        return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
+        span, theta = self.chosen.switching, self.scenario.theta
+        if span is None or is_world(self.scenario) or not span.contains(DelayRange(theta, theta)):
+            return 0  # A world's shell is proved for constant delays only.
+        return min(hi - n for hi, n in zip(span.hi, theta, strict=True))
 
     def controller(self, cap: Sequence[float]) -> Controller:
         lag, start = self.assessment.force_limits.rho, self.assessment.force_limits.energy_budget
@@ -535,7 +537,9 @@ class CertifiedCoupling:
         if self.held < 1:
             return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
-        return [*said, f"a force that is held through {answers} is covered by the file's proof"]
+        rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # of the limiter in the file's proof
+        below = "" if rho and rho == self.assessment.force_limits.rho else " while forces stay below their limits"
+        return [*said, f"a force that is held through {answers} is covered by the file's proof{below}"]
 
 
 def certified_coupling(

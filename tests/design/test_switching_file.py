@@ -422,7 +422,12 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
     (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve is found
-    assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
+    covered = "a force that is held through 1 missed answer is covered by the file's proof"
+    assert first.remarks() == [f"{covered} while forces stay below their limits"]
+    late = change(LOOP, theta=(2, 2), lam=(2, 2), varying_delay=DelayRange((2, 2), (2, 2)))
+    save(Stored.of(late, SOFT, prove(late, SOFT, "this-environment")), tmp_path / "two.json")
+    (early,) = certified_couplings(scenario, "I", str(tmp_path / "two.json"), None, 1, spare=0)
+    assert early.held == 0  # The delay of 1 sample lies below the range on file.
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST
     met = ages(missed)[1:]
