@@ -120,7 +120,7 @@ def instead(
             continue
         if needs[target].certified:
             error = decibels(transparency_of(loop, design).rms_mismatch)
-            felt = f"{error:z.2f} dB rms" if math.isfinite(error) else "exact"
+            felt = f"{error:z.2f} dB rms" if math.isfinite(error) else "no mismatch"
             designs.append((error, f"--coupling {other} --condition {target} ({felt})"))
     return "certified instead: " + ", ".join(words for _, words in sorted(designs)) if designs else ""
 
@@ -253,7 +253,10 @@ def store(
 
 
 def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Certificate | None, str | None]:
-    """Return (the certificate of the design in this loop or None, the reason why there is none)."""
+    """Return (the certificate of the design in this loop or None, the reason why there is none).
+
+    The certificate `limiter`, which covers limited forces, is preferred if it belongs to this loop.
+    """
     limited = limiter if named(design.asked).extensible else None
     for certificate in (limited, design.certificate):
         if certificate and certificate.scenario == digest(loop, design.coupling.form()):

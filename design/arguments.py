@@ -10,7 +10,7 @@ from typing import Any
 
 
 def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
-    """Raise TypeError unless `value` is an instance of `kind`; `expected` describes it in the message."""
+    """Raise TypeError unless `value` is an instance of `kind`; `expected` describes `kind` in the message."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} is {shown(value)}, expected {expected}")
 

@@ -151,10 +151,10 @@ class RangesResult:
 class SearchFigures:
     """The figures of the search between the vertices, which is evidence and no proof."""
 
-    environments: int
-    worst_ratio: float
-    worst: str
-    violated: bool
+    environments: int  # number of environments that were tried
+    worst_ratio: float  # required over available damping in the worst environment
+    worst: str  # name of the worst environment
+    violated: bool  # whether the condition is violated there
     ended_early: bool
     ended_by_clock: bool  # whether the user's time limit (--seconds) ended the search
     how: str = SEARCH

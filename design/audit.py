@@ -95,7 +95,7 @@ def check_loop(loop: Loop) -> None:
 
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
 
-#: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond any device
+#: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond those of any device
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
@@ -222,6 +222,8 @@ def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
 
 
 def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
+    """Return the largest certified T [s] up to the first edge, or None if every T that was tried is certified."""
+
     @cache
     def ratio(T: float) -> float:
         return _at_period(loop, coupling, condition, T).ratio
@@ -236,6 +238,7 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
 
 
 def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
+    """Return the largest certified increase of theta, or None if MOST_EXTRA_SAMPLES more are still certified."""
     for extra in range(1, MOST_EXTRA_SAMPLES + 1):
         later = tuple(n + extra for n in loop.theta)
         if not _varied(loop, coupling, condition, theta=later).certified:
@@ -369,7 +372,7 @@ class Help:
 
 @dataclass(frozen=True)
 class Audit:
-    """The assessment of a coupling with its margins, and the changes that help if it fails."""
+    """The assessment of a coupling with its margins, and changes that help if a condition is not certified."""
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
@@ -407,6 +410,7 @@ def audit(
     constant, needs = loop.at(loop.environment).switching(None), assessment.requirements
     own = {condition.name: condition} if condition else {}
     conditions = {name: own.get(name) or named(name) for name in needs if name != "switching"}
+    # Changes are searched for the condition that must hold, or, if it is certified, for the first one that is not.
     decisive = assessment.condition
     fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
     switching = None

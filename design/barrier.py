@@ -285,6 +285,7 @@ def towards(start: Array, x: Array, program: Program) -> Array:
 
 
 def _solved(hessian: Array, right: Array) -> Array:
+    """Return hessian^-1 right, with a ridge that grows until the scaled Hessian has a Cholesky factor."""
     scale = 1 / np.sqrt(np.diag(hessian))
     unit = scale[:, None] * hessian * scale
     diagonal, ridge = unit.diagonal().copy(), 0.0

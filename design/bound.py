@@ -383,8 +383,9 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     """Return the sums that are zero because of delays, and whether they are exactly zero.
 
     A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E with a causal R. Row i of
-    s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E. If the channels'
-    psi differ, these products lie in a subspace; v is orthogonal to it and is computed as a null space, up to rounding.
+    s_k is zero for 1 <= k <= theta_i. Later coefficients of F are sums of products of those of R and of Psi E. If the
+    channels' psi differ, these sums lie in a subspace; v is orthogonal to it and is computed as a null space, up to
+    rounding.
     Only the first steps of long delays are used; any subset of the sums gives a bound.
     """
     import scipy
@@ -455,7 +456,7 @@ class BoundBeside:
     gap_db: float | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
     even_without: tuple[str, ...] = ()  # further requirements of the design, which the bound neglects
-    relative_mismatch_db: float | None = off_table("if given", None)  # if the design minimised the supremum
+    relative_mismatch_db: float | None = off_table("if given", None)  # bound on the supremum, if this was minimised
     proved: bool = False  # False: an estimate, whose dual matrix was checked at samples only
 
     @classmethod

@@ -624,7 +624,7 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     return magnitudes(W[:, None], axes)[:, 0] if axes else W
 
 
-# Stacks of couplings or environments, for maps.
+# Stacks of couplings or environments, for the maps over K and B (sim.zwidth).
 
 _Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at z, one row for each system
 

@@ -125,7 +125,10 @@ def _met(places: set[Any], known: dict[Any, str]) -> str | None:
 
 
 def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, hint: str = "") -> bytes:
-    """Return the bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
+    """Return the bytes of a regular file of at most `most` bytes. Raises InputError.
+
+    Messages call the file `named`, and end with `hint` if the file cannot be read.
+    """
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)

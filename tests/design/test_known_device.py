@@ -1,6 +1,6 @@
 """Test devices of known motor mass and transmission: reference figures, the steps of the proof, and attacks.
 
-docs/theory.md, "What is known of the device counts", numbers these steps and states Theorems A and B.
+docs/theory.md, "Known devices", numbers these steps and states Theorems A and B.
 """
 
 from fractions import Fraction
