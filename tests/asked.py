@@ -1,4 +1,8 @@
-"""Evaluate conditions for a transfer matrix and data of a loop, and read the requirements in a command's JSON."""
+"""Evaluate conditions for a transfer matrix and data of a loop, and read the requirements in a command's JSON.
+
+Functions that take the dampings delta build the loop themselves. F is the force map, G the map before the delays Theta,
+V the coupling, and lo and hi are the ends of switching delays [samples].
+"""
 
 from __future__ import annotations
 
@@ -68,6 +72,7 @@ def prove_limiter(loop, coupling, beta=environments.BETA, c=None, swept=None):
 
 
 def _lagging(rho, lags):
+    """Return the condition of forces that are limited with this rho [N/m], with `lags` multipliers c per channel."""
     return environments.LimitedForces(lags=lags, held=tuple(float(r) for r in rho))
 
 

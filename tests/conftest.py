@@ -22,7 +22,7 @@ sys.dont_write_bytecode = False
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-# With Python's small default the collector would scan all modules and fixtures thousands of times.
+# With Python's default threshold the garbage collector would scan all modules and fixtures thousands of times.
 gc.set_threshold(100_000)
 
 settings.register_profile("no-clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])

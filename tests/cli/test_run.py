@@ -209,7 +209,7 @@ def command(*options, **kwargs):
     )
 
 
-def test_bad_input_is_one_line_and_exit_2(tmp_path):
+def test_bad_input_gets_one_line_and_exit_2(tmp_path):
     process = command("--T", "7", cwd=tmp_path)
     out, err = process.communicate()
     assert process.returncode == 2

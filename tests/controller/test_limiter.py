@@ -17,6 +17,7 @@ LIMITS = (12.0, 5.657)
 
 
 def closed(limiter: Limiter) -> Process:
+    """Return the process of a limiter whose actuators and encoders are ideal."""
     return Process(limiter, np.full(limiter.channels, np.inf), np.zeros(limiter.channels))
 
 
@@ -53,7 +54,7 @@ def test_the_forces_solve_the_box_problem(n):
 
 
 @pytest.mark.parametrize("n", [2, 3])
-def test_pivoting_finds_what_the_list_finds(n):
+def test_pivoting_and_listing_find_equal_forces(n):
     rng = np.random.default_rng(n)
     for _ in range(20):
         problem = BoxProblem(passive(n, rng), -np.ones(n), np.ones(n))

@@ -41,6 +41,7 @@ def one(stiffness=1000.0, damping=0.0, gap=0.0) -> Network:
 
 
 def walled(network: Network, coupling, theta, psi) -> Process:
+    """Return the process of a loop with walls whose actuators and encoders are ideal."""
     walls = loop_of(network, theta, psi, T).law(coupling)
     return Process(walls, np.full(walls.channels, np.inf), np.zeros(walls.channels))
 

@@ -403,7 +403,7 @@ BAD = [
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize(("options", "message"), BAD, ids=[options or "nothing" for options, _ in BAD])
-def test_bad_calls_are_one_line_and_exit_2(run, options, message):
+def test_bad_calls_get_one_line_and_exit_2(run, options, message):
     code, out, err = run(*options.split())
     assert (code, out) == (2, "")
     assert err.startswith("error: ")

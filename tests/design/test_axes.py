@@ -114,6 +114,7 @@ def symmetric(M: np.ndarray) -> np.ndarray:
 
 
 def rotated(degrees: float, values: list[float]) -> np.ndarray:
+    """Return the matrix (2, 2) with these eigenvalues along axes that are turned by `degrees`."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return symmetric(np.array([[c, -s], [s, c]]) @ np.diag(values) @ np.array([[c, s], [-s, c]]))
 
@@ -196,7 +197,10 @@ def least_multiple(least: np.ndarray, of: np.ndarray) -> float:
 
 
 def test_any_environment_with_a_latency_takes_levels() -> None:
-    """He[V/(1-z)] > l (Q Delta)^-1 l*/4 for l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta] and the best Q."""
+    """He[V/(1-z)] > l (Q Delta)^-1 l*/4 is tight at the requirement with the best Q.
+
+    Here l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta].
+    """
     V = BUILT.compliance(LOOP.T).at(Z) / (1 - Z)[:, None, None]
     each = [
         (late * window([1.0] * (n + 2)) + (LOOP.T - late) * window([1.0] * (n + 1))) / 4
@@ -207,7 +211,10 @@ def test_any_environment_with_a_latency_takes_levels() -> None:
 
 
 def test_any_environment_with_switching_takes_levels() -> None:
-    """He[V/(1-z)] > |vt|^2/4 (s Delta/T - alpha Delta'/2)^-1 + h^2/(2 alpha) Delta'^-1, Delta' = 2 Delta/tr Delta."""
+    """He[V/(1-z)] > |vt|^2/4 (s Delta/T - alpha Delta'/2)^-1 + Delta'^-1/(2 alpha) is tight at the requirement s.
+
+    Here Delta' = 2 Delta/tr Delta, and vt is the mean of the windows of both delays.
+    """
     V = hermitian_part(BUILT.compliance(LOOP.T).at(Z) / (1 - Z)[:, None, None])
     needs = required_damping(SWITCHED, BUILT, "any-environment")
     mean, windows = [1.2, 1.6], [window([1, 0.5, 0.5]), window([1, 1, 0.5, 0.5])]
@@ -333,6 +340,7 @@ def test_filtered_spring_dampers_are_not_turned() -> None:
 
 
 def turned(loop: Loop, Q: np.ndarray) -> Loop:
+    """Return the loop in other coordinates: an orthogonal Q turns the contacts first, then the inner nodes."""
     m = loop.channels
     level = symmetric(Q[:m, :m].T @ loop.Delta() @ Q[:m, :m])
     levels = tuple(tuple(map(tuple, level[own, own].tolist())) for own in loop.devices)

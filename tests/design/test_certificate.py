@@ -155,7 +155,7 @@ def test_a_static_asymmetry_is_refused():
             prove(change(DEFAULT, environment=anchored), V, condition)
 
 
-def test_environment_delay_needs_more_for_any_environment():
+def test_environment_delay_needs_more_damping_for_any_environment():
     loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
     damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
     assert verify(certified(loop, damped, "this-environment")).proved
@@ -252,7 +252,7 @@ def test_repaired_digests_do_not_forge_a_proof():
         (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )
-def test_a_bad_file_is_one_line(tmp_path, old, new, names):
+def test_a_bad_file_gets_one_line(tmp_path, old, new, names):
     path = tmp_path / "coupling.json"
     save(certified(DEFAULT, STIFF, "this-environment"), path)
     text = path.read_bytes()
@@ -404,7 +404,7 @@ def test_a_name_that_stands_twice_is_refused(tmp_path, name):
         load(path)
 
 
-def test_irregular_or_huge_files_are_one_line(tmp_path):
+def test_irregular_or_huge_files_get_one_line(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: is not a regular file, expected a file"):
         load(tmp_path / "pipe")

@@ -39,6 +39,7 @@ LOOPS = {"I": (PUBLISHED["I"], (1, 2)), "II": (PUBLISHED["II"], (0, 0))}
 
 
 def window(theta):
+    """Return 1 + 1/z + .. + z^-theta at Z."""
     return sum(Z**-j for j in range(theta + 1))
 
 
@@ -153,7 +154,7 @@ def test_without_coupling_only_the_compliant_device_oscillates():
         loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 30)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 16 < unstable["compliant"] < 30  # 0.78 of many pairs oscillate; three binomial standard deviations
+    assert 16 < unstable["compliant"] < 30  # 0.78 of many pairs oscillate, give or take three standard deviations
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():
@@ -177,6 +178,7 @@ def test_the_printed_gains_fail_the_papers_condition(coupling, expected):
 
 
 def figure_4_at(z):
+    """Return E (k, 2, 2) of Figure 4 at k points z, from its formula."""
     s = (z - 1) / (T * z)
     spring = np.array([800 + s, 700 + s])
     shared = spring[:, None] * spring[None, :] / (s**2 + spring.sum(axis=0))
@@ -184,6 +186,7 @@ def figure_4_at(z):
 
 
 def mismatch_at(z, E, coupling, lam):
+    """Return the mismatch M = F - Lambda E (8) at k points z, (k, 2, 2)."""
     s = (z - 1) / (T * z)
     V = np.stack([1 / (K + B * s) for K, B in zip(coupling.K, coupling.B, strict=True)], axis=1)[:, :, None] * np.eye(2)
     late = z[:, None, None] ** -np.array(THETA, float)[:, None]

@@ -40,7 +40,7 @@ def loop_of(network, T=1.2e-3, theta=0, delta=1.0, **further):
 
 
 def need(loop, coupling, rho=None):
-    """Return the required damping [N s/m]."""
+    """Return the damping [N s/m] that this-environment requires, with limited forces if rho is given."""
     condition = LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
     return required_damping(loop, coupling, condition).required[0]
 
@@ -102,6 +102,7 @@ MOST_SETS = pytest.mark.parametrize(
 
 
 def combined(names, delta=10.0):
+    """Return a loop with these facts of EVERY, and the limiter's rho [N/m], or None without a limiter."""
     fields = {key: value for name in names for key, value in EVERY[name].items()}
     rho, network = fields.pop("rho", None), held(*fields.pop("walls", ()))
     return loop_of(network, 1e-3, 1, delta, **fields), rho
@@ -132,7 +133,7 @@ def test_every_combination_is_proved_stored_and_verified(names):
 
 
 def test_limited_wall_requirements_are_those_of_the_block():
-    """With the multipliers found, the block written out is positive at 1.001 of the requirement, not at 0.999."""
+    """With the multipliers of the search `block_by_hand` is positive at 1.001 of the requirement, not at 0.999."""
     loop, rho = combined(("walls", "limiter"))
     needs = required_damping(loop, COUPLING, LimitedForces(held=(rho,)))
     binding = max(2 * np.pi * loop.T * needs.frequency_hz, 1e-3)
@@ -257,6 +258,7 @@ LATE, SWITCHED = {"latency": ((0.13e-3, 0.4e-3),)}, {"varying_delay": DelayRange
 
 
 def anywhere(further, delta=10.0, coupling=ANYWHERE, **network):
+    """Return a loop with these fields, and the damping [N s/m] that any-environment requires."""
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1000.0),), **network), delta=delta, **further)
     return loop, required_damping(loop, coupling, ANY_ENVIRONMENT).required[0]
 
@@ -278,7 +280,7 @@ def test_springs_before_any_environment_need_the_closed_form(further, theta, nee
 
 
 def test_any_environment_requirements_follow_from_chi():
-    """He[V/(1-z)] >= chi, with chi = (tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2)/(4 delta)."""
+    """The least delta has 4 delta He[V/(1-z)] >= tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2."""
     tau, theta, T = 0.3e-3, 2, 1.2e-3
     coupling = SpringDamper([900.0], [0.3])
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1.0),)), T, theta, latency=((tau, tau),))
@@ -291,9 +293,10 @@ def test_any_environment_requirements_follow_from_chi():
 
 
 def test_periods_latency_and_switching_follow_from_chi():
-    """He[V/(1-z)] > c* Q^-1 c/4 + h^2/(2 alpha) with Q = delta diag(1/tau, 1/(T_max - tau)) - alpha d* d/2, d = (z, 1).
+    """He[V/(1-z)] > c* Q^-1 c/4 + h^2/(2 alpha) is tight at the requirement, with h = (hi - lo)/2.
 
-    The entries of c are means over n = lo and n = hi: of 1 + .. + z^-(n+1), and of 1 + .. + z^-n.
+    Q is delta diag(1/tau, 1/(T_max - tau)) - alpha d* d/2 with d = (z, 1). The entries of c are means over n = lo and
+    n = hi: of 1 + .. + z^-(n+1), and of 1 + .. + z^-n.
     """
     T, longest, tau, lo, hi = 1e-3, 1.4e-3, 0.3e-3, 0, 2
     further = {"varying_delay": DelayRange((lo,), (hi,)), "latency": ((tau, tau),), "T_max": longest}

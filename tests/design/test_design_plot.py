@@ -65,7 +65,10 @@ def test_an_undelayed_wall_feels_like_its_spring():
 
 
 def test_a_delayed_spring_feeds_and_a_damper_dissipates():
-    """z^-1 K feels like K cos(wT) and -K sin(wT)/w; backward Euler's B like B (1 - cos wT)/T and B sin(wT)/(wT)."""
+    """z^-1 K has the stiffness K cos wT and the damping -K sin(wT)/w.
+
+    A damper B in backward Euler has the stiffness B (1 - cos wT)/T and the damping B sin(wT)/(wT).
+    """
     omega = 2 * np.pi * HZ
     late = wall(1000.0, theta=1)
     felt = curves(late, judge(late, NoCoupling()), HZ).perceived
@@ -78,7 +81,7 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
 
 
 def test_demands_match_the_formulas():
-    """this-environment: -T He[F/(z-1)]/delta; any-environment: max (1 - cos n w)/(2 delta Re[(z-1) V/(Tz)])."""
+    """The demand is -T He[F/(z-1)]/delta or, by any-environment, max (1 - cos n w)/(2 delta Re[(z-1) V/(Tz)])."""
     demands = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
         z = np.exp(2j * np.pi * HZ[k] * T)
@@ -188,6 +191,6 @@ def test_a_missing_design_leaves_the_others(tmp_path, capsys):
         (["--coupling", "missing.json"], "No such file"),
     ],
 )
-def test_bad_input_is_one_line(argv, message, tmp_path):
+def test_bad_input_gets_one_line(argv, message, tmp_path):
     with pytest.raises(InputError, match=message):
         main([*argv, "--out", str(tmp_path)])

@@ -293,7 +293,8 @@ def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
 def test_the_exact_test_refuses_alone(monkeypatch):
     """Without the quick refusal in floating point, a P just outside either end of the valid interval is refused."""
     monkeypatch.setattr(exact, "_refuted_in_floating_point", lambda G, P: False)
-    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))  # (3/4 P)(2 - P) > (1/2 - P/2)^2
+    # A P is valid if (3/4 P)(2 - P) > (1/2 - P/2)^2.
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))
     low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
     for p, expected in ((low, (False, True)), (high, (True, False))):
         for factor, proved in zip((1 - 1e-9, 1 + 1e-9), expected, strict=True):

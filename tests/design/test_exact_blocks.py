@@ -76,6 +76,7 @@ def figure_4(z):
 
 
 def late(z, steps):
+    """Return diag(z^-n) for the delays n in `steps`, (k, m, m)."""
     return z[:, None, None] ** -np.array(steps, dtype=float)[:, None] * np.eye(len(steps))
 
 
@@ -93,6 +94,7 @@ def loop(network: Network, theta, psi=None, delta=None, period=T) -> Loop:
 
 
 def to_ground(*stiffness: float, damping: float = 0.0) -> Network:
+    """Return a network of separate tips, each on a spring to ground."""
     springs = tuple(Spring((f"tip {i}", "ground"), k, damping) for i, k in enumerate(stiffness))
     return Network(tuple(f"tip {i}" for i in range(len(stiffness))), springs)
 
@@ -346,6 +348,7 @@ def proves(asked: Loop, coupling, condition, phi=None) -> bool:
 
 
 def assert_loop_limit(asked: Loop, coupling, condition, limit: float, phi=None) -> None:
+    """Assert that the loop is proved just above the damping `limit`, but not just below it."""
     for factor, expected in ((1 + CLOSE, True), (1 - CLOSE, False)):
         assert proves(change(asked, delta=(limit * factor,) * asked.channels), coupling, condition, phi) == expected
 
@@ -418,7 +421,7 @@ def test_the_nominal_proof_does_not_serve_vertices():
     asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
     asked = change(asked, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
     made = prove(asked, NoCoupling(), "this-environment")
-    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # by the vertex that needs most
+    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # the vertex that needs most
     nominal = made.matrices["P"]
     assert forged(asked, NoCoupling(), made) is None
     reason = forged(asked, NoCoupling(), made, matrices={"P": nominal, "P1": nominal, "P2": nominal})
@@ -479,7 +482,7 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     made = prove(asked, coupling, "any-environment", [phi])
     assert forged(asked, coupling, made) is None
     claimed = from_ratio("any-environment", made.required[0] / 4.0, (4.0,), 1.0)
-    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # as stored, for any Phi
+    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # for any Phi
 
     def with_phi(value: float) -> str | None:
         return forged(asked, coupling, made, multipliers={"Phi": (value,)})

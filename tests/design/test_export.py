@@ -227,7 +227,7 @@ def test_export_and_simulator_differ_by_rounding(data):
     for k in range(len(z)):
         own = 2 * gamma * (np.abs(G.C) @ np.abs(z[k]) + np.abs(G.D) @ np.abs(test.inputs[k]))
         bound = own + sum(carried[k - 1 - i] @ local[i] for i in range(k))
-        assert (np.abs(buffer.f[k, :, 0] - test.outputs[k]) <= 1.01 * bound).all()  # 1.01: products of two roundings
+        assert (np.abs(buffer.f[k, :, 0] - test.outputs[k]) <= 1.01 * bound).all()  # 1.01 covers products of roundings
     largest = np.abs(test.outputs).max()
     difference = np.abs(buffer.f[: len(z), :, 0] - test.outputs).max()
     print(f"largest difference {difference:.1e} of {largest:.2g} N: {difference / np.spacing(largest):.1f} ulp")
@@ -388,7 +388,7 @@ def test_a_hostile_name_stays_inside_the_comment(tmp_path):
         (["{place}/none.json"], "export its process with --process"),
     ],
 )
-def test_bad_input_is_one_line(place, options, message):
+def test_bad_input_gets_one_line(place, options, message):
     save(Stored.of(PAIR, NoCoupling()), place / "none.json")
     with pytest.raises(InputError, match=message), one_command():
         main([option.format(gains=place / "gains.json", place=place) for option in options])

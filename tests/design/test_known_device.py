@@ -56,6 +56,7 @@ change = msgspec.structs.replace
 
 
 def one(T, delta, theta=0, device=DEVICE, **more) -> Loop:
+    """Return a loop of one known device."""
     return loop_of(T, (delta,), (theta,), known_devices=(device,), **more)
 
 
@@ -90,7 +91,7 @@ def sweep_any(V, loop) -> Sweep:
 # Figures that were computed with separate code.
 
 
-def test_constants_of_one_period():
+def test_constants_of_a_period_match_separate_figures():
     cost = period_cost(one(1.2e-3, 1.37), 1.0, np.array([3e-5]))
     c0, c2, q, T = 1.2753875, 1.7998875e-6, 1.1073999408e-3, 1.2e-3
     expected = c0 / (T - q), c0 * q / (T - q), c0 * q * T / (T - q), c2 / q
@@ -180,7 +181,7 @@ def cost_by_hand(z, loop, beta):
 
 
 def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
-    """Minimise the integral of c0 v^2 + c2 v'^2 over piecewise linear v with these ends and this displacement."""
+    """Return the least integral of c0 v^2 + c2 v'^2 over piecewise linear v from v0 to v1 with the displacement dx."""
     h = T / n
     H = np.empty((2, n + 1))  # H is tridiagonal: the entries beside its diagonal, then the diagonal
     H[0], H[1] = c0 * h / 6 - c2 / h, c0 * h * 2 / 3 + c2 * 2 / h
@@ -445,6 +446,7 @@ def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
 
 
 def required(F, loop, high=30.0) -> float:
+    """Return the least share of the damping, at most `high`, for which some beta satisfies Theorem B."""
     return sweep_of(F, loop).best(high).share
 
 
@@ -475,7 +477,7 @@ def test_a_small_beta_gives_this_environment():
     assert sweep.required(np.array([1e-10]), 5.0)[0] == pytest.approx(0.7, rel=1e-2)
 
 
-def test_uneven_periods_need_more():
+def test_uneven_periods_need_more_damping():
     F = wall(800.0, 0.6, 1, 1e-3)
     wide, same = (one(1e-3, 1.0, 1, T_max=most, T_min=least) for most, least in ((1.2e-3, 0.9e-3), (1e-3, 1e-3)))
     assert required(F, same) == required_on_even_periods() < required(F, wide)
@@ -815,6 +817,7 @@ def random_walls(rng, T):
 
 @cache
 def any_needs(K, B, theta):
+    """Return the damping [N s/m] that known-device-any requires of a spring-damper on one device."""
     return required_damping(one(1e-3, 1.0, theta), SpringDamper([K], [B]), "known-device-any").ratio
 
 
@@ -998,6 +1001,7 @@ def test_every_device_within_the_bounds_is_covered():
 
 
 def on_a_wall(k, damping, theta, delta=1.37):
+    """Return the loop of one known device with a wall on the device itself."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), k, damping),))
     return Loop(1e-3, (theta,), (0,), (0,), (delta,), network, known_devices=(DEVICE,))
 
@@ -1113,7 +1117,7 @@ def test_hands_that_never_leave_walls_need_less_damping():
     assert left_over(pair, NoCoupling()) is None
 
 
-def test_some_hands_grow_on_a_wall_far_below():
+def test_hands_grow_on_walls_far_below_the_requirement():
     assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3, ticks=2000) > 0
 
 
@@ -1205,7 +1209,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     after, dx = np.append(v[1:], 0.0), free + de
     c0, c2 = 1.3 - beta[0] ** 2 * 14500**2 / 2, beta[0] * 0.06 - beta[0] ** 2 * 0.5 / 4
     cost_of = [discretised_cost(c0, c2, T, dx[k], v[k], after[k], 300) for k in range(active + 1)]
-    M = fe[1 : N + 1] + c * (fe[1 : N + 1] - fe[:N])  # z + c_1 (z - 1)
+    M = fe[1 : N + 1] + c * (fe[1 : N + 1] - fe[:N])  # M f_e with M = z + c_1 (z - 1)
     assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
 
 
@@ -1303,7 +1307,10 @@ def test_no_hand_gains_energy_from_ages_of_forces(name):
 
 @pytest.mark.slow
 def test_switching_for_any_environment_follows_from_chi():
-    """He[V/(1-z)] > l (Lam - alpha d* d/2)^-1 l*/4 + h^2/(2 alpha): d = (1, beta (z - 1)), l the mean for lo and hi."""
+    """He[V/(1-z)] > l (Lam - alpha d* d/2)^-1 l*/4 + h^2/(2 alpha) is tight at the requirement.
+
+    Here d = (1, beta (z - 1)), l is the mean of its values for lo and hi, and h = (hi - lo)/2 = 1.
+    """
     loop, coupling = change(one(1e-3, 1.0, 1), varying_delay=DelayRange((0,), (2,))), SpringDamper([600.0], [1.2])
     found = required_damping(loop, coupling, "known-device-any")
     beta, alpha, share = found.multiplier[0], found.multiplier[3], found.required[0]

@@ -140,7 +140,7 @@ def least_scale_of(demand):
 
 
 def test_weights_are_admitted_where_every_latency_admits_them():
-    """Q is admitted exactly where eigenvalues at many latencies admit it, also if Q is indefinite."""
+    """`Latency` accepts Q exactly if eigenvalues at many latencies show that it is allowed, also an indefinite Q."""
     rng, agreed = np.random.default_rng(0), np.zeros(2, dtype=int)
     for _ in [None] * 200:
         first, last = np.sort(np.round(rng.uniform(0, T, 2), 6))

@@ -30,6 +30,7 @@ BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limi
 
 
 def required(coupling, c=None, lag=LAG) -> float:
+    """Return the damping [N s/m] that the limited default loop requires for the multiplier c, or for the best one."""
     return limiter(PAIR.sent(coupling), PAIR.theta, DELTA, lag, c).required[0]
 
 
@@ -224,6 +225,7 @@ def test_any_environment_covers_the_limiter():
 
 
 def tampered(stored, **fields):
+    """Return the stored coupling with other fields in its certificate, whose seal is renewed."""
     known = stored.certificate.multipliers
     multipliers = known | {name: fields.pop(name) for name in ("c", "rho") if name in fields}
     proof = msgspec.structs.replace(stored.certificate, multipliers=multipliers, **fields)

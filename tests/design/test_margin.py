@@ -164,7 +164,7 @@ def test_refusals_say_why():
         this_environment(default(PUBLISHED["I"]), (-1.0, 1.0))
 
 
-def test_the_frequency_at_which_a_condition_binds():
+def test_the_binding_frequency_matches_a_dense_grid():
     """Ratio and frequency equal those of the definition, -He[F/(z-1)] T/delta, on a dense grid."""
     F, w = default(PUBLISHED["I"]), np.linspace(1e-3, np.pi, 200_001)
     z = np.exp(1j * w)

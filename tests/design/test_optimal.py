@@ -48,11 +48,13 @@ def loop_of(name: str) -> Loop:
 
 @cache
 def best(name: str):
+    """Return the design over two bases for a loop of benchmarks/loops."""
     return design(loop_of(name), SHORT)
 
 
 @cache
 def smallest(name: str):
+    """Return the design over the smallest basis for a loop of benchmarks/loops."""
     return design(loop_of(name), SMALLEST)
 
 
@@ -68,6 +70,7 @@ def short_bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int |
 
 
 def wall(K: float, theta: int, delta: float, T: float = 1e-3, channels: int = 1) -> Loop:
+    """Return a loop of equal channels, each before a spring to ground."""
     contacts = tuple("abcd"[:channels])
     network = Network(contacts=contacts, springs=tuple(Spring((c, "ground"), K, 0.0) for c in contacts))
     late = (theta,) * channels
@@ -93,7 +96,7 @@ REACHED = [
 
 
 @pytest.mark.parametrize(("name", "most", "stiffness"), REACHED)
-def test_figures_are_reached(name, most, stiffness):
+def test_designs_reach_the_recorded_figures(name, most, stiffness):
     found, loop = best(name), loop_of(name)
     figures = transparency(force(loop, found.coupling), loop.E(), loop.lam)
     assert figures.rms_mismatch_db == pytest.approx(found.figures.rms_mismatch_db)
@@ -147,7 +150,7 @@ def test_static_stiffness_is_an_exact_share(name):
 @pytest.mark.parametrize(
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n4", "o12"))]
 )
-def test_the_bound_is_below_and_close(name):
+def test_the_bound_is_close_below_the_design(name):
     limit = short_bound(loop_of(name))
     assert limit.rms < best(name).figures.rms_mismatch
     assert best(name).figures.rms_mismatch_db - limit.rms_db < 4.0
@@ -345,7 +348,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
 
 
 def test_switching_delays_match_a_separate_formula():
-    """[[He F/(z-1) + delta/T - alpha/2, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F = (z^-lo + z^-hi)/2 G."""
+    """For some alpha [[He F/(z-1) + delta/T - alpha/2, G*], [G, 2 alpha]] > 0 with F = (z^-4 + z^-6)/2 G."""
     loop = loop_of("n3")
     found = design(loop.switching(DelayRange((4,), (6,))), SMALLEST)
     assert found.proved
@@ -776,7 +779,7 @@ def test_late_walls_match_their_closed_form():
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n2", "n4"))]
 )
 def test_limited_forces_are_part_of_designs(name):
-    """[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] is positive real on a dense grid."""
+    """With D = Delta/T, He[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] > 0 on a grid."""
     loop = loop_of(name)
     found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
     assert found.proved

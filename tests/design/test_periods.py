@@ -67,7 +67,7 @@ def test_longest_period_scales_switching_and_multipliers():
 
 
 def test_the_longest_period_scales_limited_forces():
-    """The limiter's rho belongs to the controller, so no period changes it. The exact certificate agrees."""
+    """The controller sets the limiter's rho, so no period changes it. The exact certificate states the requirement."""
     loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
     longer = change(loop, T_max=LONG)
     even, uneven = (required_damping(one, SOFT, LIMITER, (0.3, 0.3)) for one in (loop, longer))

@@ -1,4 +1,4 @@
-"""Couplings designed for varying delays: their sweeps, their proofs, and lossless hands under adversarial switching."""
+"""Tests of couplings designed for varying delays: sweeps, proofs, and lossless hands under adversarial switching."""
 
 import json
 

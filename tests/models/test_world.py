@@ -38,6 +38,7 @@ COUPLINGS = (
 
 
 def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0), **options) -> World:
+    """Return the world of an MJCF text; each contact moves along the directions `along` and has a spring of G."""
     path = folder / "scene.xml"
     path.write_text(text)
     along = options.pop("along", ((1.0, 0.0, 0.0),))
