@@ -1,8 +1,8 @@
 """Compare another tool with the published figures: python benchmarks/check.py [YOURS.py]
 
 YOURS.py defines functions named like columns of figures.csv, such as `reference_this_environment(loop)`. `loop` is a
-TOML file as a dictionary; the result is a number, or None if the tool has no answer. Without YOURS.py the two functions
-below are compared. They need only NumPy, sweep frequencies, and share no code with the program that made the table.
+TOML file as a dictionary; the result is a number, or None if the tool has no answer. Without YOURS.py the two reference
+functions below are compared. They need only NumPy, sweep frequencies, and share no code with the program of the table.
 """
 
 import csv
@@ -18,7 +18,7 @@ Z = np.exp(1j * np.geomspace(1e-4, np.pi, 40_000))
 
 
 def object_(loop):
-    """Return E(z) (n, m, m) [N/m]: springs, dampers and masses by backward Euler, inner nodes eliminated."""
+    """Return E (n, m, m) [N/m] at the n points Z: the network by backward Euler, with its inner nodes eliminated."""
     env, rate = loop["environment"], (1 - 1 / Z) / loop["T"]
     nodes, m = [*env["contacts"], *env.get("masses", {})], len(env["contacts"])
     Y = np.zeros((Z.size, len(nodes), len(nodes)), complex)

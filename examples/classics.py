@@ -48,7 +48,8 @@ class PassivityControl:
 class EnergyBounding:
     """Energy bounding on each channel, made for loops without delay (Kim and Ryu, Int. J. Robotics Research 29, 2010).
 
-    f = f_- + b dx with b between -c1 - 2 f_-/dx and c1, that is, |f| <= |f_- + c1 dx|; here c1 = 2 delta/T.
+    f = f_- + b dx with the last force f_- and b between -c1 - 2 f_-/dx and c1, that is, |f| <= |f_- + c1 dx|. Here
+    c1 = 2 delta/T.
     """
 
     at_device = False

@@ -1,4 +1,4 @@
-"""From a scenario to a figure, cell by cell: open it in an editor with cells (VS Code, Spyder), or run it whole."""
+"""From a scenario to a figure, cell by cell: open this file in an editor with cells (VS Code, Spyder), or run it."""
 
 # %% Load a laboratory: devices, hands, delays and the object
 from pathlib import Path

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from haptic_loop import DesignFailed, Scenario, design_coupling, load, transparency_of
 
 BASE = load("omega-pair")  # T = 1.2 ms, theta = (1, 2) samples, 1.37 N s/m
-FLOOR = -60.0  # [dB] shown for lower errors, as those of loops that need no coupling
+FLOOR = -60.0  # [dB] shown in place of lower errors, such as those of loops that need no coupling
 
 
 def scaled(factor: float) -> Scenario:

@@ -51,9 +51,9 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], a share of ticks, and how many pairs of hands grow and how many shake.
+    """Return the peak force [N], a share of ticks, how many pairs of hands move more and more, and how many shake.
 
-    The share is that of ticks with a clipped contact force, or with forces that the shell scaled.
+    The share counts ticks in which a contact force was clipped, or the shell reduced a force.
     """
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)

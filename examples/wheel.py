@@ -16,7 +16,7 @@ import numpy as np
 from haptic_loop import Scenario, SpringDamper, certify, design_coupling, load
 
 BASE = load(Path(__file__).with_name("wheel.toml"))
-RIGID = SpringDamper([1e6], [0.0])  # as good as no coupling
+RIGID = SpringDamper([1e6], [0.0])  # so stiff that it acts as no coupling
 
 
 def theta_of(hertz: float) -> int:
@@ -25,7 +25,7 @@ def theta_of(hertz: float) -> int:
 
 
 def needed(scenario: Scenario) -> float:
-    """Return the damping [N m s/rad] that the bare stiffness of 20 N m/rad needs."""
+    """Return the damping [N m s/rad] that the stiffness of 20 N m/rad needs without a coupling."""
     return certify(scenario.loop("I"), RIGID)["this-environment"].required[0]
 
 
