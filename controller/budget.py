@@ -248,7 +248,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) of tick `tick`, from 0. Raises ValueError unless that report is due."""
+        """Report the forces (m, nsim) that acted in tick `tick`, from 0. Raises ValueError unless its report is due."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))

@@ -282,7 +282,7 @@ def _exact_cost(
 #
 # L is the least value of an integral that is linear in c0 and c2. Since c0 and c2 are concave in (s, beta), so is L.
 # The other entries are affine in beta and in the multipliers, except for switching delays. Their entries are concave in
-# beta and 1/alpha after the rows of the inputs w are divided by alpha.
+# beta and 1/alpha after the rows of their inputs w (facts.Switching) are divided by alpha.
 # A tangent of a concave block bounds the block from above. The tangents at the binding frequencies form a linear matrix
 # inequality, whose least s bounds the required s from below.
 

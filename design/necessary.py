@@ -109,7 +109,7 @@ class LeftOver:
 
     Attributes:
         required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less, and
-            better proofs than known-device can gain at most the difference. Otherwise less may be enough.
+            no proof can improve on `known_device_damping` by more than the difference. Otherwise less may be enough.
         frequency_hz: The binding frequency.
         attained: Whether a lossless hand destabilises the loop at every smaller damping. This holds for
             one channel, and for channels with equal devices.

@@ -586,9 +586,9 @@ class _Search:
     def _start(self, problem: program.Problem) -> Array:
         """Return unknowns of R = kappa I that satisfy every constraint strictly.
 
-        They exist because zero force satisfies each constraint strictly. For F = 0 and the limiter's multiplier M, the
-        Schur complement of its block is rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at
-        least 1.
+        They exist because zero force satisfies each constraint strictly. For F = 0 the Schur complement of the
+        limiter's block is rho (Re M/z - beta/4), where M is its multiplier and
+        Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:

@@ -1,1 +1,1 @@
-"""The continuous, physical world: devices and human hands as one MuJoCo scene. It knows nothing of control."""
+"""The continuous, physical world: devices and human hands as one MuJoCo scene. It contains no controller."""
