@@ -226,8 +226,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
     for i, part in enumerate(report.world or [], start=1):
         claim = Claim.of(report.assessment).words if report.assessment else "No guarantee."
         console.print(f"world, arming {i}: {claim} The shell acted on {part.ticks_acted} of {part.ticks} ticks.")
-        if part.unsettled_ticks:
-            console.print(f"  {part.unsettled_ticks} ticks whose limited channels did not settle")
+        if part.unsettled_steps:
+            console.print(f"  limited forces did not settle in {part.unsettled_steps} steps of the scene")
         if part.warnings:
             console.print(f"  MuJoCo warns: {' '.join(part.warnings)}")
         if part.step_us:

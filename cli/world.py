@@ -197,8 +197,8 @@ def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Ite
     yield "least energy at the port", _energy(figures.port_least_J)
     yield "created by contacts", _energy(figures.created_J)
     yield "peak force", f"{listed(report.peak_force_N or (), 3)} N"
-    unsettled = figures.unsettled_ticks
-    yield "limited forces", f"{unsettled} ticks whose limited channels did not settle" if unsettled else None
+    unsettled = figures.unsettled_steps
+    yield "limited forces", f"did not settle in {unsettled} steps of the scene" if unsettled else None
     yield "MuJoCo warns", " ".join(figures.warnings) or None
     yield "active parts", ", ".join(report.scene.active) or None
     yield "scene", report.scene.settings

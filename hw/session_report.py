@@ -152,7 +152,7 @@ class _WorldSession(WorldRecord):
                     port_least_J=world.least,
                     released_J=world.port.released,
                     created_J=world.port.created,
-                    unsettled_ticks=world.port.unsettled,
+                    unsettled_steps=world.port.unsettled,
                     warnings=world.port.warnings,
                     step_us=_percentiles(1e6 * np.array(world.seconds)),
                 )

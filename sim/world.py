@@ -50,7 +50,7 @@ class WorldFigures(ShellFigures):
     created_J: (
         float  # upper bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
     )
-    unsettled_ticks: int  # steps of the scene in which limited forces still changed after the last repetition
+    unsettled_steps: int  # steps of the scene in which limited forces still changed after the last repetition
     warnings: list[str]  # the texts of MuJoCo's warnings
 
 
@@ -64,7 +64,7 @@ class WorldRecord:
     port_least_J: float
     released_J: float
     created_J: float
-    unsettled_ticks: int
+    unsettled_steps: int
     warnings: list[str]
 
     @classmethod
@@ -279,7 +279,7 @@ class InWorld:
             port_least_J=float(self._least.min()),
             released_J=max(port.released for port in self.ports),
             created_J=max(port.created for port in self.ports),
-            unsettled_ticks=max(port.unsettled for port in self.ports),
+            unsettled_steps=max(port.unsettled for port in self.ports),
             warnings=list(dict.fromkeys(text for port in self.ports for text in port.warnings)),
         )
 

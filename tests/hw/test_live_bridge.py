@@ -104,7 +104,7 @@ def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
     (world,) = report["world"]
     assert report["assessment"]["guarantee"]["energy_J"] == 2e-3
     assert world["ticks"] > 0
-    assert world["unsettled_ticks"] == 0
+    assert world["unsettled_steps"] == 0
     assert world["step_us"]["p50"] > 0
     trace, link = read(next(file for file in report["files"] if file.endswith("trace.npz")))
     assert 0 < link["received"].sum() <= len(trace.x) == report["run"]["samples"]

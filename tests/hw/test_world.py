@@ -84,7 +84,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
 
 
 def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
-    """Without repetitions of the step, the unsettled ticks are those with a force at the cap."""
+    """Without repetitions, the steps that do not settle are those with a force at the cap."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
     _, report, shown = session(tmp_path, capsys, *words)
@@ -92,8 +92,8 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
     (world,) = report["world"]
     limited = int((np.abs(link["asked"]) >= 1.0).any(axis=1).sum())
     assert limited > 20
-    assert world["unsettled_ticks"] == limited
-    assert f"{limited} ticks whose limited channels did not settle" in shown
+    assert world["unsettled_steps"] == limited
+    assert f"limited forces did not settle in {limited} steps of the scene" in shown
 
 
 @pytest.mark.slow

@@ -551,10 +551,3 @@ def test_springs_that_yield_are_not_in_the_lemma(tmp_path):
     yields = LINE.replace('axis="1 0 0"/>', 'axis="1 0 0" stiffness="100" springyield="0.004"/>')
     parts = {part.what: part.at_the_port for part in world(tmp_path, yields).parts()}
     assert "shell" in parts["springs that yield"]
-
-
-if __name__ == "__main__":
-    from tempfile import TemporaryDirectory
-
-    with TemporaryDirectory() as place:
-        print(sum(count_of_the_lemma(Path(place), scene, 6000) for scene in SCENES), "constraints within their bounds")

@@ -117,8 +117,8 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
         in (trace.meta["guarantee"])
     )
     energies = {"given_J", "port_least_J", "released_J", "created_J"}
-    assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks", "warnings"} | energies
-    assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (300, 0, 0)
+    assert set(world) == {"ticks", "ticks_acted", "unsettled_steps", "warnings"} | energies
+    assert (world["ticks"], world["ticks_acted"], world["unsettled_steps"]) == (300, 0, 0)
     assert trace.meta["scene"]["active"] == []
     assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
     np.testing.assert_array_equal(trace.f, again.f)
@@ -293,8 +293,8 @@ def test_ticks_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypa
     with np.load(out / "trace.npz") as trace:
         limited = int((np.abs(trace["f"]) >= 0.5).any(axis=1).sum())
     assert 20 < limited < 500
-    assert report["world"]["unsettled_ticks"] == limited
-    assert f"{limited} ticks whose limited channels did not settle" in " ".join(shown.split())
+    assert report["world"]["unsettled_steps"] == limited
+    assert f"did not settle in {limited} steps of the scene" in " ".join(shown.split())
 
 
 def test_this_environment_says_nothing_of_a_world():
