@@ -399,7 +399,7 @@ class Guarantee:
         facts: Properties of the loop that the condition covers (Assessment.facts).
         hands: The hands that the guarantee covers. For an energy account it is "no passive hand", which begins `words`.
         environments: "any passive environment", "these ranges", "this environment", ..
-        forces: Whether limited forces are covered, in words that follow "forces", or what scales the forces.
+        forces: Whether limited forces are covered, or what scales the forces, in words that follow "forces".
         delays: The range of the forces' delays [samples], lo and hi (m,); delays may change within it at every tick.
         periods: The longest period [s].
         energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
@@ -457,8 +457,8 @@ class Assessment:
         environment: The environment that runs: a network, or a plugged-in function.
         ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
-        transparency: The mismatch; None if it cannot be computed, for example without an E(z).
-        certificate: The exact proof, if one was given or made for the ranges.
+        transparency: The mismatch; None if it cannot be computed, for example because the environment has no E(z).
+        certificate: The exact proof that the caller supplied and that holds, or that for the ranges, or None.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
         condition: The name of the condition that must hold for `holds`; another one may give the guarantee.

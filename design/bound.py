@@ -67,7 +67,7 @@ _WANTED = 1e-3  # largest error of the bounds of D between frequencies, relative
 _QUADRATURE = 1e-8  # mean square that is always subtracted, because the estimate's rule has no error bound
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # Gauss's rule in each interval, for the proved bound
 _DISK = 4.0  # radius of the disk in which the integrand is bounded, in half-widths of an interval
-_UNIT = 2.0**-53
+_UNIT = 2.0**-53  # unit roundoff of double precision
 _LARGEST_CHARGE = 0.005  # The search ends if the bound is below the barrier's value by less than this share.
 
 

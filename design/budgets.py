@@ -5,7 +5,7 @@ No clock ends it unless the user sets a time limit, so that results do not depen
 counted from the sizes of matrices and numbers (`haptic_loop.controller.arithmetic.spend`); one unit takes about a
 second on one core.
 Limits of bisections down to rounding, and of iterations in a tick, are defined where they are used.
-The numbers were measured on 23 loops, of which 22 are in benchmarks/loops, on one core of an AMD EPYC at 2.4 GHz.
+The numbers were measured on 23 loops, 22 of which are n0 to o13 in benchmarks/loops, on a core of an AMD EPYC, 2.4 GHz.
 """
 
 from __future__ import annotations

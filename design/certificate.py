@@ -129,7 +129,7 @@ def prove(
     return certificate
 
 
-_made: set[str] = set()  # seals of the certificates that this process has proved for conditions of the package
+_made: set[str] = set()  # seals of certificates that this process has proved or verified for the package's conditions
 
 
 def _proof(
@@ -295,7 +295,7 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
     if not certificate.limiter:
         return base
     if not (base.extensible or base is KNOWN_DEVICE):
-        raise ValueError(f"facts: the file has the limiter, but {certificate.condition} does not cover limited forces")
+        raise ValueError(f"facts: the file lists the limiter, but {certificate.condition} covers no limited forces")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(

@@ -375,7 +375,7 @@ class Condition(ABC):
         return "these ranges" if loop.ranges else "this environment"
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        """Return the name of the member of the ranges that a matrix belongs to, to begin a message with, or ""."""
+        """Return the beginning of a message on a matrix: the member of the ranges that it belongs to, or ""."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 

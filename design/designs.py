@@ -133,7 +133,7 @@ def design_by_kind(
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
         why = f"{kind} couplings are not designed for a condition of your own, allowed are {able} and FILE.py:NAME"
-        raise ValueError(f"condition is {own.name}: {why}; it can judge a stored coupling FILE.json")
+        raise ValueError(f"condition is {own.name}: {why}; your condition can judge a stored coupling FILE.json")
     condition_name = usual_condition(loop, kind) if own or not name else name
     able = {c.name: c for c in chosen.conditions}
     if condition_name not in able:
@@ -264,7 +264,7 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
     with suppress(ValueError, DesignFailed):
         design = design_by_kind(loop, kind, **options)
         if design.requirement.certified:
-            return f"; {words} gives a coupling that needs {design.requirement.ratio:.4g} of the damping"
+            return f"; {words} gives a coupling that needs {design.requirement.ratio:.4g} of the available damping"
     return ""
 
 

@@ -31,7 +31,7 @@ from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.frequency import hermitian
 
-_UNIT = 2.0**-53
+_UNIT = 2.0**-53  # unit roundoff of double precision
 _EVALUATION = 6e-8  # units of counted work for one bend at one frequency
 _MOST = 40_000_000  # largest number of bends times frequencies for one matrix, which takes about two seconds
 _CHUNK = 2**18  # bends times frequencies that are processed together and fit into the cache

@@ -211,7 +211,7 @@ class _Search:
         self._hands, self._loop = condition.hands(loop), loop
         self._names = ", ".join(each.name for each in unknowns)
         self._units = np.array([unit for each in unknowns for unit in each.units])
-        self._searched = np.flatnonzero(self._units)
+        self._searched = np.flatnonzero(self._units)  # The other numbers are always 0.
         bounds = [(each.least, each.most) for each in unknowns for _ in each.units]
         self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last arguments and result of `swept`
@@ -219,7 +219,7 @@ class _Search:
         self._spare = np.diag(np.zeros(system.outputs) if demand.spare is None else demand.spare)
         self._plain: list[Demand[Lti]] = []  # the block for zero multipliers, then for each unknown alone
         self._root = np.ones(system.outputs)  # scales the rows of an inequality to about one
-        self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0
+        self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0  # whether to search at all
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
         """Return (required over available damping at these values, its frequency [rad/sample]), by a refined sweep."""
@@ -588,7 +588,7 @@ def least_phi(loop: Loop) -> Array | None:
         why = f"the multiplier Phi = {phi.tolist()} is not below the damping: with psi = {loop.psi} no damping is left"
         raise DesignFailed(None, (), f"{why} for a coupling")
     if not covers(loop, phi):
-        raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} may leave some frequency uncovered")
+        raise DesignFailed(None, (), f"E-hat + Phi may not be passive at some frequency for Phi = {phi.tolist()}")
     return phi
 
 
@@ -731,7 +731,7 @@ class _AnyEnvironment(Multiplied):
         return None if any(loop.psi) else loop.environment.active(loop.T)
 
     def not_varied(self, loop: Loop) -> str | None:
-        return "with psi >= 1 every K, T and delay has its own multiplier, not searched here" if any(loop.psi) else None
+        return "with psi >= 1 each K, T and delay needs another multiplier: not searched" if any(loop.psi) else None
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)

@@ -354,7 +354,7 @@ def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
     """
     n = G.order
     if P.shape != (n, n):
-        return f"P has shape {P.shape}, the model has {n} states"
+        return f"P has shape {P.shape}, the block has {n} states"
     if not P.equals(P.T):
         return "P is not symmetric"
     if _refuted_in_floating_point(G, P):
@@ -617,9 +617,9 @@ def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | 
         block = reached(block)
     n = block.order
     if len(rows) != n:
-        return f"{name} has {len(rows)} rows, the model has {n} states"
+        return f"{name} has {len(rows)} rows, the block has {n} states"
     if ragged := [len(row) for row in rows if len(row) != n]:
-        return f"{name} has a row of {ragged[0]} entries, the model has {n} states"
+        return f"{name} has a row of {ragged[0]} entries, the block has {n} states"
     try:
         common = 1
         for value in (value for row in rows for value in row):

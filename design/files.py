@@ -1,4 +1,4 @@
-"""Read files of limited size, write files atomically, and prepare text for messages.
+"""Read files of limited size, write files atomically, write reports as JSON, and prepare text for messages.
 
 Folders that the user names (--out DIR) and default folders (out/..) are created. The folder of a file that the user
 names (--json, --video, --out FILE) must exist, so that a typing error creates no folder. Within `one_command` a file
@@ -31,10 +31,11 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.units import keys_in_unit
 
-_MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
-_MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
-_MOST_UNPACKED = 4_000_000_000  # bytes of a trace: ten hours of two channels take 3e9
-_MOST_WORDS = 1000  # characters of one message
+# Largest sizes in bytes, and for _MOST_WORDS in characters.
+_MOST_TEXT = 2_000_000  # of a scenario, a human or recorded delays
+_MOST_STORED = 50_000_000  # of a stored coupling; a proof over 200 states takes a tenth of it
+_MOST_UNPACKED = 4_000_000_000  # of an unpacked trace; ten hours of two channels take 3e9
+_MOST_WORDS = 1000  # of one message
 
 _DEEPEST_KEY = 20  # largest number of names joined by dots, because tomllib's time and memory grow with its square
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""

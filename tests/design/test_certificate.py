@@ -231,7 +231,7 @@ def test_repaired_digests_do_not_forge_a_proof():
         "does not guarantee": change(good.certificate, guarantee="any passive environment"),
         "carries no exact proof": change(good.certificate, proof="sampled"),
         "expected P": change(good.certificate, matrices={}),
-        "the model has 9 states": change(good.certificate, matrices={"P": (("1",),)}),
+        "the block has 9 states": change(good.certificate, matrices={"P": (("1",),)}),
     }
     for reason, certificate in claims.items():
         assert reason in verify(change(good, certificate=sealed(certificate))).reason

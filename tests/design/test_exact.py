@@ -232,7 +232,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
     still = Lti(*([[Fraction(v)]] for v in ("1/2", "0", "0", "0")), Fraction(1))
     assert _prove_positive_real(still, Matrix.of([[1]])).startswith("D + D' is not positive definite")
     assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
-    assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the model has 1 states"
+    assert _prove_positive_real(G, Matrix.of(np.eye(2))) == "P has shape (2, 2), the block has 1 states"
 
 
 def random_exact(rng: np.random.Generator, n: int, m: int) -> Lti:

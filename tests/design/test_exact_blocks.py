@@ -526,5 +526,5 @@ def test_a_ragged_proof_is_refused():
     made = prove(asked, STIFF, "this-environment")
     P = made.matrices["P"]
     ragged = (P[0][:-1], *P[1:])
-    assert forged(asked, STIFF, made, matrices={"P": ragged}) == "P has a row of 8 entries, the model has 9 states"
-    assert forged(asked, STIFF, made, matrices={"P": P[:-1]}) == "P has 8 rows, the model has 9 states"
+    assert forged(asked, STIFF, made, matrices={"P": ragged}) == "P has a row of 8 entries, the block has 9 states"
+    assert forged(asked, STIFF, made, matrices={"P": P[:-1]}) == "P has 8 rows, the block has 9 states"
