@@ -1,4 +1,4 @@
-"""The loop that designs, checks, maps and the bridge use: devices, delays and environment.
+"""The loop that design, simulation and hardware use: devices, delays and environment.
 
                  x  sampled                                     Delta_D  damping that the devices guarantee
     devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T

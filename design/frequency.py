@@ -145,7 +145,7 @@ def too_long(G: Lti, sweeps: int = 1) -> str | None:
         return None
     states = f"{G.inner_order} states and {G.inputs} channels"
     fewer = "a smaller psi, or fewer channels or masses"
-    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g}: use {fewer}"
+    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g} s: use {fewer}"
 
 
 def sweeping() -> AbstractContextManager[None]:

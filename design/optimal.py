@@ -411,9 +411,9 @@ class _Search:
         heavier: float,
         least: float,
     ) -> Optimal:
-        """Return the optimum over a basis with one limiter, or None for `slip`, scaled so that every sweep passes.
+        """Return the optimum over a basis, scaled so that every sweep passes; `slip` is the limiter or None.
 
-        The proof is not tried if the optimum gains less than `least` [dB] over the solution `before`.
+        With a limiter the proof is tried, unless the optimum gains less than `least` [dB] over the solution `before`.
         """
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])

@@ -32,6 +32,7 @@ _MANY = 7  # With more parameters, vertices and points on edges are drawn at ran
 _APART, _SAME = 0.2, 0.05  # least distances of two starts of the compass search and of two maxima, in range widths
 _FIRST, _LAST = 1 / 16, 1 / 128  # first (up to _MANY parameters) and last step of the compass search, in range widths
 
+#: the search in words, for reports
 SEARCH = "along edges, on faces (up to 7 parameters) and inside, then uphill from the worst points"
 
 
