@@ -137,8 +137,8 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 def _blas() -> ThreadpoolController:
     """Return a controller of the BLAS libraries of NumPy and of SciPy.
 
-    SciPy is loaded here, because only loaded libraries are controlled. With OPENBLAS_NUM_THREADS=1 its library uses one
-    thread anyway.
+    SciPy is loaded here, because only loaded libraries are controlled. With OPENBLAS_NUM_THREADS=1 SciPy's library
+    uses one thread anyway.
     """
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         compiled("scipy.linalg._flapack")

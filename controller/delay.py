@@ -81,8 +81,8 @@ def ages(delays: Ticks) -> Ticks:
 def realising(wanted: Ticks) -> Ticks:
     """Return packet delays (ticks, ..) with which the device uses forces of the `wanted` ages (ticks, ..).
 
-    A packet that the device never uses arrives together with the next packet that it uses, or after the last tick. No
-    delay exceeds the largest wanted age. Raises ValueError if an age grows by more than one in a tick.
+    A packet that the device never uses arrives together with the next used packet, or after the last tick. No delay
+    exceeds the largest wanted age. Raises ValueError if an age grows by more than one in a tick.
     """
     ticks = wanted.shape[0]
     packet = np.arange(ticks).reshape(-1, *(1,) * (wanted.ndim - 1)) - wanted

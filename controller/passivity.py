@@ -78,9 +78,9 @@ _Lost = tuple[float, float, float]
 def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
     """Return Q'GQ, where an orthonormal Q omits the directions in which G is zero at every frequency.
 
-    He G is zero in these directions, such as the difference of two contacts with the same motion, and no finite number
-    of intervals could decide the sign of zero. The second result contains the norms of the omitted parts of B, C and D,
-    or is None if G is returned unchanged.
+    An example is the difference of two contacts with the same motion. He G is zero in these directions, and no finite
+    number of intervals could decide the sign of zero. The second result contains the norms of the omitted parts of B, C
+    and D, or is None if G is returned unchanged.
     """
     rows = [part / max(float(np.linalg.norm(part)), 1e-300) for part in (G.B, G.C.T, G.D, G.D.T)]
     _, sizes, V = np.linalg.svd(np.vstack(rows))

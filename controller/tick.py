@@ -143,9 +143,9 @@ def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> N
 class StepBuffer:
     """The record of a block of ticks, in a layout that the loop writes without copying.
 
-    A row holds [z, s, w, f] of one tick for all simulations: the process state, the plant state, whose first
-    `channels` entries are the positions x, the external forces, and the forces fed back. The next row begins with z+.
-    So the tick's input [z, x], its output [f, z+] and the plant's input [w, f] are contiguous in memory.
+    A row holds [z, s, w, f] of one tick for all simulations: the states of process and plant, the external forces, and
+    the forces fed back. The first `channels` entries of s are the positions x. The next row begins with z+. So the
+    tick's input [z, x], its output [f, z+] and the plant's input [w, f] are contiguous in memory.
     """
 
     def __init__(

@@ -734,7 +734,7 @@ def crowds(
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` lists the devices of each person with several, and `axes` each device's number of axes, as in Crowd.
+    `holds` lists the devices of each person who holds several, and `axes` each device's number of axes, as in Crowd.
     `known` are the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
     """
     drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}
