@@ -206,7 +206,7 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
     """Print the session's log, and the figures of the link, of energy accounts and of the scene.
 
-    Without an assessment, whose verdict was printed before, the end of the session comes first.
+    Without an assessment no verdict has been printed, so that the end of the session comes first.
     """
     if report.assessment is None:
         last = report.session.log[-1]

@@ -199,10 +199,10 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
 
 
 def shortened(rows: Rows, less: Sequence[str]) -> tuple[list[tuple[str, str | None]], list[str]]:
-    """Return at most _MOST_ROWS rows, and a line that names those left out, if any.
+    """Return the rows of a table, and a line that names those left out, if any.
 
-    The rows named in `less` are left out as far as necessary, the least important first. A row without a name belongs
-    to the row before it.
+    While there are more than _MOST_ROWS rows, rows named in `less` are left out, the least important first. A row
+    without a name belongs to the row before it.
     """
     kept, out = [row for row in rows if row[1] is not None], []
     names = list(accumulate((name for name, _ in kept), lambda before, name: name or before))
@@ -214,7 +214,7 @@ def shortened(rows: Rows, less: Sequence[str]) -> tuple[list[tuple[str, str | No
     return kept, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
 
 
-_MOST_ROWS = 15  # most rows of a table that `shortened` makes
+_MOST_ROWS = 15  # number of rows above which `shortened` leaves rows out
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:

@@ -88,7 +88,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """Return W0 [J], the initial energy of a world's account, from --energy-budget. Raises InputError for a cap."""
+    """Return W0 [J], with which a world's account begins: that of --energy-budget, or START_J. Raises InputError."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget

@@ -100,7 +100,7 @@ class _Board:
         return came[0] if came else None
 
     def follow(self, step: int, at: int, driving: bool) -> None:
-        """Shift the pairing of steps and samples where the median lead is outside of its limits.
+        """Change the pairing of steps and samples if the median lead is outside of its limits.
 
         Raises SafetyStop if this clock is clearly faster than the leading one, or slower by more than CLOCK_TOLERANCE.
         """

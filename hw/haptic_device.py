@@ -86,7 +86,7 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send CONFIG every 0.1 s until the device acknowledges or refuses it.
+        """Send CONFIG every 0.1 s until the device accepts it, or refuses it for another reason than RUNNING.
 
         Raises SafetyStop if the device still drives 50 ms after the first CONFIG.
         """

@@ -38,7 +38,7 @@ _HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds t
 
 
 class Stage(StrEnum):
-    """The stage of a session. The last five stages are final: only a new session leaves them."""
+    """The stage of a session. In the last five stages the session has ended, and only a new session can be armed."""
 
     CONNECTING = "connecting"  # HELLO sent, no INFO yet
     CONFIGURING = "configuring"  # CONFIG sent, no ACK yet

@@ -91,7 +91,7 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
-    """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m].
+    """Return the highest speed [m/s] (99.5 % of samples), the damping lost up to it, and its standard error [N s/m].
 
     The error is infinite where fewer than _FEW strokes count.
     """

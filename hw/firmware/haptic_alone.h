@@ -54,7 +54,7 @@ typedef struct { /* the test of one axis: sums over the ticks of a block */
     uint16_t tick;
     uint8_t block;
     ha_real acting;              /* [N] force since the last tick */
-    ha_real velocity, path, from; /* the force integrated once [N s] and twice [N s2]; position [m] at the start */
+    ha_real velocity, path, from; /* the force integrated once [N s] and twice [N s2]; position [m] at the block's start */
     ha_real paths, moves, both;  /* sums of path squared, motion squared, and path times motion */
     ha_real path_in[HA_DEGREE + 1], move_in[HA_DEGREE + 1]; /* sums of products with the orthogonal polynomials */
 } ha_answer;
