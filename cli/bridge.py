@@ -27,7 +27,7 @@ from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
-from haptic_loop.sim.couplings import NAMES
+from haptic_loop.sim.couplings import NAMES, encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
@@ -60,6 +60,9 @@ def main(argv: list[str]) -> int:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         choice = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
+        steps = session.units.encoder_step
+        encoder = encoder_steps(programs[0].scenario, args.case, programs[0].assessment, steps)
+        render.console(args).print(verdict(programs[0].assessment, encoder=encoder), soft_wrap=True)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
             note = "· delta is a full matrix; a device states one lower bound per axis"
@@ -140,7 +143,6 @@ def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
     """Print the measured ages and the certified couplings, before anything is armed."""
-    console.print(verdict(programs[0].assessment), soft_wrap=True)
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old (median), {at[99]} us at the 99th percentile, {ages.missing} of "
@@ -225,7 +227,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
         console.print(f"  {part.guarantee}")
     for i, part in enumerate(report.world or [], start=1):
         claim = Claim.of(report.assessment).words if report.assessment else "No guarantee."
-        console.print(f"world, arming {i}: {claim} The shell acted on {part.ticks_acted} of {part.ticks} ticks.")
+        acted = f"The shell acted on {part.ticks_acted} of {part.ticks} ticks."
+        console.print(f"world, arming {i}: {claim} The encoder steps of the devices are not covered. {acted}")
         if part.unsettled_steps:
             console.print(f"  limited forces did not settle in {part.unsettled_steps} steps of the scene")
         if part.warnings:

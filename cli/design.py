@@ -35,6 +35,7 @@ def main(argv: list[str]) -> int:
     """Design, prove and store a coupling. Return 0 if it is certified, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.api import store
+    from haptic_loop.sim.couplings import encoder_steps
 
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
@@ -52,10 +53,12 @@ def main(argv: list[str]) -> int:
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before.
+    encoder = encoder_steps(scenario, args.case, assessment)
     if slow:
-        render.announce(args, verdicts.verdict(assessment))
+        render.announce(args, verdicts.verdict(assessment, encoder=encoder))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
-    verdict = verdicts.lost(assessment, report.robustness) if slow else verdicts.verdict(assessment, report.robustness)
+    nearby = report.robustness
+    verdict = verdicts.lost(assessment, nearby) if slow else verdicts.verdict(assessment, nearby, encoder)
     tables, lines = _tables(scenario, report)
     if report.interrupted:
         lines = ["Interrupted: the robustness is missing, and perhaps the bound.", *lines]

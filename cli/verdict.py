@@ -76,7 +76,9 @@ def verdict(
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
         swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
-        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}"
+        exact = encoder and guarantee.proof != "account"  # A shell requires exact positions, a budget does not.
+        steps = f" {_NO_STEPS}" if exact else ""
+        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}{steps}"
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
     felt = f": {_percent(share)} of the stiffness" if share else ""
@@ -88,12 +90,13 @@ def verdict(
     if guarantee.proof != "rational":
         words.append("By a refined sweep, without an exact proof.")
     if encoder and not encoder.covered:
-        words.append("Not covered: the encoder steps of the devices.")
-    elif encoder and guarantee.environments in (ANY, RANGES):
-        words.append("Encoder steps are covered with the nominal object only.")
+        words.append(_NO_STEPS)
+    elif encoder:
+        words.append("Encoder steps are covered with this object only, while forces stay below their limits.")
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
 
 
+_NO_STEPS = "Not covered: the encoder steps of the devices."
 SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
 _NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness is no better than no force
 

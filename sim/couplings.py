@@ -289,17 +289,15 @@ class EncoderSteps:
         widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
         published = tuple(friction_max or [None] * len(steps))
         values = tuple(steps), tuple(friction), published
-        if loop.environment.walls or condition in KNOWN_CONDITIONS:
-            obstacle = "walls" if loop.environment.walls else condition
+        if loop.environment.walls or loop.environment.world or condition in KNOWN_CONDITIONS:
+            obstacle = "walls" if loop.environment.walls else "a world" if loop.environment.world else condition
             return cls(
                 *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved to suffice"
             )
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
-        verdict = (
-            "are covered with the nominal object while forces stay below the limits" if covered else "are not covered"
-        )
+        verdict = "are covered with this object while forces stay below the limits" if covered else "are not covered"
         if any(most is not None for most in published):
             bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
             has = f"at least {has} N (published: at most {bounds} N)"
@@ -309,14 +307,21 @@ class EncoderSteps:
         return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
 
 
-def encoder_steps(scenario: Scenario, case: str, assessment: Assessment) -> EncoderSteps | None:
-    """Compare the devices' friction with that needed for encoder steps; None without steps, or for a singular loop."""
+def encoder_steps(
+    scenario: Scenario, case: str, assessment: Assessment, steps: Sequence[float] | None = None
+) -> EncoderSteps | None:
+    """Compare the devices' friction with that needed for encoder steps in the environment that runs.
+
+    `steps` (m,) [m] replace those of the scenario. Returns None without steps, or for a singular loop.
+    """
     condition = assessment.guarantee and assessment.guarantee.condition
     fields = ("encoder_step", "friction", "friction_max")
-    steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
+    own, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
+    loop, running = scenario.loop(case), assessment.environment
+    loop = loop.at(running) if isinstance(running, Environment) else loop
     try:
-        return EncoderSteps.of(scenario.loop(case), assessment.coupling, steps, friction, most, condition)
+        return EncoderSteps.of(loop, assessment.coupling, steps or own, friction, most, condition)
     except ValueError:  # The algebraic loop has no solution, which the conditions report.
         return None
 

@@ -1,5 +1,6 @@
 """Tests of the Coulomb friction that covers encoder steps: its bound W, and the energy of quantised loops."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,9 @@ from asked import this_environment
 from msgspec.structs import replace as change
 from worlds import FIGURE_4
 
+from haptic_loop.cli.bridge import main as bridge_command
+from haptic_loop.cli.design import main as design_command
+from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
@@ -15,6 +19,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
+from haptic_loop.sim import scenario as scenario_module
 from haptic_loop.sim.couplings import EncoderSteps, encoder_steps
 from haptic_loop.sim.scenario import load
 
@@ -47,7 +52,8 @@ def test_axes_share_the_friction_of_their_device():
     """Friction of 0.3 N against the velocity in space may act with only 0.3/sqrt(3) N on each axis."""
     space = load("omega-space")
     devices = [change(device, friction=0.3, encoder_step=STEP) for device in space.device]
-    assessment = SimpleNamespace(guarantee=None, coupling=SpringDamper([400.0] * 6, [0.1] * 6))
+    coupling = SpringDamper([400.0] * 6, [0.1] * 6)
+    assessment = SimpleNamespace(guarantee=None, coupling=coupling, environment=space.environment)
     found = encoder_steps(space.replace(device=devices), "I", assessment)
     assert found.friction == pytest.approx([0.3 / 3**0.5] * 6)
 
@@ -74,7 +80,49 @@ def test_steps_are_covered_with_one_object_only():
     covered = EncoderSteps.of(LOOP, coupling, [STEP, STEP], [0.26, 0.26])
     words = verdict(assess(LOOP, coupling), encoder=covered)
     assert "any passive object" in words
-    assert "nominal object only" in words
+    assert "covered with this object only, while forces stay below their limits" in words
+
+
+def test_friction_is_compared_in_the_running_environment():
+    """With twice the mass, the error of a step rings longer: the friction needed grows by 37 %."""
+    coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
+    heavy = change(FIGURE_4, masses={name: 2 * mass for name, mass in FIGURE_4.masses.items()})
+    at_heavy = LOOP.at(heavy).F(coupling)
+    response, X = np.abs(at_heavy.D), at_heavy.B
+    for _ in range(60_000):
+        response, X = response + np.abs(at_heavy.C @ X), at_heavy.A @ X
+    needed = response.sum(axis=1) * STEP / 2
+    scenario = load().replace(environment=FIGURE_4, theta=LOOP.theta)
+    devices = [
+        change(device, friction=float(f), encoder_step=STEP)
+        for device, f in zip(scenario.device, 1.01 * encoder_friction(F, steps), strict=True)
+    ]
+    scenario = scenario.replace(device=devices)
+    assessment = SimpleNamespace(guarantee=None, coupling=coupling, environment=FIGURE_4)
+    assert encoder_steps(scenario, "I", assessment).covered
+    assessment.environment = heavy
+    running = encoder_steps(scenario, "I", assessment)
+    assert not running.covered
+    assert running.friction_needed == pytest.approx(needed, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda out: design_command(["--delta", "1.37,1.37", "--out", f"{out}/c.json", "--scenario", f"{out}/s.toml"]),
+        lambda out: validate_command(
+            ["--humans", "2", "--duration", "0", "--no-plot", "--out", f"{out}/v", "--scenario", f"{out}/s.toml"]
+        ),
+        lambda out: bridge_command(["--rehearse", "--duration", "0.2", "--no-plot", "--out", f"{out}/b"]),
+    ],
+    ids=["design", "validate", "bridge"],
+)
+def test_commands_say_that_steps_are_not_covered(run, tmp_path, capsys):
+    """A device of a session always has counts, whatever its scenario declares."""
+    source = (Path(scenario_module.__file__).parent / "scenarios" / "omega-pair.toml").read_text()
+    (tmp_path / "s.toml").write_text(source.replace("force_limit = 12.0", "encoder_step = 1e-5\nforce_limit = 12.0"))
+    run(tmp_path)
+    assert "Not covered: the encoder steps" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_l1_gain_is_a_close_upper_bound():

@@ -326,7 +326,7 @@ def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     assert line in plain["remarks"]
     assert not plain["varying_delay"]["covered"]
     # A playout buffer makes the delay (2, 2), which needs 1.70 of 1.37 N s/m: it does not help these gains.
-    assert "the constant [2, 2], for which it is not certified either" in plain["varying_delay"]["covers"]
+    assert "the constant [2, 2], which no certificate covers either" in plain["varying_delay"]["covers"]
     lossy = run(file, "--varying-delay", "1,2", "--loss", "0.1")["varying_delay"]
     assert not lossy["covered"]
 
