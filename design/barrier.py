@@ -1,11 +1,11 @@
-"""A least-squares problem under linear matrix inequalities at many frequencies, by a log-det barrier.
+"""Solve least-squares problems under linear matrix inequalities at many frequencies (design.program, design.bound).
 
 minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
 
-The barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is strictly
-feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k. A Newton
-step is a least-squares problem in the directions S^-1/2 dS S^-1/2. The best length of a step follows from the
-eigenvalues of these matrices without further evaluations.
+The log-det barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is
+strictly feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k. A
+Newton step is a least-squares problem in the directions S^-1/2 dS S^-1/2, where dS is the change of S. The best length
+of a step follows from the eigenvalues of these matrices without further evaluations.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A lower bound on the transparency error of all linear couplings that this-environment certifies.
+"""Compute a lower bound on the transparency error of all linear couplings that this-environment certifies.
 
-The bound follows from weak duality: every feasible point of the dual problem gives a lower bound.
+python -m design prints it for an optimal coupling. By weak duality every dual feasible point gives a lower bound.
 
 The coupling may have any order. The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is
 analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the

@@ -1,4 +1,4 @@
-"""Compute the figures of reports on switching delays and on ranges."""
+"""Compute the figures of reports on switching delays (audits, sim.switching) and on ranges (python -m design)."""
 
 from __future__ import annotations
 

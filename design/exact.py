@@ -1,4 +1,4 @@
-"""Exact arithmetic: definiteness and positive realness over the rationals, and the matrices of proofs in files."""
+"""Find and check the matrices of proofs over the rationals: definiteness and positive realness in exact arithmetic."""
 
 from __future__ import annotations
 
