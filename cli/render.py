@@ -1,4 +1,4 @@
-"""Reports as tables on the terminal and as JSON.
+"""Print reports as tables on the terminal, and write them as JSON.
 
 A report is a dataclass of figures in SI units. Its fields are the keys of its JSON. A field made by `figure` has a name
 and a format, and becomes a row (name, text) of the table; a row whose text is None is left out.

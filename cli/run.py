@@ -251,7 +251,7 @@ def _tables(scenario: Scenario, report: RunReport) -> tuple[list[Any], list[str]
 
 
 def _rows(report: RunReport) -> render.Rows:
-    """Yield the rows of the table."""
+    """Yield the rows of the report's first table."""
     stability, run, assessment = report.stability, report.run, report.assessment
     felt = assessment.transparency
     ratio = felt and finite(felt.dc_ratio)

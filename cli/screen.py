@@ -1,4 +1,4 @@
-"""A terminal for reports that never cuts numbers in tables and prints names literally."""
+"""A terminal for reports: it never cuts numbers in tables, and it prints names literally."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""python -m sim.validate: test a loop with random passive humans in both engines, and with an adversary."""
+"""python -m sim.validate: test a loop with random passive humans in both engines, and search for the worst human."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
 
 
 def _about(conditions: Sequence[str]) -> str:
-    """Return the words for the axes and for the guarantee of a certified cell."""
+    """Return a remark on what K and B are, and on what a certified cell guarantees."""
     line = "K and B belong to every contact spring; a sweep certifies each cell for its environment alone"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."

@@ -41,7 +41,7 @@ from haptic_loop.controller.lti import Array
 _WINDOW = 0.012  # [s] least standard deviation of h; this h halves amplitudes at 16 Hz
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] rounding noise allowed in accelerations; a coarse encoder gets a longer window
 _SPEED_NOISE = 3e-4  # [m/s] rounding noise allowed in the speed that friction depends on; sets the shortest window
-_SPACING = 0.4  # distance of two rows, in standard deviations of h: filtered signals have no finer detail
+_SPACING = 0.4  # distance of two rows of the fit, in standard deviations of h: filtered signals have no finer detail
 _NEARBY = 3.5  # least distance of a row from a tick at which the balance does not hold, in standard deviations of h
 _REACH = 6  # standard deviations at which a window is cut off
 _STILL = 0.02  # [s] an axis is at rest if its encoder stays within one count for this long

@@ -357,7 +357,7 @@ class LinkMonitor:
 
 
 class _Tick(NamedTuple):
-    """One new STATE's facts about the link."""
+    """The facts about the link that one new STATE reports."""
 
     margin: int | None  # [us]
     missed: int
@@ -668,7 +668,7 @@ class EncoderTest:
         moved -= smooth @ (smooth.T @ moved)
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
-        # standard deviation [m] of rounding, or of noise if that is larger: `still` / 2, a range in 100 ms, spans four
+        # standard deviation [m] of rounding, or of noise if that is larger: the range `still` / 2 spans four of them
         scatter = np.array(self._units.encoder_step) * np.maximum(12**-0.5, np.array(self._still) / 8)
         own = np.maximum((moved**2).sum(axis=0) - len(t) * scatter**2, len(t) * scatter**2)
         fit = size**2 * power / own
@@ -792,7 +792,7 @@ class EncoderMonitor:
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
-        """Take `still` (m,) [counts], the encoders' noise."""
+        """Take `still` (m,) [counts], the ranges in which the encoders rest."""
         self._lever, self._T, self._units, self._still, m = limits.lever, T, units, still, len(still)
         #: (m,) [N] unit of force changes: 1 N, or half of the cap of a weak motor
         self._newton = [min(limits.lever, cap / 2) for cap in limits.cap]

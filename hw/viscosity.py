@@ -162,7 +162,8 @@ class Spectra:
     def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
         """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
 
-        The model assumes that a force `end` [N] in one more tick stops the motion left at the end of the record.
+        m1 and m2 [kg] are motor and handle, k [N/m] and d [N s/m] the transmission between them. The model assumes
+        that a force `end` [N] in one more tick stops the motion left at the end of the record.
         """
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
         link = k + d * s
