@@ -64,7 +64,7 @@ def test_tables_come_before_the_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_the_default_is_the_design_for_this_environment(tmp_path):
-    """The paper's condition renders half of the environment's stiffness; the first run should show what is possible."""
+    """The default is the more exact design; any-environment renders only half of the environment's stiffness."""
     code, report = run(tmp_path, "--case", "I", "--duration", "10", "--no-plot")
     assert code == 0
     assert report["assessment"]["condition"] == "this-environment"

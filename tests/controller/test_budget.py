@@ -112,7 +112,7 @@ def test_no_hand_is_given_more_than_the_budget():
 def test_the_budget_holds_on_stiffer_springs():
     """The default scenario's optimal coupling meets springs 2.5 times stiffer, compliant devices and lossless hands.
 
-    With the budget no energy is supplied, and hands stay below 0.5 m/s; without it most of them exceed 2 m/s.
+    With the budget forces give at most what devices dissipate, and hands stay below 0.5 m/s; else most exceed 2 m/s.
     """
     scenario, nsim = load(), 30
     coupling = design_coupling(scenario.loop("I"), "optimal", "this-environment").coupling

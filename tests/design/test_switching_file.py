@@ -221,7 +221,7 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
         E = environment_by_hand(member.network, z)
         G = np.linalg.solve(one + E @ V, E)
         nominal = ((1 / z + 1 / z**2) / 2 / (z - 1))[:, None, None] * G
-        error = np.conj(G).swapaxes(1, 2) @ np.linalg.inv(8 * alpha) @ G  # (half a tick)^2 / (2 alpha)
+        error = np.conj(G).swapaxes(1, 2) @ np.linalg.inv(8 * alpha) @ G  # h^2/(2 alpha), h = 1/2
         free = (nominal + np.conj(nominal).swapaxes(1, 2)) / 2 - alpha / 2 - error
         least.append(np.linalg.eigvalsh(free + np.diag(ranged.required) / T)[:, 0].min())
     assert min(least) == pytest.approx(0, abs=1e-4 * 1.37 / T)

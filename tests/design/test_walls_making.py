@@ -321,7 +321,7 @@ def pressed_at_rest(damping=0.0):
 
 
 def swinging(loop, coupling, damping, ticks, seed=11):
-    """Return the largest speed [m/s] of lossless hands in the last 2 % of the ticks, and the number of all contacts."""
+    """Return the largest speed [m/s] of lossless hands in the last 2 % of the ticks, and how often contact was made."""
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3, HANDS)
     A = np.zeros((HANDS, 3, 3))

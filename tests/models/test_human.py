@@ -168,7 +168,7 @@ def test_a_port_is_its_matrices():
     np.testing.assert_allclose(M @ got.B[2:, scene.pushed[0]], [0, 1], atol=1e-12)
 
 
-def test_a_lever_moves_what_it_should():
+def test_levers_enter_the_plants_matrices():
     """A spring on a lever lengthens by 2 x_2 - x_1 / 2; another one by 3 x_2 alone."""
     port = Port([0.1, 0.5], [[-0.5, 2, 0], [0, 3, 0]], [1.0, 2.0], [100.0, 50.0])
     got, M = plant(build([DEVICE], [Own(port)]).model), np.diag([0.3, 0.5])
