@@ -140,7 +140,7 @@ class EmulatorProcess:
         self._said = Path(self._folder.name, "err")
         path = Path(self._folder.name, "out")
         self._number = begin("tests.pseudo_terminal", *options, out=path, err=self._said)
-        assert _within(_PATIENCE, lambda: path.exists() and path.read_text().endswith("\n")), "the emulator did not start"
+        assert _within(_PATIENCE, lambda: path.exists() and path.read_text().endswith("\n")), "no emulator started"
         self.path = path.read_text().strip()
 
     def end(self, patience: float = 0.0) -> dict[str, str]:

@@ -267,7 +267,7 @@ def test_this_environment_is_asked_of_every_frozen_state():
 
 
 def test_stiffer_couplings_are_certified_for_switching_walls():
-    """With one sample of delay and B = 0.5 any-environment certifies up to 1033 N/m. 1200 N/m is certified for the
+    """With one sample of delay and B = 0.5 any-environment certifies up to 1032 N/m. 1200 N/m is certified for the
     switching wall, and 1772 N/m with B = 0.453 only in each frozen state."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified

@@ -148,7 +148,7 @@ def test_a_limiter_of_known_devices_names_them():
 
 
 def test_limited_forces_are_not_searched_between_vertices():
-    """The limiter's block needs 0.985 times 1.37 N s/m at both ends of the mass, and 0.03 % more between them."""
+    """The limiter's block needs 0.9848 times 1.37 N s/m at one end, and with this multiplier 0.03 % more between."""
     springs = (LOOP.environment.springs[0], change(LOOP.environment.springs[1], stiffness=700.0))
     network = change(LOOP.environment, masses={"mass": 3.0}, springs=springs)
     loop = change(LOOP, environment=network, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.985 * 1.37,))

@@ -154,7 +154,7 @@ def test_without_coupling_only_the_compliant_device_oscillates():
         loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 30)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 16 < unstable["compliant"] < 30  # 0.78 of many pairs oscillate, give or take three standard deviations
+    assert 16 < unstable["compliant"] < 30  # 0.81 of many pairs oscillate: 24 of 30 on average
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():

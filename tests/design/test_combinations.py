@@ -187,7 +187,7 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
         gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
         best = np.argmax(gained, axis=0), every
         most = gained[best]
-        if most.max() > 1e6:  # [J]; hands begin with less than 0.02 J
+        if most.max() > 1e6:  # [J]; hands begin with less than 0.5 J
             return int((most > 1.0).sum())
         plant, applied = np.stack([now[:, 0][best], now[:, 1][best]]), acting[best]
         at = 0 if 0.4 * ticks < k < 0.5 * ticks else 1 if k > 0.9 * ticks else None

@@ -257,7 +257,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
-    """P has a condition number of 1e15, and all its digits are stored.
+    """P has a condition number above 1e15, and all its digits are stored.
 
     Without the second solve, which weighs g more, the design would have g = 0.017.
     """
@@ -810,7 +810,7 @@ def test_limited_forces_are_not_designed_for_ranges():
 
 @pytest.mark.parametrize("seed", [11, *(pytest.param(n, marks=pytest.mark.validate) for n in (12, 14))])
 def test_every_loop_gets_an_answer_and_proof(seed):
-    """The loops are extreme: 15 samples of delay, 54 kg, springs of 0.08 N/m, dampings of 0.04 N s/m."""
+    """The loops are extreme: 15 samples of delay, 54 kg, springs of 0.03 N/m, dampings of 0.04 N s/m."""
     found = design(hostile(np.random.default_rng(seed)), SMALLEST)
     assert found.proved
     assert isinstance(found.coupling, ForceFilter)
