@@ -338,7 +338,7 @@ def _rms(values: Array) -> float:
 
 # ---- the cheapest engine and step for a given error
 #
-# The error is the relative rms error of the encoders' positions over the run. On a smooth scene the exact loop is the
+# The error is the relative rms error of the encoders' positions over the run. Without friction the exact loop is the
 # reference. With friction there is no exact loop: runs of RK4 with n and 2 n substeps are compared, and n is doubled
 # until the difference is small enough. If every doubling multiplies the difference by q, the error of the finest run is
 # q/(1 - q) times the last difference; a method of first order has q = 1/2. One pair of runs may agree by chance, so q

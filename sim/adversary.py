@@ -4,11 +4,11 @@ A lossless chain of masses and springs takes no energy out, and can present any 
 loop is weakest. Masses and stiffnesses are bounded, so that no mode of a human exceeds about 3 kHz; above it, errors of
 the matrix exponential would decide the verdict.
 
-The conditions assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact it dissipates the
-integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f, |dx|^2 / T is
-(sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore requires too
-much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). With damping inside this gap no
-search has found an unstable human; with less damping most searches find one.
+All conditions but the known-device ones assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact
+it dissipates the integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f,
+|dx|^2 / T is (sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore
+requires too much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). With damping inside this
+gap no search has found an unstable human; with less damping most searches find one.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def search_population(
     """Search for the worst sets of hands that the scenario's population can draw.
 
     In the first generation all sets are new draws, later half of them. The others take each device's hand from one of
-    the worst sets so far, or from a new draw. Each hand is therefore one that the population drew, whatever its class.
+    the worst sets so far, or from a new draw. So each hand is one that the population drew.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []

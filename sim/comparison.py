@@ -2,7 +2,7 @@
 
 The alternatives are: no coupling, the paper's gains (in the paper's loop only), and the spring-dampers for any passive
 environment and for this environment. The optimal coupling is included if it is quick to find. Each coupling is assessed
-with its proof and, in loops without walls and friction, drives the same hands in the exact engine. Over frequency,
+with its proof and, in loops without walls or friction, drives the same hands in the exact engine. Over frequency,
 couplings of the user's choice are compared by required damping, robustness and felt impedance.
 """
 

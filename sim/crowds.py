@@ -129,7 +129,7 @@ class Validation:
         return crowd
 
     def can_store(self, index: int) -> bool:
-        """Return whether a file can hold the humans with this index; none can hold a hand of a user's own class."""
+        """Return whether a file can hold the humans with this index; files hold only hands of the class Human."""
         return all(isinstance(human, Human) for human in self.crowd(index).humans(0))
 
 

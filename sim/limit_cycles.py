@@ -185,7 +185,7 @@ class Points:
     oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace
     amplitude: Array  # [m] of the oscillation; inf: diverged
     frequency_hz: Array  # [Hz] of the oscillation; nan: diverged
-    growth: Array  # [1/s] of the exact loop's dominant mode among those that oscillate visibly or run away
+    growth: Array  # [1/s] of the exact loop's fastest growing mode that oscillates visibly or runs away
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:

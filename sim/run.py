@@ -60,7 +60,7 @@ _COPIES = 4  # largest number of copies of a trace that a run and its report kee
 _SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
 _COLUMNS = 50  # numbers per tick that a report needs in memory even if the trace is on disk
 _BLOCK = 2048  # ticks between two calls of `progress`, each with a check of the numbers and of the engine
-_AHEAD = 8  # number of blocks for which outside forces are sampled together
+_AHEAD = 8  # number of blocks for which external forces are sampled together
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def stiffness_scale(self) -> float:
-        """Bound on any linear coupling's stiffness for all passive environments, 2 delta/((theta + 1) T) [N/m]."""
+        """The largest bound 2 delta/((theta + 1) T) [N/m] of a channel's stiffness for any passive environment."""
         return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
@@ -137,7 +137,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), for contacts that make and break; inf: refused or unbounded."""
+        """Return required over available damping (n,), inf if refused or no damping is enough; walls make and break."""
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
