@@ -42,7 +42,7 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # total of all channels [samples]; eigenvalues of 1000 states take ten seconds, of 2000 a minute
-_MOST_CHANNELS = 32  # without a coupling a run of 16 channels takes 13 s of CPU time, a run of 50 takes minutes
+_MOST_CHANNELS = 32  # a run of 32 channels without a coupling takes 12 s of CPU time
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]
