@@ -183,7 +183,7 @@ class _DelaysMet:
     def how(self) -> str:
         """The method behind the growth of `worst`, in words."""
         if self.period:
-            return f"growth by the eigenvalues of the product over the {self.period.ticks} ticks of a period"
+            return f"growth by the eigenvalues of the map over one period of {self.period.ticks} ticks"
         return f"growth of the linear loop after an impulse, over {self.judged_s:.3g} s under the run's delays"
 
 

@@ -277,8 +277,8 @@ class Attacked:
     def __str__(self) -> str:
         grows = f"a human with whom the loop grows by {self.growth_rate_per_s:+.4g} 1/s"
         ratio, verdict = self.required_over_available_damping, grows if self.found else "no destabilising human"
-        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
-        return f"{verdict} among {self.evaluated}; {close}"
+        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} times its damping"
+        return f"{verdict} among {self.evaluated} sets; {close}"
 
 
 def _held(humans: tuple[Hand, ...]) -> list[_Held]:
