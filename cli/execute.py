@@ -1,4 +1,4 @@
-"""Running a command: errors become one line on standard error, and the exit code says what happened."""
+"""Run a command: its errors become one line on standard error, and its exit code says what happened."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from haptic_loop.sim.scenario import InputError
 
 
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
-    """Run a command and leave with its exit code; bad input is one line on standard error.
+    """Run a command and exit with its exit code. For bad input, print one line on standard error.
 
     The reader of standard output may stop at any line (`| head -1`) without changing the exit code, also under
-    `set -o pipefail`. SIGTERM ends a command like Ctrl-C: temporary files are removed.
+    `set -o pipefail`. Temporary files are removed if SIGTERM or Ctrl-C ends the command.
     """
     code: str | int | None
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
@@ -58,14 +58,14 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         code = _say("error: there is not enough memory for this", UNFINISHED)
     except OSError as error:  # mostly a full disk
         code = _cannot(error)
-    except Exception as error:  # The exit code 1 would mean that a claim does not hold.
+    except Exception as error:  # Python's exit code 1 would mean that a claim does not hold.
         place, code = place_of(error), UNFINISHED  # `place` is None for a mistake in this package
         if place and is_refusal(error):
             code = _say(f"error: {place}: {error}", BAD_INPUT)
         else:
             traceback.print_exc()
             if place:
-                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
+                code = _say(f"error: {place}, which is your own code: {type(error).__name__}: {error}", BAD_INPUT)
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -79,7 +79,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
 
 
 def _run(main: Callable[[list[str]], int], argv: list[str]) -> int:
-    """Run the command. An error raised from KeyboardInterrupt, as by a compiled module at its import, is Ctrl-C."""
+    """Run the command. An error caused by a KeyboardInterrupt, as in a compiled module's import, counts as Ctrl-C."""
     try:
         return main(argv)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""haptic-loop COMMAND: every command under one name, and the entry points of python -m sim.run and others.
+"""Run the commands: as haptic-loop COMMAND, and as python -m sim.run and other modules, which call `door`.
 
 This module imports nothing that takes time, so that the second process, which draws the picture, starts at once.
 """
@@ -57,7 +57,7 @@ def _run(command: str, words: list[str]) -> NoReturn:
     if command == "run" and not {"--no-plot", "-h", "--help"} & {*words}:
         painter.begin()
     atexit.register(gc.freeze)  # Otherwise Python would search all objects for garbage at the end, for 0.1 s.
-    from haptic_loop.cli.execute import execute  # It imports NumPy.
+    from haptic_loop.cli.execute import execute  # This import loads NumPy.
 
     execute(lambda argv: _command(command).main(argv), words)
 

@@ -41,7 +41,7 @@ def _started() -> subprocess.Popen[bytes] | None:
     command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
-    try:  # In a new session the process is not ended by Ctrl-C, after which a run still draws its picture.
+    try:  # In a new session, Ctrl-C does not end the process: an interrupted run still draws its picture.
         return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=none, start_new_session=True)
     except OSError:
         return None
@@ -72,10 +72,10 @@ class Painter:
             request = pickle.dumps((spoken(), function, arguments), pickle.HIGHEST_PROTOCOL)
             with suppress(BrokenPipeError), self._process.stdin as stdin:
                 stdin.write(request)
-            self._process.stdin = None  # for communicate()
+            self._process.stdin = None  # communicate() must not use the closed pipe
 
     def save(self, path: Path) -> Path:
-        """Write the figure that was asked for as a PNG file. Raises InputError if the file cannot be written."""
+        """Write the figure of `ask` as a PNG file. Raises InputError if the file cannot be written."""
         assert self._asked
         if self._process:
             from haptic_loop.design.files import write
@@ -91,7 +91,7 @@ class Painter:
 
 
 def serve() -> None:
-    """Draw the picture that standard input asks for, and write it to standard output. The second process runs this."""
+    """Read what `ask` sends from standard input, and write its picture to standard output, in the second process."""
     import pickle
 
     os.environ["MPLBACKEND"] = "Agg"
@@ -103,7 +103,7 @@ def serve() -> None:
     speak(unit)
     sys.stdout.buffer.write(plots.png(getattr(plots, function)(*arguments)))
     sys.stdout.flush()
-    os._exit(0)  # without Python's clean-up, for which the other process would wait
+    os._exit(0)  # Skip Python's clean-up, for which the first process would wait.
 
 
 def skip_docstrings() -> None:

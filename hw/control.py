@@ -505,7 +505,7 @@ class CertifiedCoupling:
         """The number of missed answers in a row for which the coupling's file proves that a force may be held."""
         span, theta = self.chosen.switching, self.scenario.theta
         if span is None or is_world(self.scenario) or not span.contains(DelayRange(theta, theta)):
-            return 0  # A world's shell is proved for constant delays only.
+            return 0  # In a world, the energy shell is proved for constant delays only.
         return min(hi - n for hi, n in zip(span.hi, theta, strict=True))
 
     def controller(self, cap: Sequence[float]) -> Controller:
@@ -537,7 +537,7 @@ class CertifiedCoupling:
         if self.held < 1:
             return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
-        rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # of the limiter in the file's proof
+        rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # rho of the limiter in the file's proof
         below = "" if rho and rho == self.assessment.force_limits.rho else " while forces stay below their limits"
         return [*said, f"a force that is held through {answers} is covered by the file's proof{below}"]
 

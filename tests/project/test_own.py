@@ -129,7 +129,7 @@ def test_an_own_environment_is_proved_and_stored(name, covered, place):
         ("mine.py:np", "environment module: expected a class with contacts"),
         ("mine.py:soft", "stiffness between left"),
         ("mine.py:negative", "stiffness between left"),
-        ("mine.py:broken", "which is your own: ZeroDivisionError: division by zero"),
+        ("mine.py:broken", "which is your own code: ZeroDivisionError: division by zero"),
         ("mine.py:nobody", "mine.py has no nobody; it defines Weighted, Duck, "),
         ("yours.py:X", "there is no file yours.py"),
         ("mine:Gel", "expected FILE.py:NAME"),
@@ -173,7 +173,7 @@ def test_a_scenario_file_executes_nothing(line, place):
         ),
         (
             "0 * t if t[-1] < 0.2 else 1 // 0 + t",
-            "friends.py, line 10, which is your own: ZeroDivisionError: ",
+            "friends.py, line 10, which is your own code: ZeroDivisionError: ",
         ),
     ],
 )
