@@ -108,7 +108,7 @@ def _parser() -> options.Parser:
     parser.add_details()
     parser.add_output(picture=True)
     parser.only("with MuJoCo: leave out --engine exact", lambda args: args.engine != "exact", "integrator", "substeps")
-    add("--paper", action="store_true", help="a table of the figures that the paper prints, beside those of this run")
+    add("--paper", action="store_true", help="also print the figures of the paper beside those of this run")
     return parser
 
 

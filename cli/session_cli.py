@@ -50,7 +50,7 @@ def add_link_options(parser: options.Parser) -> None:
     port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
     port += f"{FORCE_DIMENSION}[:0x,1x]: index of a device and letter of its axis, for each channel"
     add("--port", metavar="PATH", help=port)
-    virtual = "the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
+    virtual = "run the whole session in virtual time with an emulated device: no port, no waiting, repeatable"
     add("--rehearse", action="store_true", help=virtual)
     fault = (
         "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; the prefix up: or down: means "
@@ -91,7 +91,7 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--force-cap", type=number(0.05, 12.0), default=1.3, metavar="NEWTON", help=cap)
     speed = "fastest motion of a hand while forces act (default 0.7, at most the devices' least credible_speed)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
-    heat = "force that each motor bears without end, or one number for all; larger forces are limited in time by I2t "
+    heat = "force that each motor can hold for ever, or one number for all; larger forces are limited in time by I2t "
     heat += "(default: not watched)"
     add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
     warm = "time constant of the motors' heating (default 10)"

@@ -94,7 +94,7 @@ def _parser() -> options.Parser:
     )
     rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
-    K, B = "[N/m]; default from delta, theta and T, or from the contact springs", "[N s/m]; default from delta"
+    K, B = "K [N/m] (default from delta, theta and T, or from the contact springs)", "B [N s/m] (default from delta)"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
     of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
     mark = "also judge and mark this point (repeatable)"
