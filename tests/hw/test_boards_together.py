@@ -203,7 +203,7 @@ class _Terminals:
 
 def test_two_ports_reach_the_serial_stack(scenario, alone, made, monkeypatch, capsys, tmp_path):
     """In virtual time, the command runs over pyserial, two pseudo-terminals and clocks that differ by 100 ppm."""
-    pytest.importorskip("serial")
+    pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
     rehearsal = rehearsal_of(scenario, [nobody(one) for one in alone], (), 1.0001, begin_us=SLIP_SOON)
     ports = _Terminals(rehearsal, monkeypatch).ports
 

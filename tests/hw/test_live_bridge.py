@@ -284,7 +284,7 @@ def test_a_device_is_identified_over_the_line(tmp_path, paces):
         late = "no new STATE", "by the host's clock", "without a STATE", "cause watchdog", "never arrived"
         assert any(words in report["reason"] for words in late)
         assert len(paces) == 1
-        return
+        pytest.skip("the machine is too busy for a session in real time")
     assert report["axes"] or "dry friction" in report["reason"]
     assert all(0 < axis["friction"]["delta"] <= 1.37 for axis in report["axes"])
 
