@@ -17,10 +17,10 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
-from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
+from haptic_loop.design.environments import ANY_ENVIRONMENT, SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.frequency import Response, frequencies, on_circle
-from haptic_loop.design.result import PLAIN_CONDITIONS, Requirement
+from haptic_loop.design.result import Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling over frequency: singular values, required damping, and what a hand perceives.
@@ -62,14 +62,15 @@ def judge(
 ) -> Demands:
     """Evaluate F with all walls touching, each condition's requirement, and the required damping over frequency.
 
-    The conditions are the plain ones and a user's `own`; `known` are requirements from an assessment of this loop and
-    coupling. Raises SingularLoop if the algebraic loop has no solution.
+    The conditions are this-environment, or switching for delays that switch, any-environment and a user's `own`;
+    `known` are requirements from an assessment of this loop and coupling. Raises SingularLoop if the algebraic loop has
+    no solution.
     """
     F, known = loop.F(coupling), known or {}
-    here = loop.at(loop.environment).switching(None)
+    here = loop.at(loop.environment)
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
-    for each in (*map(named, PLAIN_CONDITIONS), *own):
+    for each in (SWITCHING if loop.varying_delay else THIS_ENVIRONMENT, ANY_ENVIRONMENT, *own):
         needs = requirements[each.name] = known.get(each.name) or each.judge(here, coupling)
         curve = each.over_frequency(here, coupling, needs.multiplier) if np.isfinite(needs.ratio) else None
         demands[each.name] = curve

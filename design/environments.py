@@ -434,7 +434,8 @@ class ThisEnvironment(Multiplied):
         return None
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-        return ratio_in(loop, coupling, thin) if self.extensible else super().ratio(loop, coupling, thin)
+        quick = self.extensible and not loop.varying_delay  # `ratio_in` ignores delays that switch.
+        return ratio_in(loop, coupling, thin) if quick else super().ratio(loop, coupling, thin)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         if not self.extensible:

@@ -28,7 +28,6 @@ from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.known_device import KNOWN_DEVICE, KnownDevice, LimitedKnownDevice, largest_beta
 from haptic_loop.design.result import Design, DesignFailed, NotProved
-from haptic_loop.design.robustness import at
 from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
@@ -265,7 +264,7 @@ class _Search:
             raise ValueError("an optimal coupling covers delays that switch or a latency, not both: remove one")
         cases: list[program.Case] = []
         for member in loop.members():
-            there = at(loop, member.network)
+            there = loop.at(member.network).switching(None)
             constraints = [
                 program.this_environment(there),
                 *([program.switching(there, loop.varying_delay)] if loop.varying_delay else []),

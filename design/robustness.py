@@ -33,11 +33,6 @@ class Robustness:
     certified: bool  # whether the condition holds in the worst environment
 
 
-def at(loop: Loop, network: Network) -> Loop:
-    """Return the loop around the network, with constant delays."""
-    return loop.at(network).switching(None)
-
-
 def vertices(network: Network, percent: float = _PERCENT) -> dict[str, Network]:
     """Return networks by name, each with one spring, all springs or one mass changed by plus or minus `percent`.
 
@@ -81,9 +76,9 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
     If there are many vertices, a coarse sweep first selects those near the worst one.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network)}
-    loops = {name: at(loop, one) for name, one in networks.items()}
+    loops = {name: loop.at(one) for name, one in networks.items()}
     order, rough = list(loops), dict.fromkeys(loops, np.inf)
-    if len(loops) > _FEW:
+    if len(loops) > _FEW and not loop.varying_delay:  # There is no coarse sweep for delays that switch.
         rough = {name: condition.ratio(each, coupling, _THIN) for name, each in loops.items()}
         order.sort(key=lambda name: -rough[name])
     worst, where = 0.0, "nominal"
@@ -99,10 +94,11 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return `robustness`, with changes of ten percent, or None.
 
-    Returns None if the condition holds in any environment or is not evaluated for varied loops (`not_varied`), if the
-    environment is no network, has walls or has a block, or if a stiffness or mass plus ten percent is too large.
+    Returns None if the condition holds in any environment, is not evaluated for varied loops (`not_varied`) or does not
+    cover the loop, if the environment is no network, has walls or has a block, or if a stiffness or mass plus ten
+    percent is too large.
     """
-    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None

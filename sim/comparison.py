@@ -20,7 +20,7 @@ from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.files import off_table
-from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, Requirement, finite
+from haptic_loop.design.result import Chosen, Requirement, finite
 from haptic_loop.design.robustness import Robustness, robustness_nearby
 from haptic_loop.design.transparency import decibels, transparency
 from haptic_loop.sim.accuracy import credible, force_error
@@ -246,7 +246,6 @@ class Comparison:
             *failed,
         ]
         for c in couplings:
-            reasons = {name: c.conditions[name].reason for name in (*PLAIN_CONDITIONS, *own)}
-            notes += [f"{c.name}, {condition}: {reason}" for condition, reason in reasons.items() if reason]
+            notes += [f"{c.name}, {name}: {each.reason}" for name, each in c.conditions.items() if each.reason]
         about = case, scenario.name, seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
         return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)
