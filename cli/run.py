@@ -266,7 +266,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield (
         "force error",
-        f"{apart}, before clipping; with a limiter or switching delays, after it"
+        f"{apart}, compared before clipping (after it with a limiter or switching delays)"
         if apart
         else f"- ({report.ideal_force.reason})",
     )
