@@ -128,7 +128,7 @@ def made(x, meta):
 @pytest.mark.parametrize(
     ("run_part", "words"),
     [
-        ({"steady_ticks": [[0, 5000]]}, "it has 500 ticks"),
+        ({"steady_ticks": [[0, 5000]]}, "the trace has 500 ticks"),
         ({"steady_ticks": [[30, 20]]}, r"run.steady_ticks are \[\[30, 20\]\]"),
         ({"steady_ticks": "all"}, "are no pairs of ticks"),
         ({"steady_ticks": 3}, "are no pairs of ticks"),
