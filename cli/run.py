@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
     drawn = render.is_drawn(args, out / "figure.png", bool(run.trace.t.size))
     if drawn:
         painter.ask("draw_run", *_shown(args, run, report))
-    report = replace(report, robustness=_nearby(scenario.loop(args.case), chosen, assessment))
+    report = replace(report, robustness=_nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment))
     if lost := verdicts.lost(assessment, report.robustness):
         render.announce(args, lost)
     if args.paper:
