@@ -192,10 +192,11 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     """Return a sentence on the lengths of ticks and on the energy that a tick longer than certified may give a hand."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
-    longest = 1e3 * (scenario.T_max or scenario.T)
+    longest, shortest = 1e3 * (scenario.T_max or scenario.T), 1e3 * (scenario.T_min or scenario.T)
+    known = f" (known-device: from {shortest:.4g} ms)" if scenario.known_devices else ""
     cost = _overlong_tick(caps, scenario.delta)
     return (
-        f"ticks of the device last {span} ms, certified up to {longest:.4g} ms; one longer tick "
+        f"ticks of the device last {span} ms, certified up to {longest:.4g} ms{known}; one longer tick "
         f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
     )
 

@@ -439,17 +439,21 @@ class Drive:
 def timed(
     scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
-    """Return the scenario with the measured T_max and latency, and the ticks that the link takes.
+    """Return the scenario with the measured T_max, T_min and latency, and the ticks that the link takes.
 
     T_max becomes the length that a fraction `quantile` of the device's ticks does not exceed, where that is longer than
-    the scenario's T_max or T. With `at_once`, forces latch on arrival and the link takes 0 ticks. The latency then
-    ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both sides. Raises SafetyStop
-    where too few answers arrived, or the latency reaches a period.
+    the scenario's T_max or T. With known devices T_min becomes the length that this fraction reaches, where that is
+    shorter than the scenario's T_min or T. With `at_once`, forces latch on arrival and the link takes 0 ticks. The
+    latency then ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both sides. Raises
+    SafetyStop where too few answers arrived, or the latency reaches a period.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
     if longest > 1e6 * known:
         scenario = scenario.replace(T_max=1e-6 * longest)
+    shortest = ages.shortest_tick(T_us, quantile)
+    if scenario.known_devices and shortest < 1e6 * (scenario.T_min or scenario.T):
+        scenario = scenario.replace(T_min=1e-6 * shortest)
     if not at_once:
         return scenario, ages.link_delay(T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
@@ -567,7 +571,8 @@ def certified_coupling(
     delays = tuple(max(n, link + more) for n, more in zip(scenario.theta, later, strict=True))
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     if behind:
-        slower = slower.replace(T_max=(scenario.T_max or scenario.T) * (1 + CLOCK_TOLERANCE))
+        # No shortest period is known, because the clocks drift.
+        slower = slower.replace(T_max=(scenario.T_max or scenario.T) * (1 + CLOCK_TOLERANCE), T_min=None)
     try:
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:

@@ -93,6 +93,12 @@ class Ages:
         longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(longest) if longest > T_us + _CLOCK_US else T_us
 
+    def shortest_tick(self, T_us: float, q: float = 1.0) -> float:
+        """Return the length [us] that a fraction q of ticks reaches, or T unless it is shorter by a clock's error."""
+        ordered = sorted(self.ticks, reverse=True)
+        shortest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
+        return float(shortest) if shortest < T_us - _CLOCK_US else T_us
+
     def quantile(self, q: float) -> int:
         """Return the least age that a fraction q of forces does not exceed. Raises SafetyStop if fewer arrived."""
         ordered, everything = sorted(self.values), len(self.values) + self.missing

@@ -11,6 +11,7 @@ from haptic_loop import load
 from haptic_loop.cli.bridge import _overlong_tick
 from haptic_loop.cli.bridge import main as bridge
 from haptic_loop.cli.replay import main as replay
+from haptic_loop.design.certificate import required_damping
 from haptic_loop.hw.control import certified_couplings, timed
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.monitor import Ages, LinkSettings
@@ -102,6 +103,19 @@ def test_certificates_cover_the_spread_of_ticks():
     assert spread_need == pytest.approx(1.1 * even_need, rel=1e-9)
     known = LAB.replace(T_max=1.4e-3)
     assert timed(known, ages, 0.9, 100.0)[0].T_max == 1.4e-3
+
+
+def test_known_devices_cover_ticks_that_are_short():
+    """Theorem B holds for periods from T_min on: a coupling for the constant T needs more with ticks of 0.6 ms."""
+    known, ticks = load("omega-pair-known"), (600,) * 40 + (1200,) * 60
+    met, link = timed(known, Ages((130,) * 100, 0, ticks), 0.99, 100.0)
+    assert met.T_min <= 1e-6 * min(ticks)
+    assert timed(known, Ages((130,) * 100, 0, (1199, 1200, 1201)), 0.99, 100.0)[0].T_min is None
+    assert timed(LAB, Ages((130,) * 100, 0, ticks), 0.99, 100.0)[0].T_min is None
+    constant, covered = (certified_couplings(s, "I", None, "known-device", link, spare=0)[0] for s in (known, met))
+    needed = required_damping(met.loop("I"), constant.chosen.coupling, "known-device")
+    assert needed.ratio > 1 > required_damping(known.loop("I"), constant.chosen.coupling, "known-device").ratio
+    assert required_damping(met.loop("I"), covered.chosen.coupling, "known-device").certified
 
 
 def test_the_power_of_overlong_ticks_is_bounded():
