@@ -130,7 +130,7 @@ def test_draws_lie_in_range_and_are_seeded():
     ("changes", "said"),
     [
         ({"period": {"min": 1e-3}}, r"period\.min, period\.max are 0\.001 s, none"),
-        ({"period": {"min": 1e-3, "max": 2e-3, "recorded": [1e-3]}}, "either min and max or recorded"),
+        ({"period": {"min": 1e-3, "max": 2e-3, "recorded": [1e-3]}}, "either min and max, or recorded"),
         ({"period": {"recorded": [1e-3, 1.0]}}, r"period\.recorded has 1 s"),
         ({"period": {"min": 1e-3, "max": 2e-3}, "T_max": 1.5e-3}, r"period is up to 0\.002 s, above T_max"),
         ({"period": {"min": 2e-4, "max": 2e-3}, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
