@@ -42,11 +42,11 @@ class DesignOptions(TypedDict, total=False):
     order: int  # ccl: states per channel
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of varying delays
-    limiter: bool  # cover limited forces by this-environment; the default is to try for spring-damper only
+    limiter: bool  # cover limited forces, too; by default only a spring-damper by this-environment tries to
     objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
-    band_hz: tuple[float, float]  # optimal, spring-damper for this-environment: band of the mismatch
+    band_hz: tuple[float, float]  # [Hz] optimal, spring-damper of least mismatch: band of the mismatch
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: a soft penalty instead
-    seconds: float  # optimal: time after which no larger basis is tried
+    seconds: float  # optimal: time [s] after which no larger basis is tried
 
 
 @one_blas_thread

@@ -64,7 +64,7 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-#: A user's function u -> force (m,) [N], where u (m,) [m] are the displacements at the environment for zero force now.
+#: A user's function u -> force (m,) [N]; u (m,) [m] are the displacements at the environment if it exerts no force now.
 PluggedEnvironment = Callable[[Array], Array]
 
 

@@ -115,7 +115,7 @@ class _Stiffest:
 class _Sensitivity:
     """The tolerated error of each value if only this value changes; None, with the reason, if it is not known.
 
-    Errors are relative: the certificate holds for (1 - delta_error) delta, and for (1 + T_error) T.
+    Errors are relative: the certificate holds for every delta above (1 - delta_error) delta, and for (1 + T_error) T.
     """
 
     least_delta: tuple[float, ...] | None = None  # [N s/m]: the required damping
@@ -327,7 +327,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
     """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
 
-    All channels are shortened by the same number of samples, and lam is 0 in the shortened loop.
+    The delays of all channels fall by the same number of samples, but not below 0. The changed loop has lam = 0.
     """
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):

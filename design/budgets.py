@@ -71,7 +71,7 @@ FIXED_ORDER_PROBLEMS = 100
 #: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.
 BETA_CUTS, BETA_ROUNDS = 40, 60
 #: Points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, but on one edge at
-#: least RANGE_ALONG[0] (with six parameters these are more) and at most RANGE_ALONG[1]; RANGE_DRAWN on faces and
+#: least RANGE_ALONG[0] (from six parameters on these are more) and at most RANGE_ALONG[1]; RANGE_DRAWN on faces and
 #: inside. RANGE_STARTS compass searches follow. Up to five parameters all of these take about the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 

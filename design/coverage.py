@@ -1,4 +1,4 @@
-"""Compute the figures of reports on switching delays (audits, sim.switching) and on ranges (python -m design)."""
+"""Compute the figures of reports on switching delays (design, audits, sim.switching) and on ranges (design)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NOT_COVERED = (
 
 @dataclass(frozen=True)
 class _Playout:
-    """Requirement for the constant delay hi of a playout buffer."""
+    """Requirement of this-environment for the constant delay hi, as behind a playout buffer."""
 
     theta: tuple[int, ...]
     required_damping: tuple[float, ...]
@@ -37,7 +37,7 @@ class _Playout:
 
 @dataclass(frozen=True)
 class SwitchingFigures:
-    """Requirement for any switching within a loop's range of delays.
+    """Requirement for any switching of the delays within a loop's range, lo to hi (m,) [samples].
 
     If the requirement is infinite, the figures after lo and hi are None.
     """
@@ -68,7 +68,7 @@ class SwitchingFigures:
 
 @dataclass(frozen=True)
 class NominalWorst:
-    """A figure in the nominal environment, and its worst value over the ranges."""
+    """A figure in the nominal environment, and its worst value in the members of ranges (Loop.members)."""
 
     nominal: float
     worst: float
@@ -76,7 +76,7 @@ class NominalWorst:
 
 @dataclass(frozen=True)
 class OverRanges:
-    """Requirement of this-environment and mismatch of a coupling over ranges; minus infinity dB is null in JSON."""
+    """Requirement of this-environment and mismatch in the members of ranges; minus infinity dB is null in JSON."""
 
     coupling: str
     violated: int  # number of members in which this-environment is violated
@@ -108,7 +108,10 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of `design` over the ranges, preceded by those of the design without ranges if it exists."""
+    """Return the figures of `design` in the members of the loop's ranges.
+
+    If `nominal` is given and makes a design for the nominal environment alone, the figures of this design come first.
+    """
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

@@ -34,7 +34,7 @@ class _Kind(NamedTuple):
     takes: tuple[str, ...] = ()  # further arguments: condition, progress
     options: tuple[str, ...] = ()  # names of the kind's options (design.api.DesignOptions)
     model: bool = False  # whether the coupling contains a model of the environment, so that walls are impossible
-    limited: bool = False  # whether limited forces are covered by default
+    limited: bool = False  # whether designs try by default to cover limited forces
     softened: bool = False  # whether designs may be repeated for less damping until a user's own condition holds
 
 
@@ -76,7 +76,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 
     The default of a spring-damper or a user's own function is this-environment, which gives the least transparency
     error. In loops with walls, worlds, ranges or varying delays, but without a latency, the default is any-environment.
-    Each of the other kinds has one condition, except for the two that need bounds of the devices. If these bounds are
+    Each of the other kinds has one condition besides the two that need bounds of the devices. If these bounds are
     known, the two take precedence where KINDS allows them, because they never require more damping: known-device
     replaces this-environment in loops without a latency, and known-device-any is chosen if walls exist and it covers
     the loop.

@@ -84,8 +84,8 @@ from haptic_loop.design.result import (
 # ----------------------------------------------------------------------------------------------------
 # The search for the best multiplier. s is required over available damping, and the block is affine in (s, multiplier).
 # At finitely many frequencies a semidefinite program (design.cone) gives the least s over the multipliers between their
-# bounds (`Unknowns`): a lower bound. Frequencies at which a sweep with this multiplier needs a larger s are added until
-# the sweep attains the bound, or a budget is spent.
+# bounds (`Unknowns`), which is a lower bound. Frequencies at which a sweep with this multiplier needs a larger s are
+# added until the sweep attains the bound, or a budget is spent.
 
 
 class Multiplied(Condition):
@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return the block, affine in s and `multiplier`, which has s times the multipliers of the hands' side."""
+        """Return the block, affine in s and in `multiplier`, which holds s times the multipliers of the hands' side."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -761,7 +761,7 @@ class _AnyEnvironment(Multiplied):
         return "Theorem 4 needs a coupling, and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with `multiplier`; for None, with `least_phi` or the best other multiplier found."""
+        """Return the requirement with `multiplier`; for None, with `least_phi` if psi >= 1, else the best found."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)

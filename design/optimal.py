@@ -114,10 +114,11 @@ def design(
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
-    With ranges around the environment, a proved coupling satisfies this-environment at every vertex and at every point
-    that the search between the vertices visits. With a range of delays, any switching within the range is safe.
-    If no optimal coupling can be proved or its mismatch is large, two simpler couplings are candidates, too: the
-    environment scaled down (R = kappa I) and the best spring-damper. The function returns the best candidate.
+    With ranges around the environment, a proved coupling satisfies this-environment at every vertex (of more than 128,
+    at 128) and at every point that the search between the vertices visits. With a range of delays, any switching within
+    the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
+    candidates, too: the environment scaled down (R = kappa I) and the best spring-damper. The function returns the best
+    candidate.
 
     Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
     that has no design in this loop, and for a loop that no damping makes safe without a coupling.

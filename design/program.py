@@ -58,7 +58,7 @@ _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weights of g - 1 beside the mismatch, u
 HIGH_HZ = 100.0  # Above this frequency the objective (soft rows) or a constraint (cap) keeps the force low.
 SOFT = 0.05, 0.3  # The weight of the soft rows is SOFT[0] min(mismatch so far, SOFT[1]).
 _EVEN = 0.002  # weight of the error relative to each motion's own force (`_evened`)
-_LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the largest force
+_LEAST_FORCE = 0.01  # floor of a motion's own force, as a share of the norm of E
 _SMALL = 1e-5  # weight of R's coefficients, some of which have no effect if the environment has no inverse
 _DECIMALS = 10  # decimal places of g and of R's coefficients
 # Duality gaps before the first and before each later sweep, relative to the objective, or to the difference between the
@@ -621,7 +621,7 @@ def _evened(E: Complex, size: Array) -> Complex:
     """Return L, which adds to the mismatch M the errors in motions with small forces: |M L|^2 = |M|^2 + addition.
 
     Divided by |E|^2, the addition is _EVEN times the mean of |M v|^2/(|E v|^2 + _LEAST_FORCE^2 |E|^2) over the m right
-    singular vectors v of E. The mismatch is relative to the largest force, and many couplings with nearly the same
+    singular vectors v of E. The mismatch is relative to the norm of E, and many couplings with nearly the same
     mismatch differ only in motions with small forces. The addition selects one whose error is small relative to these
     forces, too.
     """

@@ -73,7 +73,7 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
 def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness:
     """Return the worst requirement in the environment and in `vertices`, by the refined sweep of the condition.
 
-    If there are many vertices, a coarse sweep first selects those near the worst one.
+    If there are many vertices and delays are constant, a coarse sweep first selects those near the worst one.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network)}
     loops = {name: loop.at(one) for name, one in networks.items()}

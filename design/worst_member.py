@@ -105,7 +105,8 @@ def _member(region: Region, point: Array) -> Member:
 def _points(region: Region) -> Iterator[Array]:
     """Yield points of the unit cube: at vertices, on edges, on faces and inside.
 
-    With up to _MANY dimensions these include all vertices and edges. With more, they are random and on no faces.
+    With up to _MANY dimensions these include all vertices and points on all edges. With more, they are random and on no
+    faces.
     """
     n = region.low.size
     rng = np.random.default_rng(_SEED)
