@@ -12,7 +12,7 @@ dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta (on vectors, ' is the trans
 By completing a square, a tick adds at least -r(a) for every dx, with r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the
 sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until they
 have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
-exists at every tick: a tick lowers R by its largest loss, and W by at most this loss, so that s = 0 is allowed. So
+exists at every tick: a tick with force a lowers R by r(a), and W by at most r(a), so that s = 0 is allowed. So
 W >= 0 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the
 energy that the devices dissipate, devices and hands receive at most W0, and
 sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
@@ -22,11 +22,12 @@ device must set its force to zero. The largest loss of tick t is the largest r o
 R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
 it, and a tick without a report counts with its largest loss.
 
-*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. By summation by parts, sum a'de is at most q/2
-times the total change of the acting force. |dx| is at least the measured |dx| minus q. So a tick with the measured dx
-adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel, where a_- is the force of the
-previous tick. The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this
-loss. While the force is constant, an encoder that dithers costs no energy.
+*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. By summation by parts, the sum of a de until a
+tick with force a[n] is at most q/2 (|a[n]| + sum |a - a_-|) per channel, and |a[n]| = sum (|a| - |a_-|). |dx| is at
+least the measured |dx| minus q. So a tick with the measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-|
++ |a| - |a_-|) per channel, where a_- is the force of the previous tick. The largest loss of the tick is r(a) + 2 q |a|.
+The argument above holds with this increment and this loss. While the force is constant, an encoder that dithers costs
+no energy.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
 that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
@@ -248,7 +249,7 @@ class EnergyBudget(_Net):
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """Report the forces (m, nsim) that acted in tick `tick`, from 0. Raises ValueError unless its report is due."""
+        """Report the forces (m, nsim) [N] of tick `tick`, counted from 0. Raises ValueError if none are due for it."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for a report")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
@@ -274,7 +275,9 @@ class EnergyBudget(_Net):
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
             return
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
-        before = self._last[1] if self._last[0] == tick - 1 else -acted  # An unknown force is the costliest.
+        before = (
+            self._last[1] if self._last[0] == tick - 1 else -acted
+        )  # An unknown force counts as -acted, which costs most.
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:
@@ -289,9 +292,9 @@ class EnergyBudget(_Net):
         """Return the largest s (nsim,) for which the energy is at least the reserve including the packet s f.
 
         Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is its present reserve,
-        r = T f^2/(4 delta'), and b = 2 q |f|. The sum of the reserves is within the energy if and only if
-        sum (s^2 r + s b) <= room + sum M for every set of these pairs. It is enough to check the first n pairs, for
-        every n, in the order of the s at which s^2 r + s b exceeds M.
+        r = T f^2/(4 delta'), and b = 2 q |f|. Let room be the energy that is not reserved yet. The reserves are within
+        the energy if and only if every set of pairs has sum (s^2 r + s b) <= room + sum M, both sums over the set. It
+        is enough to check the first n pairs, for every n, in the order of the s at which s^2 r + s b exceeds M.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
         scale, now = np.ones_like(room), self._reserve[self._reached]  # (pairs that the packet reaches, nsim)

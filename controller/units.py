@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 PositionUnit = Literal["m", "rad"]
 _spoken: ContextVar[PositionUnit] = ContextVar("unit", default="m")
-#: the rotary unit for each unit in a text; N, m and g alone are units only after "[", or after one of 0-9 ) ] } and a
-#: space
+#: the rotary unit for each unit in a text; the single letters of _ALONE are units only directly after "[", or after a
+#: digit or closing bracket and one space
 _ROTARY = {"N s/m": "N m s/rad", "N/m": "N m/rad", "m/N": "rad/(N m)", "m/s": "rad/s", "kg": "kg m2"}
 _ALONE = {"N": "N m", "m": "rad", "g": "g m2"}
 _WORDS = re.compile(
@@ -41,7 +41,7 @@ def spoken() -> PositionUnit:
 
 
 def in_unit(text: str, unit: PositionUnit | None = None) -> str:
-    """Return `text` with radians for metres if `unit` (default: this command's) is rad. The function is idempotent."""
+    """Return `text` with rotary units if `unit` (default: this command's) is rad. A second call changes nothing."""
     return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
 
 

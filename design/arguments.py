@@ -1,4 +1,4 @@
-"""Check function arguments; the errors have one line and name the argument."""
+"""Check function arguments. Each error message is one line that names the argument."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def number(name: str, value: Any, expected: str = "a number") -> float:
 def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
     """Raise ValueError unless `value` is one of the allowed words."""
     if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{name} is {value!r}, allowed are {', '.join(allowed)}")
+        given = repr(value) if isinstance(value, str) else shown(value)
+        raise ValueError(f"{name} is {given}, allowed are {', '.join(allowed)}")
 
 
 def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:

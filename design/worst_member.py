@@ -28,7 +28,7 @@ _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
 
 _SEED = 0xFACE
-_MANY = 7  # With more parameters, vertices and points on edges are drawn at random, and none on faces.
+_MANY = 7  # With more parameters, vertices, points on edges and points inside are drawn at random, and none on faces.
 _APART, _SAME = 0.2, 0.05  # least distances of two starts of the compass search and of two maxima, in range widths
 _FIRST, _LAST = 1 / 16, 1 / 128  # first (up to _MANY parameters) and last step of the compass search, in range widths
 
@@ -105,8 +105,8 @@ def _member(region: Region, point: Array) -> Member:
 def _points(region: Region) -> Iterator[Array]:
     """Yield points of the unit cube: at vertices, on edges, on faces and inside.
 
-    With up to _MANY dimensions these include all vertices and points on all edges. With more, they are random and on no
-    faces.
+    With up to _MANY dimensions these include all vertices, and points on every edge. With more, vertices, points on
+    edges and points inside are random, and there are none on faces.
     """
     n = region.low.size
     rng = np.random.default_rng(_SEED)
@@ -144,7 +144,9 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
-    step = 1.0 if point.size > _MANY else _FIRST  # With many parameters some vertices are untried.
+    step = (
+        1.0 if point.size > _MANY else _FIRST
+    )  # With many parameters only some vertices were tried, so steps go to others.
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]

@@ -137,9 +137,9 @@ class Port:
             raise ValueError("port: expected one or more handles, and a positive mass at every other point")
         groups = len(self.across) // self.axes
         if not self.across[:, : -self.axes].any(axis=1).all() or not -groups <= self.pull < groups:
-            raise ValueError("port: expected spring-dampers that touch a point each, and the index of one as `pull`")
+            raise ValueError("port: expected spring-dampers with at least one point, and the index of one as `pull`")
         if self.impedance and (self.handles > 1 or self.impedance.A.shape[:-2] != tuple(many)):
-            raise ValueError("port: an impedance needs a port with one handle, and as many humans as the port")
+            raise ValueError("port: an impedance is for ports with one handle, and has the leading axes of `mass`")
 
     @classmethod
     def chain(cls, links: _Array) -> Self:
@@ -263,9 +263,9 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
     """
     A, B, C, D = (np.atleast_2d(np.asarray(part, dtype=float)) for part in (A, B, C, D))
     stiffness = 0.0
-    right, sizes, left = np.linalg.svd(A)  # if A is singular, left[-1] spans its null space, right[:, -1] its left one
+    U, sizes, Vh = np.linalg.svd(A)  # if A is singular, Vh[-1] spans its null space, and U[:, -1] that of A'
     if A.size and sizes[-1] <= 1e-12 * max(sizes[0], 1e-300):
-        null, left = left[-1], right[:, -1]
+        null, left = Vh[-1], U[:, -1]
         if abs(left @ null) <= 1e-9:
             raise ValueError("impedance: A has a double eigenvalue at zero, expected one spring at most")
         left = left / (left @ null)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 #
 # Only this file uses the names of joints. A body slides along x, or along the free axes of its device; then its joints
 # are called motor.x, motor.y and so on. The order of the joints is motors, handles of compliant devices, further masses
-# of the humans, bodies of persons. The encoders measure the first m positions:
+# of the humans, bodies of persons. The encoders measure the first m positions. One device and its human:
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
@@ -128,7 +128,7 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
     """Build one scene of devices, each held by its human. `persons` hold several devices.
 
     Raises:
-        ValueError: The numbers or the axes of devices and humans differ, or a person holds a device that does not
+        ValueError: There is not one human with the same axes for each device, or a person holds a device that does not
             exist or that another person holds.
     """
     held = tuple((person.holds, person.port()) for person in persons)
@@ -640,7 +640,7 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) if links have amounts along directions, with 1 + 2 axes^2 numbers each
+    axes: tuple[int, ...] = ()  # (devices,) of free axes; () if links have three numbers, else 1 + 2 axes^2 each
     mechanics: _Drawn = ()  # (nsim, devices), or empty where every hand holds the scenario's devices
 
     def __post_init__(self) -> None:
@@ -654,7 +654,9 @@ class Crowd:
         if bodies.shape != (len(links), len(self.holds), 5):
             raise ValueError(f"bodies has the shape {bodies.shape}, expected {(len(links), len(self.holds), 5)}")
         if not ((bodies >= 0) & (bodies < np.inf)).all() or not (bodies[..., 0] > 0).all():
-            raise ValueError("bodies has a negative, infinite or massless entry: such a person is not passive")
+            raise ValueError(
+                "bodies: expected finite numbers that are not negative, and a positive mass for each person"
+            )
         for name, values in (("links", links), ("bodies", bodies)):
             values.setflags(write=False)
             object.__setattr__(self, name, values)
@@ -710,7 +712,7 @@ def draw(population: Population, devices: int, seed: int, index: int, links: int
     count = int(rng.integers(1, 3)) if links == MIXED else links
     low, high = np.log([population.mass, population.damping, population.stiffness]).T
     if not axes:
-        # Generator.uniform gives the same bits, but takes three times as long to check its bounds.
+        # Generator.uniform gives the same bits, but is three times slower, because it checks its bounds.
         return np.exp(low + (high - low) * rng.random((devices, count, 3)))
     drawn = np.zeros((devices, count, 1 + 2 * max(axes) ** 2))
     for i, k in enumerate(axes):
@@ -836,7 +838,7 @@ class Variants:
 
 
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
-    """Return the models of the devices with every set of humans. Raises ValueError if their numbers differ."""
+    """Return the models of the devices with every set of humans. Raises ValueError unless each has one per device."""
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)
     scene = _compiled(devices, first, drawn=False)

@@ -109,7 +109,7 @@ class Firmware:
 
 
 class Traffic:
-    """Draw random events between a device's ticks from a seed: a host that errs, and a line with faults."""
+    """Draw the random events between ticks: a host's right and wrong messages, faults of the line, emergency stops."""
 
     def __init__(self, seed: int, device: Device) -> None:
         self.rng, self.hand, self.device = random.Random(seed), random.Random(~seed), device
@@ -124,7 +124,7 @@ class Traffic:
         return Config(self.theta, rng.randint(0, 4), rng.randint(1, 6), rng.choice((0, 0, 3, 100)), cap, slew)
 
     def force(self) -> Force:
-        """Return what a correct host would send now."""
+        """Return a valid FORCE in time, with a random force and a command that is mostly right for the phase."""
         d, rng = self.device, self.rng
         source = d.k
         command, force = rng.choice((Command.IDLE, Command.ARM)), (0,) * d.info.axes
@@ -290,16 +290,17 @@ def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
 
 @needs_gcc
 def test_c_and_python_agree_byte_for_byte(library, episodes):
-    compared = 0
+    answered = 0
     for (seed, *_), (about, script, answers, _) in zip(EPISODES, episodes, strict=True):
-        firmware, expected = Firmware(library, about), iter(answers)
+        firmware, expected = Firmware(library, about), enumerate(answers)
         for op in script:
             answer = play(firmware, op)
             if op[0] == "T":
-                want = next(expected)
-                assert answer == want, f"seed {seed}, tick {compared}: {described(answer)} for {described(want)}"
-                compared += len(want[1]) > 0
-    assert compared > 12_000
+                tick, want = next(expected)
+                both = f"C sent {described(answer)}, Python sent {described(want)}"
+                assert answer == want, f"seed {seed}, tick {tick}: {both}"
+                answered += len(want[1]) > 0
+    assert answered > 12_000
 
 
 @pytest.mark.slow
@@ -431,13 +432,13 @@ def compiled_sketch(tmp_path_factory):
 
 @pytest.fixture
 def sketch(compiled_sketch, tmp_path):
-    """Return a board that was just switched on: a library under a new name has its own memory."""
+    """Return a board that was just switched on. A copy of the library has static variables of its own."""
     return Sketch(Path(shutil.copy(compiled_sketch, tmp_path)))
 
 
 @needs_gxx
 def test_the_example_sketch_arms_follows_and_stops(sketch):
-    assert sketch.run(12_000) == []  # silent until configured
+    assert sketch.run(12_000) == []  # no message before HELLO or CONFIG
     sketch.feed(Hello())
     (about,) = sketch.run(1200)
     assert (about.axes, about.period_ns, about.firmware) == (2, 1_200_000, "example 1")
@@ -519,7 +520,7 @@ def test_only_ticks_feed_the_boards_watchdog(sketch):
     assert loop.index("not due yet") < loop.index("watchdogFeed();") > loop.index("writeForces(force);")
 
 
-# Python and C follow the rules of docs/protocol.md that no single frame shows
+# The tests below check, in Python and in C, rules of docs/protocol.md that involve several ticks.
 
 
 @pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
@@ -566,7 +567,7 @@ def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
     device.armed(theta, hold, ramp)
     device.answer(Command.RUN, (1000, -1000), theta)  # the last answer
     forces = []
-    due = max(1, theta)  # with theta = 0 the answer to a tick is missed when the next one begins
+    due = max(1, theta)  # with theta = 0, too, the device misses an answer only when the next tick begins
     for _ in range(due + hold + ramp + 1):
         device.tick()
         forces.append(device.force)
@@ -600,7 +601,7 @@ def test_emergency_stops_replace_earlier_causes(device):
     assert device.state().cause == Cause.ESTOP_HOST  # the first emergency stop stays
 
 
-def test_late_double_and_mistimed_forces_are_counted(device):
+def test_late_double_or_mistimed_forces_never_act(device):
     """A late FORCE sets only echo and a negative margin.
 
     A second FORCE for the same tick sets nothing, nor does one with a wrong theta. None of them counts as a CRC error.
@@ -638,7 +639,7 @@ def test_a_hello_of_another_version_is_answered(device):
     assert (type(about), about.version) == (Info, 2)
 
 
-def test_the_deadman_is_reported_in_every_state(device):
+def test_armed_devices_report_the_deadman(device):
     device.armed()
     assert not device.state().deadman
     for held in (True, False, True):

@@ -136,7 +136,7 @@ def test_an_own_environment_is_proved_and_stored(name, covered, place):
         ("ends.py:X", "SystemExit: 7"),
     ],
 )
-def test_a_wrong_environment_is_one_line(words, message, place):
+def test_wrong_environments_are_refused_in_one_line(words, message, place):
     done = run(f"{RUN} --environment {words}", place)
     *before, last = done.stderr.splitlines()
     assert done.returncode == 2
@@ -189,7 +189,7 @@ def test_a_hand_that_fails_later_is_named(force, message, place):
     assert message in done.stderr.splitlines()[-1]
 
 
-def test_a_coupling_must_be_derived_from_ours(place):
+def test_own_couplings_must_be_subclasses_of_coupling(place):
     done = run(f"{RUN} --coupling mine.py:duck", place)
     assert done.returncode == 2
     message = "coupling is a Duck, which is not derived from controller.coupling.Coupling"
@@ -200,7 +200,7 @@ def test_a_coupling_must_be_derived_from_ours(place):
     "command", [f"{RUN} --environment mine.py:hard --coupling", "python -m design.audit --coupling"]
 )
 def test_a_coupling_may_be_given_by_its_compliance(command, place):
-    """A run puts walls behind the coupling, and an audit accepts the same option."""
+    """`weighted` defines only its compliance. It runs with an environment that has walls, and an audit takes it."""
     done = run(f"{command} mine.py:weighted", place)
     assert done.returncode == 0, done.stderr
     assert "error" not in done.stderr.lower()
@@ -208,7 +208,7 @@ def test_a_coupling_may_be_given_by_its_compliance(command, place):
 
 
 def test_errors_name_the_innermost_line(tmp_path):
-    """A user's own refusal keeps its traceback, and one of this package does not need it."""
+    """Errors of the user's code keep their traceback; errors that this package raises on purpose do not."""
     file = tmp_path / "nested_error.py"
     file.write_text("def inner():\n    raise ValueError('no')\n\ndef outer():\n    inner()\n")
     with pytest.raises(ValueError, match="no") as caught:

@@ -1,4 +1,4 @@
-"""The K-B map of a fixed coupling equals closed forms and dense sweeps, and the command reports it."""
+"""Maps over stiffness and damping of contact springs, with a fixed coupling, equal closed forms and dense sweeps."""
 
 import json
 
@@ -38,8 +38,9 @@ def optimal():
 def densely(sweep, coupling_force, K, B):
     """Return required over available damping from up to 60010 frequencies and the network's equations alone.
 
-    Of frequencies 5e-5 rad/sample apart, every tenth is swept first. Its neighbours follow only if its figure is within
-    1 % of the largest. Between the first ones, a peak of width 0.01 rises by (2.5e-4/0.01)^2 only.
+    The first pass sweeps every tenth of 60000 frequencies, which are 5e-5 rad/sample apart. The second pass sweeps the
+    neighbours of those whose ratio is within 1 % of the largest. A peak of width 0.01 rad/sample exceeds its nearest
+    ratio of the first pass by at most the share (2.5e-4/0.01)^2 = 6e-4, so that the second pass finds it.
     """
     T, (M, D, S) = sweep.loop.T, sweep.loop.network.matrices()
     network = sweep.loop.network
@@ -65,7 +66,7 @@ def densely(sweep, coupling_force, K, B):
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
-    """The tolerance is 1e-5: between points 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2.
+    """Ratios agree to 1e-5: a peak of width 0.01 exceeds points 5e-5 apart by at most (2.5e-5/0.01)^2 = 6e-6 of it.
 
     With the slowest pole 0.0015 from 1, a supremum at 0 exceeds the value at 1e-6 rad/sample by (1e-6/0.0015)^2.
     """
@@ -81,8 +82,11 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
         assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
 
 
-def test_model_kept_uses_the_scenarios_environment():
-    """`model kept` uses V = Q (I - E0 Q)^-1 with the scenario's E0; for other E it differs from this-environment."""
+def test_a_kept_model_is_the_scenarios_environment():
+    """In the row "model kept" the coupling is V = Q (I - E0 Q)^-1 with the scenario's E0 in every cell.
+
+    Where a cell's environment is not E0, the ratio therefore differs from that of this-environment.
+    """
     coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)
 
@@ -105,19 +109,20 @@ def test_bare_walls_match_colgates_condition():
     sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
     needed = sweep.ratios("this-environment", K, B) * sweep.loop.delta[0]
-    # Maps split the pole of F/(z-1) off, so that rounding does not grow at low frequencies: errors were 2e-16.
-    np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
+    # Maps split the pole of F/(z-1) at z = 1 off, so that rounding does not grow at low frequencies. Relative errors
+    # were 2e-16.
+    np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-13)
 
 
-def test_constant_requirements_are_equal_in_all_cells():
+def test_any_environment_requires_the_same_in_all_cells():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
     assert sweep.conditions == ("this-environment", "any-environment")
     ratios = sweep.ratios("any-environment", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
     assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 
 
-def test_hands_meet_the_cells_own_environment(optimal):
-    """The growth with each hand equals that of its own loop, closed with the cell's force map."""
+def test_hands_grow_as_in_exact_loops(optimal):
+    """HeldDevices gives each set of hands the growth rate of the exact loop with the force map of the cell."""
     sweep = around(PAIR, optimal["omega-pair"])
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 1, 12, 1)
     F = sweep.force_maps(np.array([300.0, 3000.0]), np.array([0.5, 0.5]))[0]

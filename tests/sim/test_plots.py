@@ -93,9 +93,11 @@ def test_pictures_contain_every_sample(drawn):
     ]
 
 
-def test_nearby_handles_are_drawn_with_their_distance(drawn):
+def test_the_label_says_how_near_encoders_are(drawn):
     x = np.sin(np.arange(3000) / 300)[:, None]
-    run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm apart at 1 m look like one line
+    run = replace(
+        trace(1e3 * x, x), x_handle=1.004 * x
+    )  # At an amplitude of 1 m, curves 4 mm apart look like one line.
     (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
     assert axis.get_ylabel() == "displacement of the handle [mm],\nwithin 4 mm of the encoder"
     np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
@@ -125,7 +127,7 @@ def test_legends_name_walls_and_curves_that_coincide(drawn):
         np.testing.assert_allclose(spans, edges + T)
 
 
-def test_onsets_show_amplitudes_and_implausible_parts_are_grey(drawn):
+def test_onsets_have_amplitudes_and_grey_times(drawn):
     t = T * np.arange(6000)
     swing = 1e-6 * np.exp(1.4 * t) * np.cos(2 * np.pi * 84 * t)
     handle = 0.015 * np.sin(2 * np.pi * 0.6 * t)
@@ -277,7 +279,7 @@ def test_cells_meet_halfway():
 
 
 def test_panels_show_forces_beside_ideal_ones(undrawn):
-    """The panels' range is 1.5 times the largest ideal force of the credible run."""
+    """Both panels show 1.5 times the largest ideal force of `calm`, the only run that is credible to its end."""
     f, t = np.array([[0.0], [1.0], [3.0]]), T * np.arange(3)
     panels = [plots.Panel("calm", trace(f), 2 * f), plots.Panel("wild", trace(5 * f), 9 * f, 1.5e-3)]
     figure = undrawn(plots.plot_side_by_side, panels)
@@ -301,7 +303,7 @@ def test_environment_maps_mark_their_design_point(drawn):
     assert "this environment: certified inside this edge" in legend(figure)
 
 
-def test_every_unit_in_a_picture_becomes_radians():
+def test_every_unit_in_a_picture_becomes_rotary():
     """Tick labels have no unit, so they are not rewritten."""
     f = np.sin(np.arange(2000) / 20)[:, None] * np.exp(np.arange(2000) / 500)[:, None]
     figure = plots.draw_run(trace(f), "2 mm", 8.0, ideal=(f, 15.0), onset=Onset(2.0, 1500))

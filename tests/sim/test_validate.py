@@ -497,7 +497,7 @@ def test_impossible_crowds_cannot_be_built():
         Crowd(np.ones((2, 3)))
     with pytest.raises(ValueError, match="bodies has the shape"):
         Crowd(np.ones((1, 2, 1, 3)), ((1, 2),))
-    with pytest.raises(ValueError, match="massless"):
+    with pytest.raises(ValueError, match="a positive mass for each person"):
         Crowd(np.ones((1, 2, 1, 3)), ((1, 2),), np.zeros((1, 1, 5)))
 
 
