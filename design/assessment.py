@@ -645,7 +645,7 @@ def _force_limits(
 ) -> ForceLimits:
     """Return the limiter for a loop, or clipping with the reason."""
     if limiter is False:
-        return ForceLimits(None, "forces are clipped, as asked")
+        return ForceLimits(None, "the limiter is switched off")
     return _covered_limits(loop, coupling, requirements, proof, known)
 
 

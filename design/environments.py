@@ -438,6 +438,7 @@ class ThisEnvironment(Multiplied):
         return ratio_in(loop, coupling, thin) if quick else super().ratio(loop, coupling, thin)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        """Return the ratios (n,) for constant delays and touching walls; None for a subclass."""
         if not self.extensible:
             return None
         poles = loop.F(coupling).poles()
