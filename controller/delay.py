@@ -235,7 +235,7 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if bool(self.recorded) == (self.min is not None or self.max is not None):
-            raise ValueError("period: give either min and max, or recorded")
+            raise ValueError("give either min and max, or recorded")
         if self.recorded:
             wrong = [T for T in self.recorded if not 1e-6 <= T <= 0.1]
             if wrong:

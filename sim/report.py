@@ -94,12 +94,13 @@ def _tau(case: str) -> PaperRow:
 
 
 def _figure(case: str, stability: Stability) -> PaperRow:
+    agrees = "agrees" if stability.exact_verdict == ("unstable" if case == "none" else "stable") else "does not agree"
     growth = f"{stability.exact_growth_rate_per_s:+.2f} 1/s at {stability.exact_frequency_hz:.1f} Hz"
     here = f"{stability.exact_verdict}: {growth}"
     if case != "none":
-        why = "agrees; masses and stiffness of the devices are assumed"
+        why = f"{agrees}; masses and stiffness of the devices are assumed"
         return PaperRow("Figure 6: with a coupling", "no oscillation", here, why)
-    why = "agrees; masses and transmission of the devices are assumed: the paper's own first-order device is "
+    why = f"{agrees}; masses and transmission of the devices are assumed: the paper's own first-order device is "
     why += "stable with each of 200 pairs of hands"
     return PaperRow("Figure 5: no coupling", "self-sustained oscillation", here, why)
 

@@ -41,7 +41,7 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
-_MOST_DELAYS = 1000  # total of all channels [samples]; eigenvalues of 1000 states take ten seconds, of 2000 a minute
+_MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take 2 CPU s, of 2000 8 s
 _MOST_CHANNELS = 32  # a run of 32 channels without a coupling takes 12 s of CPU time
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
@@ -124,7 +124,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
-            seconds = f"each sample is a state, and the eigenvalues would take about {1e-8 * total**3:.0f} s"
+            seconds = f"each sample is a state, and the eigenvalues would take about {1e-9 * total**3:.0f} s"
             raise ValueError(f"{many}: {seconds}; a longer T has fewer samples for the same delay")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:

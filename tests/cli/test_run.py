@@ -95,7 +95,8 @@ def test_case_i_is_designed_certified_and_proved(tmp_path):
     assert report["stability"]["clipped_ticks"] == 0
     assert report["error"]["position_relative_rms"] < 1e-7
     assert all(Path(name).is_file() for name in report["files"])
-    assert [row["what"] for row in report["paper"]][-1].startswith("Figure 6")
+    assert report["paper"][-1]["what"].startswith("Figure 6")
+    assert report["paper"][-1]["why"].startswith("agrees")
 
 
 def test_published_gains_are_refused_by_their_own_condition(tmp_path):
@@ -374,3 +375,10 @@ def test_cross_checks_say_whether_verdicts_agree():
     assert "same verdict" in same
     assert "ANOTHER VERDICT" in other
     assert "differs by +2.0e-05 1/s" in same
+
+
+@pytest.mark.slow
+def test_the_papers_table_says_where_runs_differ(tmp_path):
+    """Case I without its coupling oscillates, and Figure 6 does not."""
+    _, report = run(tmp_path, "--coupling", "none", "--paper", "--no-plot", "--duration", "0.5")
+    assert report["paper"][-1]["why"].startswith("does not agree")
