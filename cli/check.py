@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
-from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import where_proved
 from haptic_loop.controller.units import speak
 from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
@@ -19,6 +18,7 @@ from haptic_loop.design.certificate import (
     NotProved,
     Verdict,
     condition_of,
+    covered,
     lag,
     named,
     on_file,
@@ -29,8 +29,7 @@ from haptic_loop.design.certificate import (
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
-from haptic_loop.design.known_device import described
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, RANGES, listed, suffices, switching_guarantee
+from haptic_loop.design.result import CONDITIONS, RANGES, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search_ranges
 from haptic_loop.sim.couplings import read_coupling
 
@@ -55,6 +54,7 @@ class _Checked:
     reason: str | None = render.figure("reason")
     condition: str | None = render.figure("condition")
     guarantee: str | None = render.figure("guarantee")
+    loop: str = render.figure("loop")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
     between: SearchFigures | None = render.figure("between vertices")
@@ -141,17 +141,12 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         )
 
 
-def _guarantee(loop: Loop, condition: Condition) -> str:
-    """Return the environments of a condition in words, with the devices if it is for known devices only."""
-    devices = f"; every passive hand, on {described(loop)}" if condition.name in KNOWN_CONDITIONS else ""
-    return f"{condition.words(loop)}{devices}"
-
-
 def _checked(
     stored: Stored, condition: Condition | None, verdict: Verdict, searched: Searched | None, seconds: float
 ) -> _Checked:
     loop, claim, proved = stored.loop, stored.certificate, verdict.proved
     span, switching = loop.varying_delay, None
+    delays = f"theta = {listed(loop.theta)}" + (f", psi = {listed(loop.psi)}" if any(loop.psi) else "")
     if span and claim and "switching" in claim.facts:
         guarantee = f"{switching_guarantee(span)}, in {claim.guarantee}" if proved else None
         shown = span.lo, span.hi, guarantee, "rational" if proved else None
@@ -160,7 +155,8 @@ def _checked(
         proved,
         verdict.reason,
         claim and claim.condition,
-        _guarantee(loop, condition or named(claim.condition)) if claim and proved else None,
+        (condition or named(claim.condition)).words(loop) if claim and proved else None,
+        "; ".join([f"T = {1e3 * loop.T:.6g} ms, {delays}", *(covered(loop, claim) if claim else ())]),
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
         searched and SearchFigures.of(searched),

@@ -42,8 +42,8 @@ from haptic_loop.design.exact import (
     rows_of,
 )
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
-from haptic_loop.design.result import NotProved, Requirement, refusal
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
+from haptic_loop.design.result import KNOWN_CONDITIONS, NotProved, Requirement, refusal, switching_guarantee
 
 _CLAIM_TOLERANCE = 1e-6  # allowed relative error of required damping and margin on file; repeated sweeps agree to 1e-9
 
@@ -274,6 +274,20 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return loop.per_channel(certificate.multipliers["rho"])
     known = _NAMED.get(certificate.condition)
     return known.lag(loop) if known else None
+
+
+def covered(loop: Loop, claim: Certificate) -> Iterator[str]:
+    """Yield what a certificate covers in words: switching delays, periods, latencies, and devices within bounds."""
+    known = claim.condition in KNOWN_CONDITIONS
+    if loop.varying_delay:
+        yield switching_guarantee(loop.varying_delay)
+    if loop.T_max or (known and loop.T_min):
+        least = f"from {1e3 * (loop.T_min or loop.T):.6g} " if known else "up "
+        yield f"periods {least}to {1e3 * (loop.T_max or loop.T):.6g} ms"
+    for least, most in dict.fromkeys(loop.latency or ()):
+        yield f"forces that latch {1e3 * least:.6g} to {1e3 * most:.6g} ms after their tick"
+    if known:
+        yield described(loop)
 
 
 def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:

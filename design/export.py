@@ -20,9 +20,9 @@ from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.ranges import where_proved
-from haptic_loop.design.certificate import Verdict, lag
+from haptic_loop.design.certificate import Verdict, covered, lag
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.result import RANGES, listed, switching_guarantee
+from haptic_loop.design.result import RANGES, listed
 
 # ----------------------------------------------------------------------------------------------------
 # An export is one state-space block with a fixed order of its sums, and a test vector in that order.
@@ -898,11 +898,10 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_guarantee(stored.loop.varying_delay)}" if stored.loop.varying_delay else ""
     how = f"{claim.condition}, proof: {claim.proof}"
     if claim.guarantee == RANGES and stored.loop.ranges:
         where = where_proved(stored.loop.network, stored.loop.ranges)
         how += f"; proved at {where} only: design.check searches between them"
-    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
-        "also while forces are limited." if limited else "only while forces stay below their limits."
-    )
+    forces = "also while forces are limited" if limited else "only while forces stay below their limits"
+    only = "; ".join((*covered(stored.loop, claim), forces, "encoder steps are not covered"))
+    return f"Certified for {claim.guarantee} ({how}): {needs}; {only}."

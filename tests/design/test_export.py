@@ -13,16 +13,17 @@ import pytest
 from asked import prove_limiter
 from worlds import FIGURE_4, PAIR, SOFT, T
 
+from haptic_loop.cli.check import main as check
 from haptic_loop.cli.export import main
-from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as Gains
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.law import Law, Limiter
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design import export as export_module
-from haptic_loop.design.certificate import prove
+from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import _sequential, c_source, process_block, single_precision_error, trial
 from haptic_loop.design.files import InputError, one_command
@@ -356,6 +357,26 @@ def test_an_export_is_repeatable_byte_for_byte(place):
     assert "Certified for any passive environment" in first
     assert export(place, "gains", "--process").read_text() == first
     assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full").read_text()
+
+
+def test_a_file_names_the_loop_that_is_certified(tmp_path, capsys):
+    """Other devices, longer periods and other latencies need other damping, here more than there is."""
+    known = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),) * 2
+    late = msgspec.structs.replace(PAIR, theta=(0, 0), lam=(0, 0), T_max=1.3e-3, latency=((3e-4, 6e-4),) * 2)
+    for name, loop, coupling, condition, words in (
+        ("known", msgspec.structs.replace(PAIR, known_devices=known), PUBLISHED["I"], "known-device", "at least 60 g"),
+        ("late", late, SOFT, "this-environment", "periods up to 1.3 ms; forces that latch 0.3 to 0.6 ms after"),
+    ):
+        save(Stored.of(loop, coupling, prove(loop, coupling, condition)), tmp_path / f"{name}.json")
+        header = " ".join(export(tmp_path, name, "--process").read_text().replace(" * ", " ").split())
+        assert words in header
+        assert "encoder steps are not covered" in header
+        capsys.readouterr()
+        assert check([str(tmp_path / f"{name}.json"), "--json", "-"]) == 0
+        assert words in json.loads(capsys.readouterr().out)["loop"]
+    assert not required_damping(PAIR, PUBLISHED["I"], "this-environment").certified
+    slow = msgspec.structs.replace(late, T_max=1.2e-2, latency=None)
+    assert not required_damping(slow, SOFT, "this-environment").certified
 
 
 def test_an_uncertified_export_exits_with_1(place, tmp_path, capsys):
