@@ -228,9 +228,9 @@ class EnergyBudget(_Net):
         """Return the force to send now (m, nsim) [N]: s times `wanted`, with one s in [0, 1] for all channels.
 
         `dx` [m] is the displacement since the last call, and `acted` [N] the force that acted in that time. Without
-        `acted` it is the sent force if delays are constant, and unknown otherwise. The first call ignores both.
-        `wanted` must be clipped to forces that the device can apply. An entry that is nan, or 1e12 N or more, is sent
-        as zero.
+        `acted` that force is the one sent `lo` ticks earlier, if hi = lo and `hold` is 0; otherwise it is unknown. The
+        first call ignores both. `wanted` must be clipped to forces that the device can apply. An entry that is nan, or
+        has a size of 1e12 N or more, is sent as zero.
         """
         if self.ticks:
             self._book(self._turned(dx), None if acted is None else self._turned(acted))

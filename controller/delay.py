@@ -51,7 +51,10 @@ def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
 
 
 def packet_delays(values: ArrayLike) -> Ticks:
-    """Return a read-only array of delays (ticks, m, nsim), in samples or LOST. Raises ValueError for other numbers."""
+    """Return a read-only array of delays (ticks, m, nsim), in whole samples or LOST; fractions are cut off.
+
+    Raises ValueError for another number of axes, or for a number below LOST.
+    """
     delays = np.array(values, dtype=np.int64)
     if delays.ndim != 3:
         raise ValueError(f"delays have the shape {delays.shape}, expected (ticks, channels, simulations)")

@@ -274,7 +274,7 @@ class Environment:
 
 
 class RigidWall(Environment, enum.Enum):
-    """A rigid wall (E -> infinity) with one channel, which is always in contact with the coupling in front of it."""
+    """A rigid wall (E -> infinity) that the coupling in front of it always touches. It has one channel."""
 
     RIGID_WALL = "rigid wall"  # its name in files
 
@@ -324,7 +324,7 @@ class SceneFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
     """A MuJoCo scene instead of a network. It has no known E(z), which this-environment and known-device need."""
 
     file: str  # MJCF
-    digest: str  # SHA-256 over the contents of the scene's files
+    digest: str  # SHA-256 over the names and contents of the scene's files
     along: tuple[tuple[tuple[float, float, float], ...], ...]  # directions per touched body, one per contact
     every: int = 1  # number of ticks for one step of the scene
 
@@ -712,7 +712,10 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """Return the network with two-sided springs in place of the touching walls (by default all), without the others."""
+    """Return the network with a two-sided spring-damper in place of each wall; it is zero if the wall does not touch.
+
+    By default all walls touch.
+    """
     if not network.walls:
         return network
     touching = [True] * len(network.walls) if touching is None else touching

@@ -258,7 +258,7 @@ class Lti(ReadOnly):
 
         Returns:
             (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None if A is lower
-            triangular or the error may exceed _ERROR.
+            triangular, the eigenvectors do not give P, or the error may exceed _ERROR.
         """
         core, lines = self._lines
         A, B = self.A[core[:, None], core], self.B[core]

@@ -41,7 +41,7 @@ class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Ranges of a network's parameters, each independent of the others."""
 
     springs: tuple[UncertainSpring, ...] = ()
-    masses: dict[str, _Range] = {}  # [kg], by node
+    masses: dict[str, _Range] = {}  # [kg], by node or point
 
     def __post_init__(self) -> None:
         for node, limits in self.masses.items():

@@ -99,7 +99,7 @@ def expm_each(matrices: _Array) -> _Array:
     """Return the exponential of each of (nsim, n, n) matrices, by scaling and squaring.
 
     Each result depends on its own matrix only. scipy.linalg.expm calls a threaded BLAS for every matrix, which made
-    verdicts about many humans several times slower on busy cores. To import SciPy takes as long as a short run.
+    verdicts about many humans several times slower on busy cores, and its import takes as long as a short run.
     """
     norm = np.abs(matrices).sum(axis=1).max(axis=1)
     halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
