@@ -189,7 +189,7 @@ def _list_devices(args: argparse.Namespace) -> int:
     rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]
     title = "published figures; the last column is the stiffness that CHAI3D allows"
     lines = [f"[{i}] {source}" for source, i in numbered.items()]
-    lines.append("Give unknown figures beside `device` in a scenario, or with --delta; hw.identify measures them.")
+    lines.append("Give unknown figures beside `device` in a scenario, or --delta, whose value hw.identify measures.")
     render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)
     return options.DONE
 

@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before.
+    slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before the bound.
     encoder = encoder_steps(scenario, args.case, assessment)
     if slow:
         render.announce(args, verdicts.verdict(assessment, encoder=encoder))
@@ -86,8 +86,8 @@ def _parser() -> options.Parser:
     varying = "also certify any switching of the forces' delays in this range [samples]"
     parser.add_varying_delay(varying)
     limiter = (
-        "fail unless the proof covers limited forces, too; for this-environment, and for known-device if optimal "
-        "(default: only a spring-damper tries this proof)"
+        "fail unless the proof covers limited forces, too; for this-environment, and for known-device with an optimal "
+        "coupling (default: only a spring-damper tries this proof)"
     )
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
@@ -185,7 +185,7 @@ _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 def _that_decays(
     scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
-    """Design for less and less damping, which gives softer couplings, until every mode has at least damping `ratio`.
+    """Design for less and less damping, and so softer couplings, until no mode's damping ratio is below `ratio`.
 
     A coupling certified for less damping is also certified for the devices' damping. Raises DesignFailed if the ratio
     is not reached.

@@ -256,7 +256,7 @@ def _with_transmissions(
 
 
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Return a device's [[device]] table for a scenario, with declared stiffness unless all axes identified it.
+    """Return a device's [[device]] table; its stiffness is declared unless `bounds` or all axes have estimates of it.
 
     `axes` and `bounds` have one entry per free axis. Masses and the transmission are means over the axes; each bound is
     the worst of the axes.

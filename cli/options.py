@@ -154,7 +154,8 @@ class Parser(argparse.ArgumentParser):
         )
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
         known = (
-            "guaranteed motor mass [kg], largest stiffness [N/m], least and largest damping [N s/m] of the transmission"
+            "guaranteed bounds: least motor mass [kg], and largest stiffness [N/m], least damping and largest damping "
+            "[N s/m] of the transmission"
         )
         loop.add_argument(
             "--known-device",

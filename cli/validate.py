@@ -176,7 +176,7 @@ class _Searched:
     """Results of the adversary; None without --adversary, or if Ctrl-C ended its search."""
 
     worst: Worst | None = None
-    drawn: Worst | None = None  # the worst human of the scenario's own population
+    drawn: Worst | None = None  # the worst human of a user's own class of populations; None for a Population
     ratio: float = 0.0  # required over available damping of the attacked loop
     interrupted: bool = False
 
