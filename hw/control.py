@@ -408,7 +408,10 @@ class Drive:
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
     def _check_motion(self, x: tuple[float, ...], ticks: int, seconds: float) -> None:
-        """Raise SafetyStop where handles jumped to x (m,) [m] in `seconds`, or moved faster than the speed limit."""
+        """Raise SafetyStop where handles jumped to x (m,) [m], or moved faster than the speed limit.
+
+        The last `ticks` ticks lasted `seconds`.
+        """
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
         if ticks > 1:

@@ -513,7 +513,7 @@ class EncoderNoise:
 
     @property
     def still(self) -> tuple[int, ...]:
-        """Return the range (m,) [counts] in which an encoder rests: twice its noise, at least 1.
+        """Return the range (m,) [counts] in which an encoder rests: twice its noise, but 1 for a noise of up to 1.
 
         Broken channels toggle by 1. Over a longer time, noise exceeds this range with a probability below 1e-6.
         """

@@ -126,7 +126,7 @@ class Session:
         return self._take(0, "certified")
 
     def arm(self, now: int) -> Said:
-        """Arm at a person's request. Do nothing unless the session is disarmed and `hindrance` is None."""
+        """Arm a disarmed session at a person's request, or log its `hindrance` instead. Ignore other stages."""
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
             self._log(hindrance)

@@ -30,7 +30,7 @@ typedef HA_REAL ha_real;
 #define HA_DEGREE 5      /* degree of the polynomial subtracted from a motion to remove gravity, drift and the hand */
 #define HA_FIT 0.8f      /* least share of a motion's sum of squares with the shape of a free mass's answer */
 #define HA_REST 0.1f     /* [s] window without forces in which the noise of the sensors is measured */
-#define HA_PRESSING 0.3f /* [N] a sensor that stands still for HA_PRESSED [s] under a larger force is dead */
+#define HA_PRESSING 0.3f /* [N], or half the cap if less: a sensor at rest for HA_PRESSED [s] under a larger force is dead */
 #define HA_PRESSED 0.5f
 
 enum { HA_HOMING, HA_READY, HA_TESTING, HA_RUNNING, HA_STOPPING };
