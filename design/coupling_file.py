@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.coupling import Coupling, Form, Strict, require_channels
-from haptic_loop.controller.environment import Network
+from haptic_loop.controller.environment import Network, RigidWall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.files import InputError, counted, read, write
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
@@ -101,9 +101,14 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
 
 
 def digest(*parts: msgspec.Struct) -> str:
-    """Return the SHA-256 of the parts' canonical JSON: sorted keys, shortest decimals, floats with a point."""
-    plain = [msgspec.json.decode(_canonical(_read_back(part))) for part in parts]
-    return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
+    """Return the SHA-256 of the parts' canonical JSON: sorted keys, shortest decimals, floats with a point.
+
+    An environment of a user's own class counts with the matrices of its E(z), because its fields need not determine E.
+    """
+    loops = [part for part in parts if isinstance(part, Loop)]
+    own = [loop.E() for loop in loops if not isinstance(loop.environment, Network | RigidWall)]
+    encoded = [*(_canonical(_read_back(part)) for part in parts), *(_canonical([E.A, E.B, E.C, E.D]) for E in own)]
+    return hashlib.sha256(msgspec.json.encode([msgspec.json.decode(each) for each in encoded])).hexdigest()
 
 
 def _read_back(part: _Part) -> _Part:

@@ -20,12 +20,12 @@ from haptic_loop.controller.coupling import (
     _ComplianceForm,
     _InternalModelForm,
 )
-from haptic_loop.controller.environment import Network, Spring, Wall
+from haptic_loop.controller.environment import Environment, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import budgets, environments, spring_damper
 from haptic_loop.design import certificate as design_certificate
-from haptic_loop.design.certificate import Verdict, prove, required_damping, verify
+from haptic_loop.design.certificate import Verdict, prove, proves, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
@@ -549,3 +549,29 @@ def test_certificates_of_one_object_list_no_ranges():
     certificate = prove(loop, coupling, "any-environment")
     assert (certificate.guarantee, certificate.facts) == (HERE, ())
     assert verify(Stored.of(loop, coupling, certificate)).proved
+
+
+def of_own_spring(stiffness: float) -> Loop:
+    """Return a loop around a spring of a class without fields: all such classes have the same name."""
+
+    class Own(Environment):
+        contacts = ("tip",)
+
+        def E(self, T):
+            return Lti.constant(numbers([[stiffness]], T), T)
+
+    return Loop(1e-3, (1,), (0,), (0,), (1.37,), Own())
+
+
+def test_own_environments_have_their_own_certificates():
+    """A spring k alone needs (theta + 1/2) k T: 0.75 N s/m for 500 N/m, 7.5 for 5000, so one proof covers one of them.
+
+    A certificate that this process has made is not proved again.
+    """
+    soft, stiff, same = (of_own_spring(k) for k in (500.0, 5000.0, 500.0))
+    certificate = prove(soft, NoCoupling(), THIS_ENVIRONMENT)
+    assert certificate.required == pytest.approx((0.75,))
+    assert proves(soft, NoCoupling(), certificate)
+    assert proves(same, NoCoupling(), certificate)
+    assert required_damping(stiff, NoCoupling(), THIS_ENVIRONMENT).ratio == pytest.approx(7.5 / 1.37)
+    assert not proves(stiff, NoCoupling(), certificate)
