@@ -95,7 +95,9 @@ def _parser() -> options.Parser:
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order (Remark 5)")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     _add_optimal_options(parser, "optimal (--band: spring-damper, too): the force filter of least transparency error")
-    parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>].json)")
+    parser.add_output(
+        "FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>][-<condition>].json)"
+    )
     return parser
 
 

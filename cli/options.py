@@ -229,7 +229,8 @@ class Parser(argparse.ArgumentParser):
     def add_output(
         self,
         out: str = "DIR",
-        what: str = "folder for files, created if missing (default out/<command>-<case or scenario>[-<coupling>])",
+        what: str = "folder for files, created if missing "
+        "(default out/<command>-<case or scenario>[-<coupling>][-<condition>])",
         picture: bool = False,
         seed: bool = True,
     ) -> None:

@@ -29,7 +29,8 @@ _KEPT = 8  # latest samples of a board that are stored
 _COMPARED = 400  # ticks over which clocks are compared before forces act
 _LONGEST = 5e-4  # [s] longest time for which one call waits
 _EXCHANGE = "exchange the ports, or the delays (--theta)"
-_FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SILENT, wire.Phase.DISARMED)  # worst first
+#: phases of a board that the STATE of all boards shows before ARMED and HOLDING, the worst first
+_FAULTS = (wire.Phase.ESTOP, wire.Phase.RAMP, wire.Phase.STOPPED, wire.Phase.SILENT, wire.Phase.DISARMED)
 
 
 def ticks_behind(theta: Sequence[int], axes: Sequence[int]) -> tuple[int, ...]:
@@ -208,7 +209,7 @@ class Boards:
         return [board.ages for board in self._boards]
 
     def info(self) -> wire.Info | None:
-        """Return one INFO for all axes, or None until all came. Raises SafetyStop if the boards do not fit together."""
+        """Return one INFO for all axes; None until all came in. Raises SafetyStop if the boards do not fit together."""
         with self._together():
             for i, board in enumerate(self._boards):
                 self._infos[i] = self._infos[i] or board.device.info()
@@ -228,7 +229,10 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """Send each board its part of `config` with its extra delay. Return the highest result; None until all came."""
+        """Send each board its part of `config` with its extra delay.
+
+        Return the highest result, or None until all boards have answered.
+        """
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:

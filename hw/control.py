@@ -445,10 +445,10 @@ def timed(
     """Return the scenario with the measured T_max, T_min and latency, and the ticks that the link takes.
 
     T_max becomes the length that a fraction `quantile` of the device's ticks does not exceed, where that is longer than
-    the scenario's T_max or T. With known devices T_min becomes the length that this fraction reaches, where that is
-    shorter than the scenario's T_min or T. With `at_once`, forces latch on arrival and the link takes 0 ticks. The
-    latency then ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both sides. Raises
-    SafetyStop where too few answers arrived, or the latency reaches a period.
+    the scenario's T_max or T. With known devices T_min becomes the length that this fraction of ticks has at least,
+    where that is shorter than the scenario's T_min or T. With `at_once`, forces latch on arrival and the link takes 0
+    ticks. The latency then ranges from the least age to the quantile of the ages, widened by `guard_us` [us] on both
+    sides. Raises SafetyStop where too few answers arrived, or the latency reaches a period.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
@@ -476,7 +476,7 @@ class Armable(Protocol):
     @property
     def name(self) -> str: ...  # name in the log
     @property
-    def margin_us(self) -> float: ...  # [us] least time from a force to its latch, or if theta = 0, to its tick's end
+    def margin_us(self) -> float: ...  # [us] least State.margin_us of an answer that is not late
     def controller(self, cap: Sequence[float]) -> Controller: ...  # return a new controller for `cap` (m,) [N]
 
 

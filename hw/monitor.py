@@ -94,7 +94,7 @@ class Ages:
         return float(longest) if longest > T_us + _CLOCK_US else T_us
 
     def shortest_tick(self, T_us: float, q: float = 1.0) -> float:
-        """Return the length [us] that a fraction q of ticks reaches, or T unless it is shorter by a clock's error."""
+        """Return the length [us] that a fraction q of ticks has at least, or T unless this is below T - _CLOCK_US."""
         ordered = sorted(self.ticks, reverse=True)
         shortest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
         return float(shortest) if shortest < T_us - _CLOCK_US else T_us

@@ -65,7 +65,7 @@ class _Cable:
     gone: bool = False
 
     def wait(self, seconds: float) -> bool:
-        """Advance time by at most `seconds`, and return whether bytes have come or the cable was pulled."""
+        """Advance time as `Rehearsal.wait` does, and return whether bytes have come or the cable was pulled."""
         return self.rehearsal.wait(seconds, (self,))
 
     def read(self) -> bytes:

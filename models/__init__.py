@@ -1,1 +1,1 @@
-"""The continuous, physical world: devices and human hands as one MuJoCo scene. It contains no controller."""
+"""Devices and human hands as one continuous MuJoCo scene, and scenes that devices touch, without any controller."""
