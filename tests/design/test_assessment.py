@@ -1,4 +1,4 @@
-"""Tests of the guarantee of an assessment: another loop, coupling or law of the forces loses it."""
+"""Tests of an assessment's guarantee: which loops, couplings and limited forces it covers, and what ends it."""
 
 import json
 from functools import cache
@@ -31,8 +31,8 @@ from tests.asked import needs, safe_with
 
 ONE = parse(ONE_MASS)
 LOOP = ONE.loop("I")
-SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified for any environment
-HERE_ONLY = SpringDamper([2100.0], [1.0])  # needs 97 % of the damping in this environment
+SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified in the default loop for any environment
+HERE_ONLY = SpringDamper([2100.0], [1.0])  # needs 97 % of the damping in LOOP
 change = msgspec.structs.replace
 
 
@@ -78,7 +78,7 @@ def test_an_energy_account_covers_no_latency():
 
 
 def test_the_limiter_is_judged_with_switching_delays():
-    """With constant delays the limiter would be covered (a ratio of 0.70), with switching delays it is not (1.04)."""
+    """The limiter needs 0.70 of the damping with constant delays, and 1.04 of it with switching delays."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
     for runs in ({}, {"environment": loop.environment}):
         limits = assess(loop, coupling, **runs).force_limits
@@ -98,7 +98,7 @@ def test_a_forged_certificate_proves_nothing():
     assert (assessment.guarantee, assessment.certificate) == (None, None)
 
 
-def test_a_guarantee_names_the_forces_that_run():
+def test_a_guarantee_says_whether_limited_forces_are_covered():
     limited, clipped = on_its_own_loop(), assess(LOOP, HERE_ONLY, limiter=False)
     assert limited.force_limits.rho is not None
     assert "limiter" in limited.facts
@@ -107,7 +107,7 @@ def test_a_guarantee_names_the_forces_that_run():
     assert "below" in clipped.guarantee.forces
 
 
-def test_a_clipped_guarantee_says_where_it_ends():
+def test_words_say_whether_limited_forces_are_covered():
     scenario = load()
     loop, coupling = scenario.loop("I"), SpringDamper([600.0, 400.0], [0.5, 0.5])
     clipped = assess(loop, coupling, limiter=False, force_limit=(12.0, 12.0))
@@ -123,8 +123,8 @@ def test_a_clipped_guarantee_says_where_it_ends():
     assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
 
 
-def test_own_conditions_must_name_switching_delays():
-    """A condition whose `covers` does not name switching delays is refused, and then its limiter proves nothing."""
+def test_a_users_condition_must_name_switching_delays():
+    """A condition whose `covers` does not name switching delays is refused, and the rho that it gives is not used."""
 
     class Own(ThisEnvironment):
         name = "own"
@@ -138,8 +138,8 @@ def test_own_conditions_must_name_switching_delays():
     assert (assessment.holds, assessment.force_limits.rho) == (False, None)
 
 
-def test_a_limiter_of_known_devices_names_them():
-    """This-environment covers every device here, but its block for limited forces fails by 0.5 %."""
+def test_a_guarantee_names_its_limiters_known_devices():
+    """This-environment certifies every device here, but its limiter needs 0.5 % more damping than is available."""
     bounds = DeviceBounds(0.1, 2000.0, 0.5, 2.0)
     loop = change(LOOP, delta=(0.98 * 1.37,), known_devices=(bounds,))
     limited = assess(loop, HERE_ONLY)
@@ -148,7 +148,7 @@ def test_a_limiter_of_known_devices_names_them():
 
 
 def test_limited_forces_are_not_searched_between_vertices():
-    """The limiter's block needs 0.9848 times 1.37 N s/m at one end, and with this multiplier 0.03 % more between."""
+    """The limiter needs 0.9848 times 1.37 N s/m for a mass of 3 kg, and with this multiplier 0.03 % more for 0.2 kg."""
     springs = (LOOP.environment.springs[0], change(LOOP.environment.springs[1], stiffness=700.0))
     network = change(LOOP.environment, masses={"mass": 3.0}, springs=springs)
     loop = change(LOOP, environment=network, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.985 * 1.37,))
@@ -161,7 +161,7 @@ def test_limited_forces_are_not_searched_between_vertices():
 
 
 def test_one_environment_covers_no_ranges():
-    """The nominal mass of 1 kg needs 0.9713 times 1.37 N s/m, and a mass of 0.1 kg needs 0.9735 times."""
+    """Relative to 1.37 N s/m the nominal mass of 1 kg needs 0.9713, a mass of 0.1 kg 0.9735; 0.973 is available."""
     loop = change(LOOP, ranges=Ranges(masses={"mass": (0.02, 3.0)}), delta=(0.973 * 1.37,))
     nominal = assess(loop, HERE_ONLY, ranges_samples=0, limiter=False)
     assert (nominal.ranges.proved, nominal.holds) == (False, False)
@@ -169,7 +169,7 @@ def test_one_environment_covers_no_ranges():
 
 
 def test_a_sweep_of_limited_forces_is_no_proof():
-    """A coefficient of 130 decimals has no exact proof: any-environment, which covers the limiter, is only swept."""
+    """A B of 130 decimals has too many digits for a proof: any-environment, which covers the limiter, is only swept."""
     loop = change(LOOP, theta=(0,), lam=(0,))
     for B, proof in ((0.01, "rational"), (1e-130, "sampled")):
         assessment = assess(loop, SpringDamper([100.0], [B]), force_limit=(12.0,))
@@ -181,8 +181,8 @@ def test_a_sweep_of_limited_forces_is_no_proof():
         assert ("without an exact proof" in limits.words) == ("without an exact proof" in verdict(assessment))
 
 
-def test_a_proof_without_the_limiter_is_partial(monkeypatch):
-    """The linear loop is proved, but its limiter is only swept, so the guarantee rests on a sweep."""
+def test_a_swept_limiter_makes_the_guarantee_sampled(monkeypatch):
+    """The loop without limiter is proved, but the limiter is only swept, so the guarantee rests on a sweep."""
 
     def refuse(*args, **kwargs):
         raise NotProved("a proof takes long")
@@ -196,7 +196,7 @@ def test_a_proof_without_the_limiter_is_partial(monkeypatch):
 
 
 def test_a_stored_limiter_proof_covers_no_longer_delay():
-    """The file's proof is for one sample of delay; the loop has more states than a proof may have."""
+    """The stored proof is for a delay of 1 sample. With 801 samples the loop has more states than are proved."""
     loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
     coupling = SpringDamper([1.0], [0.01])
     on_file = prove(loop, coupling, LIMITER)
@@ -298,11 +298,11 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
         assert there["assessment"]["reason"]
 
 
-# One wall: every command reports the damping for making and breaking contact, not that for permanent contact.
+# At one wall every command reports the damping for making and breaking contact, not that for permanent contact.
 
 
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.validate)])
-def test_one_wall_has_one_requirement(tmp_path, monkeypatch, every):
+def test_commands_agree_on_the_requirement_of_a_wall(tmp_path, monkeypatch, every):
     monkeypatch.chdir(tmp_path)
     coupling = SpringDamper([1200.0], [0.5])
     scenario = load("one-wall")

@@ -1,4 +1,4 @@
-"""Tests of `python -m design.audit`: closed forms, the paper's gains, edges, strict JSON and bad calls."""
+"""Tests of `python -m design.audit`: closed forms, the paper's gains, edges of certification, JSON and bad calls."""
 
 import json
 import re
@@ -74,15 +74,15 @@ def strict(text: str) -> dict:
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
-    """A wall needs K T/2 + B without delay. A spring with one sample of delay needs 3 K T/2, and 2 K T by Theorem 4."""
+    """Without delay a wall needs K T/2 + B. With one sample a spring needs 3 K T/2, and 2 K T for any environment."""
     subject = wall(K, B, theta)
     assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
     assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
 
 
 @pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
-def test_rigid_wall_couplings_are_proved_and_stored(theta, proved, tmp_path):
-    """A wall of 1000 N/m needs (theta + 1/2) 1000 N/m times T. With delay the guarantee covers a rigid wall only."""
+def test_sufficiently_damped_rigid_walls_are_proved_and_stored(theta, proved, tmp_path):
+    """A rigid wall behind a spring K needs (theta + 1/2) K T. With delay the guarantee covers a rigid wall only."""
     loop, coupling = wall(1000, 0, theta, delta=1.51 if proved else 1.49)
     needs = certify(loop, coupling)
     assert needs["this-environment"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
@@ -108,14 +108,14 @@ def test_impossible_rigid_walls_are_refused():
 
 
 def test_a_rigid_wall_is_the_stiff_limit():
-    ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
+    ground = Network(("a",), (Spring(("a", GROUND), 1e9),))  # softens K = 2000 N/m by 2e-6 of K
     loop, coupling = wall(2000, 0.4, 1)
     ratio = requirement(loop.at(ground), coupling, "this-environment").ratio
     assert ratio == pytest.approx(requirement(loop, coupling, "this-environment").ratio, rel=1e-5)
 
 
 @pytest.mark.parametrize(("condition", "theta", "K"), [("this-environment", 0, 2340), ("any-environment", 0, 2340)])
-def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
+def test_the_stiffest_spring_is_at_colgates_bound(condition, theta, K):
     """The stiffest spring without delay has K = 2 (delta - B)/T."""
     assert stiffest(*wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
 
@@ -158,7 +158,7 @@ def test_the_stiffest_gains_of_late_forces_are_certified(B):
         assert f"with B = {B:g} N s/m, no K" in margin.reason
 
 
-def test_the_largest_period_before_a_wall_is_colgates():
+def test_the_largest_period_is_at_colgates_bound():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
         found = sensitivity(*subject, condition)
@@ -175,8 +175,8 @@ def test_the_papers_gains_are_not_certified():
     assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["margins"]["any-environment"]["stiffest"]["reason"]
 
 
-def test_rounded_gains_of_the_literature_exceed_the_damping():
-    """Theorem 4 needs 0.02 % more damping than is available; the this-environment condition needs far less."""
+def test_optimal_gains_rounded_up_fail_any_environment():
+    """Any-environment needs 0.02 % more damping than is available, and this-environment needs about half of it."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
     assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
@@ -187,7 +187,7 @@ def test_rounded_gains_of_the_literature_exceed_the_damping():
 @pytest.mark.parametrize(
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
-def test_certification_changes_exactly_at_the_edge(subject, condition):
+def test_certification_ends_at_the_reported_edges(subject, condition):
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
@@ -211,7 +211,7 @@ def test_certification_changes_exactly_at_the_edge(subject, condition):
     assert [requirement(*s, condition).certified for s in outside] == [False] * 4
 
 
-def test_figures_that_do_not_exist_say_why():
+def test_figures_that_do_not_exist_have_a_reason():
     spring = wall(0.01, 0.0, delta=1.0)
     found = sensitivity(*spring, "this-environment")
     assert (found.largest_T_s, found.extra_samples) == (None, None)
@@ -285,7 +285,7 @@ def test_edge_takes_the_certified_side():
     ],
 )
 def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside):
-    """The edge is exact to 1e-7 after at most 8 values. Bisection would take 24."""
+    """The edge is within 1e-7 of its exact value after at most 8 sweeps. Bisection would take 24."""
     values = []
 
     def swept(x):
@@ -403,7 +403,7 @@ BAD = [
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize(("options", "message"), BAD, ids=[options or "nothing" for options, _ in BAD])
-def test_bad_calls_get_one_line_and_exit_2(run, options, message):
+def test_bad_calls_end_with_one_error_line(run, options, message):
     code, out, err = run(*options.split())
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
@@ -449,7 +449,7 @@ def test_a_rigid_audit_names_the_stiffest_wall(run, B):
     assert "No wall with B = 2 N s/m was found to be certified" in out.replace("\n", " ")
 
 
-def test_a_certified_wall_is_not_denied(run):
+def test_a_certified_wall_is_not_called_uncertified(run):
     code, out, _ = run(*["--rigid", "--K", "1000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1e4"])
     assert code == 0
     words = out.replace("\n", " ")
@@ -474,7 +474,7 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 
 
 def test_long_computations_are_refused_or_ended(monkeypatch):
-    """A sweep of the pair is estimated at .16 ms, a search at sixty times that."""
+    """A sweep of the pair is estimated at .16 ms, and a search at sixty times as much."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
     told = report(PAIR, SOFT)
     part, need = told["margins"]["this-environment"], needs(told, "this-environment")

@@ -1,4 +1,7 @@
-"""Test devices with several axes: matrix levels Delta_i in loops, conditions, proofs, designs and limiter."""
+"""Test devices with several axes: matrix levels Delta_i in loops, conditions, proofs, designs and limited forces.
+
+A level is full if it has entries off its diagonal.
+"""
 
 from fractions import Fraction
 from itertools import pairwise
@@ -44,7 +47,7 @@ def _with(**fields: object) -> Loop:
     return msgspec.structs.replace(PAIR, **fields)
 
 
-def test_levels_stand_in_blocks_of_devices() -> None:
+def test_levels_are_the_diagonal_blocks_of_delta() -> None:
     expected = np.zeros((4, 4))
     expected[:2, :2], expected[2:, 2:] = LEVELS
     assert (PAIR.Delta() == expected).all()
@@ -53,7 +56,7 @@ def test_levels_stand_in_blocks_of_devices() -> None:
     assert msgspec.json.decode(msgspec.json.encode(PAIR), type=Loop) == PAIR
 
 
-def test_one_axis_each_is_the_default() -> None:
+def test_one_axis_per_device_is_the_default() -> None:
     single = _with(axes=(1, 1, 1, 1), levels=tuple(((d,),) for d in PAIR.delta))
     assert single.axes is None
     assert single.levels is None
@@ -81,7 +84,7 @@ def test_one_axis_each_is_the_default() -> None:
         ({"delta": (1.0, 0.9, 1.2, 2.0)}, ["level #1", "delta = [1.0, 0.9]", "diagonal"]),
     ],
 )
-def test_impossible_axes_are_refused(fields: dict[str, object], words: list[str]) -> None:
+def test_impossible_axes_and_levels_are_refused(fields: dict[str, object], words: list[str]) -> None:
     with pytest.raises(ValueError, match=words[0]) as refused:
         _with(**fields)
     message = str(refused.value)
@@ -129,7 +132,7 @@ ONE = np.eye(2)
 SPRINGS = between(rotated(30, [900, 300]), rotated(-50, [700, 200]), np.array([[50.0, 10.0], [10.0, 80.0]]))
 MASS = Plane(4, np.diag([0, 0, 0, 0, 0.5, 0.5]), between(0.5 * ONE, 0.4 * ONE, 0.2 * ONE), SPRINGS)
 LOOP = _with(environment=MASS)
-#: one device whose plane holds a mass of 0.5 kg, with springs along the axes of its level
+#: the environment of one device: springs of 900 N/m along x and 300 N/m along y hold a mass of 0.5 kg
 CORNER = Plane(
     2,
     np.diag([0, 0, 0.5, 0.5]),
@@ -148,7 +151,7 @@ def scaled(loop: Loop, share: float) -> Loop:
     return msgspec.structs.replace(loop, delta=tuple(share * d for d in loop.delta), levels=levels or None)
 
 
-def test_this_environment_sweeps_matrix_levels() -> None:
+def test_this_environment_takes_matrix_levels() -> None:
     needs = required_damping(LOOP, BUILT, "this-environment")
     assert needs.ratio == pytest.approx(0.511540, abs=5e-7)
     assert needs.frequency_hz * 2 * np.pi * LOOP.T == pytest.approx(1.2171, abs=5e-5)
@@ -158,13 +161,13 @@ def test_this_environment_sweeps_matrix_levels() -> None:
     assert required_damping(least, BUILT, "this-environment").ratio == pytest.approx(1.009846, abs=5e-7)
 
 
-def test_any_environment_sweeps_matrix_levels() -> None:
+def test_any_environment_takes_matrix_levels() -> None:
     assert required_damping(LOOP, BUILT, "any-environment").ratio == pytest.approx(2.690002, abs=5e-7)
 
 
-def test_latency_sweeps_matrix_levels() -> None:
+def test_latency_takes_matrix_levels() -> None:
     late = msgspec.structs.replace(LOOP, latency=((1e-4, 3e-4),) * 2 + ((2e-4, 2e-4),) * 2)
-    apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)  # 1/t2 and 1/(T - t1) of device 1
+    apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)  # q11 < 1/t2 and q22 < 1/(T - t1) of device 1
     assert required_damping(late, BUILT, "this-environment", apart).ratio == pytest.approx(0.619369, abs=5e-7)
     assert required_damping(late, BUILT, "this-environment").ratio < 0.619369
 
@@ -228,8 +231,8 @@ def test_any_environment_with_switching_takes_levels() -> None:
     assert left(needs.ratio * (1 - 1e-4)) < 0
 
 
-def test_a_multiplier_stays_below_full_levels() -> None:
-    """With psi = 1 E-hat + Phi is passive, and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1 of the paper."""
+def test_any_environment_with_psi_takes_full_levels() -> None:
+    """At the requirement s, E-hat + Phi is passive and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1 (theory.md)."""
     soft = Plane(4, MASS.matrices[0], MASS.matrices[1], 0.25 * SPRINGS)
     loop = msgspec.structs.replace(LOOP, environment=soft, psi=(1, 1, 0, 0))
     design = design_by_kind(loop, "moving-average")
@@ -262,7 +265,7 @@ ONE_SWITCHED = msgspec.structs.replace(ONE_DEVICE, varying_delay=DelayRange((0, 
 
 
 @pytest.mark.parametrize("loop", [LATE, ONE_SWITCHED, pytest.param(SWITCHED, marks=pytest.mark.validate)])
-def test_the_stiffest_coupling_counts_levels(loop: Loop) -> None:
+def test_moving_averages_take_full_levels(loop: Loop) -> None:
     design = design_by_kind(loop, "moving-average")
     assert 0.999 < design.requirement.ratio < 1
     assert prove(loop, design.coupling, "any-environment").proof == "rational"
@@ -271,13 +274,13 @@ def test_the_stiffest_coupling_counts_levels(loop: Loop) -> None:
         np.testing.assert_allclose(stiffness, 2 / 2.1e-3 * np.array(LEVELS[0]), rtol=3e-4)
 
 
-def test_switching_weighs_a_device_by_its_level() -> None:
+def test_switching_has_one_multiplier_per_device() -> None:
     needs = required_damping(SWITCHED, BUILT, SWITCHING)
     assert needs.ratio == pytest.approx(1.276090, abs=5e-7)
     assert len(needs.multiplier or ()) == 2
 
 
-def test_limiter_has_one_weight_per_device() -> None:
+def test_the_limiter_has_one_multiplier_per_device() -> None:
     condition = LimitedForces()
     assert condition.rho(LOOP) == pytest.approx([0.01 * d / LOOP.T for d in LOOP.least_damping], rel=1e-5)
     assert required_damping(LOOP, BUILT, condition, (0.26, 0.742)).ratio == pytest.approx(0.518330, abs=5e-7)
@@ -286,7 +289,7 @@ def test_limiter_has_one_weight_per_device() -> None:
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment", LimitedForces()])
 def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> None:
-    """A proof exists above the requirement; 2 % below it, the sweeps of the two environment conditions refuse."""
+    """2 % above the requirement a proof exists, and 2 % below it the sweep refuses. The limiter is proved for LOOP."""
     least = required_damping(LOOP, BUILT, condition).ratio
     enough = scaled(LOOP, float(f"{1.02 * least:.6g}"))
     if not isinstance(condition, str):  # rho is a share of the damping, so scaling would change the limiter
@@ -297,7 +300,7 @@ def test_matrix_levels_are_proved_exactly(condition: str | LimitedForces) -> Non
         assert required_damping(scaled(LOOP, 0.98 * least), BUILT, condition).ratio > 1
 
 
-def test_rigid_wall_with_a_stiffness_matrix() -> None:
+def test_a_stiffness_matrix_meets_its_closed_form() -> None:
     """The ratio s is (theta + 1/2) T times the largest eigenvalue of Delta^-1/2 K Delta^-1/2."""
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
@@ -312,8 +315,8 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
 
 
 @pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
-def test_a_wall_meets_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
-    """s Delta >= c n n' (n is the normal) holds for s = c n' Delta^-1 n; one axis needs c [N s/m] at this wall."""
+def test_walls_need_damping_along_their_normal(theta: int, damping: float, needs: float) -> None:
+    """The ratio is s = c n' Delta^-1 n, the least with s Delta >= c n n': n is the normal, and one axis needs c."""
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
     network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})
@@ -340,7 +343,7 @@ def test_filtered_spring_dampers_are_not_turned() -> None:
 
 
 def turned(loop: Loop, Q: np.ndarray) -> Loop:
-    """Return the loop in other coordinates: an orthogonal Q turns the contacts first, then the inner nodes."""
+    """Return the loop in other coordinates; the orthogonal Q has rows of the contacts, then of the inner nodes."""
     m = loop.channels
     level = symmetric(Q[:m, :m].T @ loop.Delta() @ Q[:m, :m])
     levels = tuple(tuple(map(tuple, level[own, own].tolist())) for own in loop.devices)
@@ -349,7 +352,7 @@ def turned(loop: Loop, Q: np.ndarray) -> Loop:
 
 
 @pytest.mark.parametrize("turns", [14, pytest.param(200, marks=pytest.mark.validate)])
-def test_turning_the_axes_changes_nothing(turns: int) -> None:
+def test_turning_the_axes_keeps_each_requirement(turns: int) -> None:
     """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i per device keeps each requirement."""
     rng = np.random.default_rng(3)
     asked = [
@@ -375,7 +378,7 @@ def test_turning_the_axes_changes_nothing(turns: int) -> None:
         assert after == pytest.approx(before[i], abs=1e-10), (number, condition)
 
 
-def test_decoupled_axes_need_the_damping_of_one() -> None:
+def test_decoupled_axes_add_no_required_damping() -> None:
     """Three axes of an isotropic device, each with a separate chain, need the damping of one axis with its chain."""
 
     def chains(axes: int) -> Network:
@@ -408,9 +411,10 @@ ONE_KNOWN = msgspec.structs.replace(ONE_DEVICE, known_devices=(BOUNDS,) * 2)
 
 
 def period_forms(loop: Loop, share: float, beta: np.ndarray) -> np.ndarray:
-    """Return L of Theorem B with full levels, on (dx, v, v+) (3m, 3m): the least integral of v'C0 v + c2 v'^2.
+    """Return L of Theorem B with full levels, on (dx, v, v+) (3m, 3m).
 
-    C0 = share Delta_i - beta^2 P/4; scipy computes K = (C0/c2)^(1/2) and tanh(K T/2).
+    L is the least integral of v^T C0 v + c2 |dv/dt|^2 over a period. C0 = share Delta_i - beta^2 P/4 I; SciPy computes
+    K = (C0/c2)^(1/2) and tanh(K T/2).
     """
     m, P = loop.channels, BOUNDS.transmission_stiffness_max**2 / BOUNDS.transmission_damping_min
     out, one = np.zeros((3 * m, 3 * m)), np.eye(2)
@@ -431,7 +435,7 @@ def period_forms(loop: Loop, share: float, beta: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("loop", [ONE_KNOWN, pytest.param(KNOWN, marks=pytest.mark.validate)])
 def test_known_devices_take_full_levels(loop: Loop) -> None:
-    """He[[F/(z-1), 0], [-beta F/z, 0]] + L(dx, v, z v) is positive just above the requirement, not below."""
+    """He[[F/(z-1), 0], [-beta F/z, 0]] + L(dx, v, z v) is positive just above the requirement, and not just below."""
     m = loop.channels
     coupling = _MatrixSpringDamper(BUILT.K[:m, :m], BUILT.B[:m, :m])
     needs = required_damping(loop, coupling, KNOWN_DEVICE)
@@ -455,7 +459,7 @@ def test_known_devices_take_full_levels(loop: Loop) -> None:
 
 
 @pytest.mark.slow
-def test_known_devices_with_full_levels_permit_more_stiffness() -> None:
+def test_known_devices_permit_stiffer_moving_averages() -> None:
     loop = ONE_KNOWN
     known, every = (design_by_kind(loop, "moving-average", name) for name in ("known-device-any", "any-environment"))
     assert 0.999 < known.requirement.ratio < 1
@@ -464,7 +468,7 @@ def test_known_devices_with_full_levels_permit_more_stiffness() -> None:
     assert np.linalg.eigvalsh(softer - stiffer).min() > 0
 
 
-def test_principal_axes_are_orthogonal_exactly() -> None:
+def test_principal_axes_are_orthogonal_and_below_levels() -> None:
     rng = np.random.default_rng(5)
     for n in (2, 3, 3, 3):
         A = np.round(rng.normal(size=(n, n)), 4)
@@ -498,7 +502,7 @@ def test_full_level_designs_at_walls_are_proved(known: bool, condition: str) -> 
     assert prove(loop, design.coupling, condition).proof == "rational"
 
 
-def test_full_levels_take_ranges() -> None:
+def test_full_levels_with_ranges_have_spring_dampers_only() -> None:
     springs = Spring(("a.x", "ground"), 300.0, 0.5), Spring(("a.y", "ground"), 100.0, 0.5)
     network = Network(("a.x", "a.y"), springs, points={"a": ("a.x", "a.y")})
     ranges = Ranges((UncertainSpring(("a.x", "ground"), stiffness=(200.0, 400.0)),))
@@ -509,8 +513,8 @@ def test_full_levels_take_ranges() -> None:
         design_by_kind(loop, "optimal")
 
 
-def test_turned_filters_keep_a_symmetric_compliance() -> None:
-    """A general V in other coordinates equals Q V Q' to 1e-5, and V(1) is exactly symmetric."""
+def test_turned_compliances_keep_a_symmetric_static_value() -> None:
+    """A general V in other coordinates equals Q V Q' to 1e-5 of each entry, and V(1) is exactly symmetric."""
     V = Lti.diag(Lti([[0.37]], [[1.0]], [[2.1e-4]], [[6e-4]], 1e-3), Lti([[-0.2]], [[0.7]], [[1.3e-4]], [[9e-4]], 1e-3))
     after, z = Compliance(V).turned(TURN), np.exp(1j * np.array([0.1, 1.0, 3.0]))
     np.testing.assert_allclose(after.V.at(z), TURN @ V.at(z) @ TURN.T, rtol=1e-5, atol=1e-9)
@@ -518,7 +522,7 @@ def test_turned_filters_keep_a_symmetric_compliance() -> None:
     assert (static == static.T).all()
 
 
-def test_matrix_gains_must_be_symmetric_and_definite() -> None:
+def test_matrix_gains_must_be_symmetric_and_positive_definite() -> None:
     with pytest.raises(ValueError, match="symmetric"):
         _MatrixSpringDamper([[1.0, 2.0], [1.0, 9.0]], np.zeros((2, 2)))
     with pytest.raises(ValueError, match="positive definite"):
@@ -530,8 +534,8 @@ def test_matrix_gains_must_be_symmetric_and_definite() -> None:
 
 
 @pytest.mark.parametrize("balls", [(3,), (2, 2), (1, 3), (3, 3, 3)])
-def test_limited_vectors_solve_their_equation(balls: tuple[int, ...]) -> None:
-    """f = q - M v with |f_i| <= L_i, and v_i along f_i where |f_i| = L_i, otherwise 0."""
+def test_limited_force_vectors_solve_their_equation(balls: tuple[int, ...]) -> None:
+    """f = q - M v with |f_i| <= L_i for each vector f_i; v_i is along f_i where |f_i| = L_i, and otherwise 0."""
     rng = np.random.default_rng(sum(balls))
     n, L = sum(balls), np.repeat(rng.uniform(1, 20, len(balls)), balls)[:, None]
     for spread in (1.0, 30.0, 1e4):
@@ -551,7 +555,7 @@ def test_limited_vectors_solve_their_equation(balls: tuple[int, ...]) -> None:
         np.testing.assert_allclose(work, L * slip, rtol=1e-12)
 
 
-def test_vectors_of_one_entry_are_a_box() -> None:
+def test_balls_of_one_entry_equal_a_box() -> None:
     rng = np.random.default_rng(0)
     A = rng.normal(size=(3, 3))
     M, limit, q = A @ A.T + np.eye(3), np.array([2.0, 3.0, 4.0]), 10 * rng.normal(size=(3, 200))
@@ -559,15 +563,15 @@ def test_vectors_of_one_entry_are_a_box() -> None:
     np.testing.assert_allclose(ball, box, atol=1e-12)
 
 
-def test_a_late_device_is_solved_before_others() -> None:
-    """With psi = 1 of one device M is block triangular, and its symmetric part may be indefinite."""
+def test_block_triangular_ticks_are_solved() -> None:
+    """With psi = 1 of one device M is block triangular. f + M v = q is solved even if M + M' is indefinite."""
     M = np.block([[50 * ONE, 500 * np.ones((2, 2))], [np.zeros((2, 2)), 3 * ONE]])
     q = 10 * np.random.default_rng(1).normal(size=(4, 100))
     v, f = BallProblem(M, np.ones(4), (2, 2)).solve(q)
     np.testing.assert_allclose(f + M @ v, q, atol=1e-10)
 
 
-def test_a_vector_has_one_limit() -> None:
+def test_axes_of_a_device_share_one_limit() -> None:
     with pytest.raises(ValueError, match="one value for all axes"):
         LOOP.law(BUILT, [2.0, 3.0, 5.0, 5.0], [1.0] * 4, balls=LOOP.devices)
 
@@ -604,8 +608,8 @@ def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> n
     return most / start
 
 
-def test_limited_hands_in_space_get_no_energy() -> None:
-    """No lossless hand of 60 gains energy at 1.02 of the requirement 0.518330; at 0.6 of it five or more do."""
+def test_limited_force_vectors_give_no_energy() -> None:
+    """At 1.02 of the requirement 0.518330 none of 60 lossless hands gains energy; at 0.6 of it five or more do."""
     assert (most_energy(1.02 * 0.518330, 1) <= 1 + 1e-9).all()
     assert (most_energy(0.6 * 0.518330, 1, ticks=200) > 1.001).sum() >= 5
 
@@ -624,14 +628,14 @@ def test_an_energy_budget_takes_matrix_levels() -> None:
     assert budget.energy[0] == pytest.approx(1.0 + earned, rel=1e-12)
 
 
-def test_encoder_friction_is_a_length_in_space() -> None:
+def test_encoder_friction_is_a_norm_over_axes() -> None:
     F, steps = LOOP.F(BUILT), [1e-5, 2e-5, 1e-5, 1e-5]
     each, whole = encoder_friction(F, steps), encoder_friction(F, steps, (2, 2))
     np.testing.assert_allclose(whole, np.repeat([np.hypot(*each[:2]), np.hypot(*each[2:])], 2))
 
 
 def test_stiffest_coupling_attains_the_matrix_bound() -> None:
-    """V(1) >= T/2 blockdiag(n_i Delta_i^-1): K = Delta_1/T = [[1500, 400], [400, 900]] N/m for device 1."""
+    """V(1) >= T/2 blockdiag(n_i Delta_i^-1), so device 1 allows K = Delta_1/T = [[1500, 400], [400, 900]] N/m."""
     design = design_by_kind(LOOP, "moving-average")
     assert design.requirement.certified
     V1 = design.coupling.compliance(LOOP.T).dc()
@@ -674,8 +678,8 @@ def test_a_turned_filter_keeps_its_static_share() -> None:
     np.testing.assert_allclose(after.filter(1e-3).at(z), TURN @ before.filter(1e-3).at(z) @ TURN.T, atol=1e-9)
 
 
-def test_switching_search_shares_a_multiplier() -> None:
-    """An option gives delays per device; the slope by gains and multipliers equals central differences."""
+def test_switching_searches_take_delays_per_device() -> None:
+    """An option gives delays per device. The room's slope by gains and multipliers equals central differences."""
     loop = msgspec.structs.replace(LOOP, levels=None)
     span = delay_range(((0, 1), (2, 2)), loop, 9)
     assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))
@@ -734,13 +738,13 @@ def test_optimal_filters_in_space_take_switching_delays(loop: Loop) -> None:
     assert 0 < room < 0.01  # certified, and nearly all of the damping is spent
 
 
-def test_reports_show_matrix_gains_on_their_diagonal() -> None:
+def test_reports_show_the_diagonal_of_matrix_gains() -> None:
     rows = dict(verdict.gain_rows(assess(PAIR, BUILT)))
     assert rows == {"coupling, static": "1500, 800, 1000, 700 N/m"}
 
 
 @pytest.mark.parametrize("loop", [ONE_DEVICE, pytest.param(LOOP, marks=pytest.mark.validate)])
-def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
+def test_optimal_filters_take_limited_force_vectors(loop: Loop) -> None:
     """The multiplier of a design over two bases has one number per device."""
     design = design_by_kind(loop, "optimal", limiter=True, bases=((1, 1), (2, 1)))
     needs = required_damping(loop, design.coupling, LimitedForces(0.0, 1))
@@ -749,7 +753,10 @@ def test_optimal_filters_limit_force_vectors(loop: Loop) -> None:
 
 
 def _chains(stiffness: float, c: float) -> Loop:
-    """Return a delayed loop of one device with two axes and 16 masses, too many states for a storage matrix."""
+    """Return a loop with psi = 1, one device with two axes, and 16 masses, too many states for a storage matrix.
+
+    The level is [[1, c sqrt(1.5)], [c sqrt(1.5), 1.5]] N s/m.
+    """
     springs = [Spring(("a.x", "x0"), stiffness, 0.05), Spring(("a.y", "y0"), 0.7 * stiffness, 0.05)]
     for axis in "xy":
         nodes = [*(f"{axis}{i}" for i in range(8)), "ground"]

@@ -1,4 +1,4 @@
-"""Tests of the bound on linear couplings: its dual matrix is nonnegative on the whole circle, also between samples.
+"""Tests of the bound on the mismatch of linear couplings: its dual matrix is nonnegative, also between samples.
 
 A value of the bound is charged if the error of the dual matrix between samples was subtracted from it.
 """
@@ -32,7 +32,7 @@ def loop_of(name):
 
 @cache
 def judged(name):
-    """Return the bound, and (dual, point, uncharged value, charged value) for the largest charged value."""
+    """Return the bound, and (dual, its unknowns x, uncharged value, charged value) for the largest charged value."""
     calls, charged = [], module._Dual.charged
 
     def recorded(self, x, value, swept):
@@ -84,7 +84,7 @@ def test_the_charged_matrix_is_nowhere_negative(name):
     assert found.proved
     assert charge > 0
     assert least + charge > -0.02 * charge
-    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # the charge is not much too large
+    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # at most twice what D needs, plus 0.3 % of the value
 
 
 @pytest.mark.validate
@@ -162,7 +162,7 @@ def test_a_bound_holds_between_sharp_bends():
 
 
 def test_a_bound_names_its_condition():
-    """A loop without coupling is not bounded where known-device certifies it, but this-environment does not."""
+    """The bound limits what this-environment certifies; here only known-device certifies the loop without coupling."""
     loop = load("omega-pair-known").loop("I")
     known = haptic_loop.assess(loop, NoCoupling(), limiter=False)
     assert known.guarantee is not None
@@ -173,7 +173,7 @@ def test_a_bound_names_its_condition():
         assert "that this-environment certifies" in BoundBeside(-35.14, proved=proved).words
 
 
-def test_only_a_proved_bound_is_called_one(monkeypatch):
+def test_only_proved_bounds_are_stated_as_limits(monkeypatch):
     limit = "no linear coupling that this-environment certifies can be better than -3.00 dB"
     assert BoundBeside(-3.0, proved=True).words.startswith(limit)
     assert "no linear coupling" not in BoundBeside(-3.0).words
@@ -212,7 +212,7 @@ def test_a_full_level_enters_the_dual_value():
 
 @pytest.mark.parametrize(("latency", "factor"), [(None, 1 / 2), (((5e-4, 8e-4),) * 2, 1 / 1.5)])
 def test_timing_scales_the_level_of_a_bound(monkeypatch, latency, factor):
-    """After a latency of at least t1 the level is Delta/(T_max - t1), instead of Delta/T."""
+    """The dual problem's level is Delta T/(T_max - t1), where t1 is the least latency."""
     seen = []
     monkeypatch.setattr(module._Dual, "best", lambda dual: (seen.append(dual.loop), 1.0, 1.0)[1:])
     bound(msgspec.structs.replace(PLANE, T_max=2 * PLANE.T, latency=latency), knots=8)
@@ -220,8 +220,8 @@ def test_timing_scales_the_level_of_a_bound(monkeypatch, latency, factor):
     assert seen[0].T_max is None
 
 
-def test_no_bound_exceeds_a_late_certified_loop():
-    """A damper of 1.2 N s/m without coupling has no error; it is certified for 1 N s/m only if forces latch late."""
+def test_no_bound_exceeds_a_late_loops_mismatch():
+    """Without coupling a damper of 1.2 N s/m has no mismatch. A device of 1 N s/m is enough only for late forces."""
     damper = Network(("tip",), (Spring(("tip", GROUND), 1.0, 1.2),))
     loop = Loop(1e-3, (0,), (0,), (0,), (1.0,), damper, latency=((5e-4, 5e-4),))
     assert required_damping(loop, NoCoupling(), "this-environment").certified

@@ -1,4 +1,4 @@
-"""Tests of state-space couplings: their realisation, the descent, and certificates of the results."""
+"""Tests of fixed-order couplings (`--coupling ccl`): their realisation, the descent, and the designs' certificates."""
 
 import warnings
 
@@ -78,7 +78,7 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
 
 
-def test_the_inner_approximation_reaches_its_optimum(inner):
+def test_fixed_order_designs_beat_spring_dampers(inner):
     loop, found = inner
     assert found.objective <= (4.31 if loop is LONE else 9.8)
     assert found.objective < spring_damper.design(loop).objective
@@ -109,10 +109,10 @@ def test_every_descent_step_is_feasible_and_better():
         assert norm < before
 
 
-@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # an accuracy of 1e-4 is enough
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # the optimum is compared to 1e-3 only
 def test_the_zeros_are_optimal_for_the_poles(inner):
-    """With the poles of the design fixed, condition and norm are convex at each frequency: cvxpy finds the optimum."""
-    import cvxpy as cp  # takes more than a second, in every worker that collects this file
+    """For the design's poles condition and norm are convex at each frequency: the design is the optimum of cvxpy."""
+    import cvxpy as cp  # at the top it would take every worker that collects this file more than a second
 
     loop, found = inner
     shaping, poles = Shaping(loop), np.diag(found.coupling.V.A)
@@ -142,7 +142,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
 
 @pytest.mark.parametrize(("loop", "order", "diagonal"), [(asked(), 1, False), (LONE, 3, True)], ids=["pair", "one"])
 def test_three_steps_beat_the_structured_design(loop, order, diagonal):
-    """The start leaves a share `_START_ROOM` of the damping unused; three steps gain over ten times that share."""
+    """The start leaves a share `_START_ROOM` of the damping unused; three steps lower the norm by over ten shares."""
     structured, design = spring_damper.design(loop), ccl.design(loop, order, diagonal, most_sdps=3)
     assert design.sdps == structured.sdps + 3  # no step ended in the solver's rounding
     assert design.objective < structured.objective * (1 - 10 * _START_ROOM)
@@ -158,7 +158,7 @@ def test_environment_delay_designs_never_worsen_their_start():
     found = ccl.design(loop, most_sdps=3)
     assert found.requirement.certified
     assert found.phi is not None
-    # The design is never worse than its starting gains, which leave room. Rounding may end the descent there.
+    # The design is never worse than its starting gains, which leave `_START_ROOM` of the damping unused.
     room = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
     assert found.objective <= spring_damper.design(room).objective * (1 + 1e-9)
 
@@ -169,13 +169,13 @@ def test_environment_delay_designs_never_worsen_their_start():
         ({"order": 0}, "order is 0, allowed are 1 to 10"),
     ],
 )
-def test_a_bad_request_gets_one_line(options, message):
+def test_an_order_of_zero_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ccl.design(asked(), **options)
 
 
 def test_a_free_mass_is_called_useless(tmp_path, capsys):
-    """A free mass has no static stiffness, and its weighted loop is too stiff for SciPy's Lyapunov solver."""
+    """A free mass has no static stiffness. Its design warns nowhere, though SciPy's Lyapunov solver would."""
     scenario = tmp_path / "free.toml"
     text = 'name = "free"\nT = 1e-3\nduration = 1.0\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\n'
     scenario.write_text(text + 'damping = 1.37\n[environment]\ncontacts = ["tip"]\nmasses = { tip = 0.3 }\n')
@@ -200,8 +200,8 @@ def test_only_searched_springs_are_called_the_softest(condition, searched, tmp_p
     assert ("softest that the search tries" in shown) == searched
 
 
-def test_a_stiff_loop_has_its_reachability_gramian(monkeypatch):
-    """The Gramian by doubling equals SciPy's in a loop where both are accurate."""
+def test_doubling_gives_scipys_reachability_gramian(monkeypatch):
+    """Doubling gives the Gramian where SciPy's solver warns. Here it equals SciPy's, since both are accurate."""
     rng = np.random.default_rng(0)
     A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
     G = Lti(0.99 * A / np.abs(np.linalg.eigvals(A)).max(), B, np.eye(4), np.zeros((4, 2)), 1.0)

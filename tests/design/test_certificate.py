@@ -1,4 +1,4 @@
-"""Certificates are proofs, agree with the sweep, survive saving and loading, and are refused after tampering."""
+"""Tests of certificates: they agree with the sweep, survive saving and loading, and are refused after tampering."""
 
 import os
 from fractions import Fraction
@@ -46,7 +46,7 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
 
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
-def test_environment_delay_is_proved_with_its_multiplier(psi):
+def test_loops_with_psi_are_proved_with_phi(psi):
     """With psi >= 1 a proof of Theorem 4 needs a large enough Phi and guarantees this environment only."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(loop)
@@ -64,13 +64,13 @@ def test_environment_delay_is_proved_with_its_multiplier(psi):
     assert not verify(change(stored, certificate=forged)).proved
 
 
-def test_models_too_large_to_prove_are_reported():
+def test_loops_too_large_to_prove_are_refused():
     loop = change(DEFAULT, theta=(400, 400), delta=(600.0, 600.0))
     with pytest.raises(NotProved, match="over 806 states takes long: up to 800 are tried"):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "this-environment")
 
 
-def test_a_model_of_a_hundred_states_is_proved():
+def test_a_block_of_97_states_is_proved():
     loop = change(DEFAULT, theta=(45, 46), delta=(400.0, 400.0))
     stored = certified(loop, SpringDamper((300.0, 200.0), (0.1, 0.1)), "this-environment")
     assert len(stored.certificate.matrices["P"]) == 97
@@ -165,7 +165,7 @@ def test_environment_delay_needs_more_damping_for_any_environment():
 
 @pytest.mark.parametrize("count", [12, pytest.param(60, marks=pytest.mark.validate)])
 def test_proof_and_sweep_agree_on_both_sides(count):
-    """A random loop is proved exactly if the ratio is below 1; from 1 - 1e-4 to 1 either outcome is accepted."""
+    """A random loop is proved if and only if its ratio is below 1, but from 1 - 1e-4 to 1 it need not be proved."""
     rng = np.random.default_rng(7)
     outcomes = []
     for _ in range(count):
@@ -181,7 +181,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of one to three contacts and a coupling; delta is 0.5 to 1.5 times the need, at most 150 N s/m."""
+    """Return a star of 1 to 3 contacts and a coupling. Delta is 0.5 to 1.5 of the requirement, up to 150 N s/m."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]
@@ -252,7 +252,7 @@ def test_repaired_digests_do_not_forge_a_proof():
         (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )
-def test_a_bad_file_gets_one_line(tmp_path, old, new, names):
+def test_a_bad_file_gets_one_error_line(tmp_path, old, new, names):
     path = tmp_path / "coupling.json"
     save(certified(DEFAULT, STIFF, "this-environment"), path)
     text = path.read_bytes()
@@ -267,14 +267,14 @@ def test_a_bad_file_gets_one_line(tmp_path, old, new, names):
 @pytest.mark.parametrize(
     ("content", "said"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
 )
-def test_other_files_are_refused_in_one_line(tmp_path, content, said):
+def test_files_without_a_coupling_are_refused(tmp_path, content, said):
     path = tmp_path / "coupling.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"coupling.json: .*{said}"):
         load(path)
 
 
-def test_coefficients_that_no_coupling_has_are_refused():
+def test_coefficients_above_1e12_are_refused():
     with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are sizes up to 1e\+12"):
         _InternalModelForm((), (((1e80, 0.0), (0.0, 1e80)),))
     with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
@@ -311,8 +311,8 @@ def test_realisations_changed_by_rounding_are_refused(condition):
     assert reason.startswith("rounding may change the forces by ")
 
 
-def test_the_bound_on_rounding_holds_for_a_tick():
-    """The forces of 200 ticks differ from those of exact ticks by at most 3 sqrt(200) times `rounding`."""
+def test_the_bound_on_rounding_holds_over_ticks():
+    """Parseval's theorem bounds the errors of 200 forces by `rounding` times the norm of x, less than 3 sqrt(200)."""
     loop, rng = change(wall(1000.0, 2.0, 5.0), theta=(1,), lam=(1,)), np.random.default_rng(8)
     for size in (1.0, 1e3):
         running, exact = loop.F(cancelling(size)), loop.F(cancelling(size), exact=True)
@@ -328,10 +328,10 @@ def test_the_bound_on_rounding_holds_for_a_tick():
 
 
 def test_near_sharp_resonances_proof_and_run_agree():
-    """The float and the rational loop are compared exactly at a point of the circle near a sharp peak.
+    """The responses of the float and the rational loop are computed exactly at a point of the circle near a sharp peak.
 
-    The Schur form of the rational loop errs by more than their difference. `rounding` still bounds that difference,
-    and the filter is proved.
+    Their response in floating point errs by more than they differ. `rounding` still bounds their difference, and the
+    filter is proved.
     """
     springs = (("a", "m", 1000.0, 0.01), ("m", "n", 100.0, 0.0), ("n", "k", 1000.0, 0.0), ("k", "b", 3000.0, 0.01))
     parts = tuple(Spring((one, other), stiffness, damping) for one, other, stiffness, damping in springs)
@@ -380,7 +380,7 @@ def test_limits_are_checked_before_anything_is_built(monkeypatch, loop, coupling
             prove(loop, coupling, condition)
 
 
-def test_proofs_with_endless_digits_are_refused_quickly(tmp_path):
+def test_proofs_with_too_many_digits_are_refused(tmp_path):
     good = certified(DEFAULT, STIFF, "this-environment")
     rows = [[f"1/{10**600 + 2 * (9 * i + j) + 1}" for j in range(9)] for i in range(9)]
     reason = verify(change(good, certificate=sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))))
@@ -404,7 +404,7 @@ def test_a_name_that_stands_twice_is_refused(tmp_path, name):
         load(path)
 
 
-def test_irregular_or_huge_files_get_one_line(tmp_path):
+def test_irregular_or_huge_files_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: is not a regular file, expected a file"):
         load(tmp_path / "pipe")
@@ -433,7 +433,7 @@ def test_any_environment_ignores_the_realisation_and_walls():
 # Budgets of time
 
 
-def test_too_long_exact_arithmetic_ends_in_one_line(monkeypatch):
+def test_exact_arithmetic_ends_at_its_budget(monkeypatch):
     stored = certified(PAIR, STIFF, "this-environment")
     monkeypatch.setattr(budgets, "EXACT", 0.0)
     words = "exact arithmetic was given up after the work of 0 s: too many digits over many states"
@@ -468,14 +468,14 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
                 assert not expected
 
 
-def test_proof_and_sweep_agree_on_any_network():
-    """Proof and sweep agree on 12 random networks."""
+def test_proof_and_sweep_agree_on_random_networks():
+    """Of 12 random networks 4 to 8 are proved, and the sweep agrees on each of the 12."""
     found = list(proofs(11, 12))
     assert [row for row in found if not row.holds] == []
     assert 3 < sum(row.proved for row in found) < 9
 
 
-def test_every_block_is_measured_before_it_is_proved(monkeypatch):
+def test_every_block_has_a_limit_of_states(monkeypatch):
     """A block with one state more than the limit is refused, and the message names the limit."""
     loop, coupling = scenario("omega-pair").loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
     wall, one = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
@@ -503,8 +503,8 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
         design_certificate._blocks(loop, coupling, THIS_ENVIRONMENT, [1.0] * 4)
 
 
-def test_a_long_delay_is_proved_from_its_file(tmp_path):
-    """The coupling of a loop with a delay of 101 samples is proved, saved and loaded."""
+def test_a_loop_with_a_long_delay_is_stored(tmp_path):
+    """The coupling of a loop with a delay of 101 samples is proved, and its file is saved and loaded."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
     kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
     save(kept, tmp_path / "late.json")
@@ -512,14 +512,14 @@ def test_a_long_delay_is_proved_from_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("psi", [1001, 10**9, 2**70])
-def test_a_delay_beyond_all_files_is_refused(psi):
+def test_delays_beyond_1000_samples_are_refused(psi):
     with pytest.raises(ValueError, match=rf"psi is \[{psi}, {psi}\], allowed are .* 0 to 1000"):
         msgspec.structs.replace(PAIR, psi=(psi, psi))
     with pytest.raises(ValueError, match=rf"to \[{psi}, {psi}\] samples, expected 0 <= lo <= hi <= 1000"):
         DelayRange((1, 1), (psi, psi))
 
 
-def test_a_loop_unfit_for_files_names_its_field(tmp_path):
+def test_saving_a_negative_damping_is_refused(tmp_path):
     """`replace` accepts a negative damping. Saving that loop is refused."""
     stored = Stored(msgspec.structs.replace(PAIR, delta=(1.0, -1.0)), SOFT.form())
     with pytest.raises(InputError, match=r"bad.json: .* > 0.0 - at `\$.loop.delta"):
@@ -541,7 +541,7 @@ def test_no_condition_certifies_at_equality(condition, theta, room, certified):
     assert required_damping(edge, SOFT, condition).certified is certified
 
 
-def test_certificates_of_one_object_list_no_ranges():
+def test_certificates_of_one_environment_list_no_ranges():
     """With psi = 1 a proof of Theorem 4 covers only the environment for which Phi was found, here the nominal one."""
     pair, coupling = scenario().loop("I"), SpringDamper([2800.0, 1700.0], [1.6, 2.2])
     ranges = ranges_around(pair.environment, 10.0)

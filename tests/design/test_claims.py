@@ -35,7 +35,7 @@ T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 W = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 40_001), np.linspace(1e-4, np.pi, 40_001)]))
 Z = np.exp(1j * W)
 RATE = 2j * np.sin(W / 2) * np.exp(-0.5j * W) / T  # (z-1)/(Tz), without cancellation at low frequency
-LOOPS = {"I": (PUBLISHED["I"], (1, 2)), "II": (PUBLISHED["II"], (0, 0))}
+LOOPS = {"I": (PUBLISHED["I"], (1, 2)), "II": (PUBLISHED["II"], (0, 0))}  # the paper's gains and lam of each case
 
 
 def window(theta):
@@ -50,7 +50,7 @@ def line(K, B, theta):
 
 
 def needed(e_hat_inverse, K, B, theta):
-    """Return the damping that one environment needs: sup of -T Re[F/(z-1)] with F = z^-theta (1/E + V)^-1."""
+    """Return the damping that E needs: sup of -T Re[F/(z-1)], F = z^-theta (1/E + V)^-1; e_hat_inverse is D/E at Z."""
     return (-(Z ** -(theta + 1) / (e_hat_inverse + 1 / (K / RATE + B))).real).max()
 
 
@@ -79,10 +79,11 @@ def test_theorem_1_telescopes():
         assert np.cumsum(balance).min() >= -1e-12
 
 
-def test_sampled_energy_balance_of_devices_and_hands():
+def test_devices_and_hands_keep_the_sampled_energy_balance():
     """In the default scenario the stored energy rises by no more than the ports supply less the sampled dissipation.
 
-    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, h at the handles; w = 0 gives (a) of docs/theory.md.
+    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, where the forces w move the handles by dh; w = 0 gives
+    (a) of docs/theory.md.
     """
     rng = np.random.default_rng(1)
     simulation = assemble(load(), PUBLISHED["I"])
@@ -121,7 +122,7 @@ def test_certified_forces_give_less_than_devices_dissipate():
             slow[k] += colour * slow[k - 1]
         dx = 1e-4 * (slow * rng.normal(size=(2, 20)) + rng.normal(size=(1500, 2, 20)))
         assert supplied(F, dx).min() >= -1e-12
-    # An uncertified map loses energy to motion in the worst direction at the frequency where the condition binds.
+    # An uncertified map gives energy to motion in the worst direction at the frequency where the condition binds.
     F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = this_environment(F, (DELTA, DELTA)).frequency_hz
     z = np.exp(2j * np.pi * hz * T)
@@ -160,10 +161,10 @@ def test_without_coupling_only_the_compliant_device_oscillates():
 def test_figure_6_is_quiet_with_the_printed_gains():
     for coupling in (PUBLISHED["I"], PUBLISHED["II"]):
         record = run(assemble(load(), coupling), "exact")
-        assert np.abs(record.f).max() < 0.7
-        assert 0.0155 < np.abs(record.s[:, :2]).max() < 0.016
+        assert np.abs(record.f).max() < 0.7  # [N]
+        assert 0.0155 < np.abs(record.s[:, :2]).max() < 0.016  # [m], motion of the devices
         fast = np.diff(record.f[-4000:], axis=0)
-        assert np.abs(fast).max() < 0.01  # no oscillation left in the last 4.8 s, only the motion of the hands
+        assert np.abs(fast).max() < 0.01  # [N] per tick: in the last 4.8 s only the hands move
 
 
 @pytest.mark.parametrize(("coupling", "expected"), [(PUBLISHED["I"], (7.63, 7.84)), (PUBLISHED["II"], (7.04, 3.89))])
@@ -196,7 +197,7 @@ def mismatch_at(z, E, coupling, lam):
 
 @pytest.mark.parametrize("case", ["I", "II"])
 def test_index_25_of_the_default_environment_is_infinite(case):
-    """The least singular value falls as the square of the frequency while the mismatch stays above 50."""
+    """The least singular value of E falls as the square of the frequency, but the mismatch stays above 50 N/m."""
     z = np.exp(2j * np.pi * np.array([1e-1, 1e-2, 1e-3]) * T)
     E = figure_4_at(z)
     least = np.linalg.svd(E, compute_uv=False)[:, -1]
@@ -245,7 +246,7 @@ def test_a_rigid_wall_is_not_the_worst_environment():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_theorem_4_is_the_worst_lossless_environment(seed):
+def test_a_lossless_environment_attains_theorem_4(seed):
     """A lossless environment q = 1/E-hat attains the damping of Theorem 4 at one frequency and exceeds it at none."""
     rng = np.random.default_rng(seed)
     K, B, theta = np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2)), int(rng.integers(0, 4))
@@ -281,7 +282,7 @@ def moving_average(theta, delta):
     return Lti(np.eye(theta, k=-1), first, taps, [[T / (2 * delta)]], T)
 
 
-def test_no_linear_coupling_is_stiffer():
+def test_no_linear_coupling_exceeds_the_stiffness_limit():
     """A random stable V of one channel needs a damping of at least (theta+1) T / (2 V(1))."""
     rng = np.random.default_rng(4)
     w = np.linspace(0, np.pi, 2001)[1:]
@@ -307,7 +308,10 @@ def test_no_linear_coupling_is_stiffer():
 
 
 def test_theorem_4_excludes_the_loop_shaping_premise():
-    """sigma_max(E(1) V(1)) >= 0.8175 for any V that Theorem 4 admits; SOFT has sigma_max(E V) >= 1.13 up to 80 Hz."""
+    """The premise is sigma_max(E V) << 1. Theorem 4 only admits V with sigma_max(E(1) V(1)) >= 0.8175.
+
+    SOFT has sigma_max(E V) >= 1.13 up to 80 Hz.
+    """
     E1 = 800 * 700 / 1500 * np.array([[1, -1], [-1, 1]])
     floor = np.array(THETA) + 1.0
     rng = np.random.default_rng(5)
@@ -355,7 +359,7 @@ def test_unilateral_springs_are_passive_under_backward_euler():
     assert touching > 25
 
 
-def test_the_frozen_guarantee_ends_with_another_stiffness():
+def test_a_this_environment_guarantee_ends_with_stiffer_springs():
     """Springs 20 % stiffer need 1.516 N s/m instead of 1.363. With a tenfold or tenth mass, DELTA still suffices."""
 
     def required(factor, mass):
@@ -371,7 +375,7 @@ def test_the_frozen_guarantee_ends_with_another_stiffness():
 
 @pytest.mark.slow
 def test_saturation_is_outside_every_certificate():
-    """A certified loop with lossless hands comes to rest if linear, but may swing at 1.2 Hz if forces are clipped."""
+    """A certified loop with lossless hands comes to rest, but may swing at 1.2 Hz for ever if forces are clipped."""
     hands = (Human((Link(1.2326, 0.0, 34.923),)), Human((Link(0.01999, 0.0, 266.28),)))
     base = load()
     devices = tuple(
@@ -407,7 +411,7 @@ def test_saturation_is_outside_every_certificate():
 
 
 def test_the_multiplier_block_has_a_schur_complement():
-    """The block is positive definite exactly if Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1, as in (14)."""
+    """The matrix of (14) is positive if and only if Phi < Delta_D and Delta_V > (Phi^-1 - Delta_D^-1)^-1."""
     rng = np.random.default_rng(7)
     seen = set()
     for _ in range(300):
@@ -426,7 +430,7 @@ def test_the_multiplier_block_has_a_schur_complement():
     assert seen == {True, False}
 
 
-def test_one_environment_sample_exceeds_the_devices_damping():
+def test_one_sample_of_psi_exceeds_the_damping():
     """With psi = 1 the largest eigenvalue of -He E-hat reaches 1.479 N s/m, so no Phi below DELTA exists."""
     hat = figure_4_at(Z) * (Z**-1 / RATE)[:, None, None]
     least = -np.linalg.eigvalsh((hat + np.conj(np.swapaxes(hat, 1, 2))) / 2)[:, 0]
@@ -444,8 +448,8 @@ def test_delayed_spring_that_uses_all_damping_is_refused(unused):
     assert "not below the damping" in needs.shortfall
 
 
-def test_every_step_of_the_convex_sequence_improves():
-    """The tangent lies below g*g, so on fixed frequencies no step is worse than the one before."""
+def test_no_convex_step_increases_the_norm():
+    """The tangent lies below g*g, so on fixed frequencies no step increases the norm of the step before."""
     shaping = Shaping(Loop(T, THETA, (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4))
     w = np.concatenate([np.geomspace(1e-3, 3, 20), [0.0465]])
     gains = np.array([0.1, 0.1, 0.4, 0.4])
@@ -460,7 +464,7 @@ def test_every_step_of_the_convex_sequence_improves():
 
 
 class Resonant(Environment):
-    """H (1 - 1/z), where H is 500 plus a pair of poles: it may supply power in a band of some 1e-6 rad/sample."""
+    """E = H (1 - 1/z), where H is 500 plus a pair of poles. E may supply power in a band of some 1e-6 rad/sample."""
 
     contacts = ("tip",)
 
@@ -476,7 +480,7 @@ class Resonant(Environment):
         return Lti(A, B, C, D, T) @ step
 
 
-def test_an_active_environment_gets_no_guarantee():
+def test_active_environments_get_no_any_environment_guarantee():
     """A narrow active resonance is not certified for any environment; a passive resonance of the same width is."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):

@@ -1,4 +1,4 @@
-"""Tests of combined facts: figures of a separate computation, exact proofs, and hands that try to gain energy."""
+"""Tests of facts that hold together (docs/theory.md): separate figures, proofs, and hands that try to gain energy."""
 
 import functools
 import itertools
@@ -54,10 +54,10 @@ def need(loop, coupling, rho=None):
         (3000.0, 2.4, 0, (0.12e-3, 0.6e-3), 5.3171),
     ],
 )
-def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most):
-    """The requirement is 4 % below `most`, which bounds both parts of a period separately with the multiplier m = 0.
+def test_latency_and_walls_need_damping_within_bounds(k, damping, theta, latency, most):
+    """The requirement is at least 4 % below `most`, computed for m = 0 and a separate bound on each part of a period.
 
-    A wall that never loses contact needs less.
+    A wall that never loses contact needs no more.
     """
     loop = loop_of(Network(("tip",), walls=(wall(k, damping),)), theta=theta, latency=(latency,))
     touched = loop_of(Network(("tip",), (Spring(("tip", GROUND), k, damping),)), theta=theta)
@@ -66,8 +66,11 @@ def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, mo
 
 
 @pytest.mark.parametrize(("theta", "known", "alone"), [(1, 1.2623, 1.2452), (0, 0.99051, 0.99051)])
-def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
-    """rho is 0.01/T times the requirement without limiter; `known` was computed with the walls' multiplier m = 0."""
+def test_limiter_and_walls_need_damping_within_bounds(theta, known, alone):
+    """The requirement is between that without limiter, `alone`, and `known`, computed for the walls' multiplier m = 0.
+
+    rho is 0.01/T times the requirement without limiter.
+    """
     loop = loop_of(held(wall(3000.0, 2.0)), 1e-3, theta)
     linear = need(loop, COUPLING)
     assert alone * 0.999 < linear <= alone * (1 + 5e-5)
@@ -84,7 +87,7 @@ def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
     assert known * (1 - 5e-4) < found < known * (1 + 5e-5)
 
 
-EVERY = {
+EVERY = {  # fields of a loop by the fact that they add; `walls` and `rho` are read by `combined`
     "latency": {"latency": ((0.1e-3, 0.3e-3),)},
     "walls": {"walls": (wall(3000.0, 2.0),)},
     "limiter": {"rho": 13.0},
@@ -117,7 +120,7 @@ def least_of(names):
 
 @MOST_SETS
 def test_every_combination_is_proved_stored_and_verified(names):
-    """The proof exists at 1.001 of the required damping, not at 0.999; a file that lacks a multiplier is refused."""
+    """A proof exists at 1.001 of the requirement; at 0.999 the sweep refuses. No multiplier may be missing."""
     loop, rho = combined(names)
     least = least_of(names)
     condition = LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
@@ -132,7 +135,7 @@ def test_every_combination_is_proved_stored_and_verified(names):
     assert not required_damping(change(loop, delta=(0.999 * least,)), COUPLING, condition).certified
 
 
-def test_limited_wall_requirements_are_those_of_the_block():
+def test_limited_walls_need_what_the_block_needs():
     """With the multipliers of the search `block_by_hand` is positive at 1.001 of the requirement, not at 0.999."""
     loop, rho = combined(("walls", "limiter"))
     needs = required_damping(loop, COUPLING, LimitedForces(held=(rho,)))
@@ -152,10 +155,10 @@ HANDS, TICKS = 60, 12000
 
 
 def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
-    """Return how many lossless hands have 2 % more energy at the end than in the middle.
+    """Return how many lossless hands have 2 % more energy at the end than in the middle, or above 1 J if one has 1e6 J.
 
-    Each tick tries the force of every age at both ends of the latency and of the periods T to T_max. It applies the one
-    that gives most energy.
+    Each tick tries the forces of all ages at both ends of the latency and of the periods T to T_max. It applies the
+    force that gives most energy.
     """
     rng = np.random.default_rng(seed)
     mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)
@@ -204,7 +207,7 @@ def test_no_hand_gains_energy_at_the_requirement(names, ticks):
 
 
 @pytest.mark.parametrize(("share", "some"), [(1.01, False), (0.3, True)])
-def test_periods_latency_and_switching_bound_the_energy(share, some):
+def test_no_hand_gains_energy_under_worst_timing(share, some):
     """With the worst period, latency and age at every tick no hand gains energy at 1.01 of the requirement.
 
     At 0.3 of it some hands do.
@@ -240,7 +243,7 @@ def test_facts_are_proved_at_every_vertex(names):
 
 
 @pytest.mark.validate
-def test_walls_with_ranges_are_guaranteed_as_ranges():
+def test_walls_with_ranges_are_guaranteed_for_ranges():
     """Every vertex is proved, and the search between the vertices uses the multipliers of the proof."""
     network = held(wall(3000.0, 2.0))
     loop = loop_of(network, 1e-3, 1, 1.3, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
@@ -368,7 +371,7 @@ def test_below_the_requirement_some_hands_gain_energy(further):
 
 
 @pytest.mark.parametrize(("theta", "tau"), [(0, 0.13e-3), (2, 0.5e-3)])
-def test_the_stiffest_coupling_counts_the_exact_latency(theta, tau):
+def test_the_stiffest_coupling_attains_the_latency_limit(theta, tau):
     """V(1) = ((theta + 1) T + tau)/(2 delta) is the least compliance of a linear coupling."""
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1e3),)), theta=theta, latency=((tau, tau),))
     found = design_coupling(loop, "moving-average", "any-environment")

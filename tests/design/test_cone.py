@@ -26,9 +26,10 @@ def hermitian(rng, *shape):
 
 
 def with_known_optimum(rng, p, shapes):
-    """Return a problem and its optimum x: S(x) and the multiplier Z of each block have complementary ranges.
+    """Return a problem of p unknowns and its optimum x. Shapes are (number of matrices, their size, whether complex).
 
-    cost_a = <slope_a, Z>. Slopes add up to I and every x_a is bounded, so that primal and dual set have an interior.
+    Each block's matrices S(x) and multipliers Z have complementary ranges, and cost_a = <slope_a, Z>. Slopes add up to
+    I and every x_a is bounded, so that the primal and the dual set have an interior.
     """
     x, cost, blocks = rng.normal(size=p), np.zeros(p), []
     for count, n, complex_ in shapes:
@@ -65,7 +66,7 @@ def test_a_known_optimum_is_found(seed, settings):
     assert problem.cost @ found == pytest.approx(other, rel=1e-5, abs=1e-5)
 
 
-def test_a_large_block_is_not_for_clarabel(monkeypatch):
+def test_a_large_block_is_solved_without_clarabel(monkeypatch):
     """60 complex rows have 7260 real entries in their triangle; Clarabel's equations have the square of that."""
     calls = answering(monkeypatch)
     problem, x = with_known_optimum(np.random.default_rng(0), 5, [(1, 60, True)])
@@ -142,7 +143,7 @@ def test_an_infeasible_problem_is_no_solver_failure():
         bounds(lambda x: x - 1, lambda x: -x).solve("the request")
 
 
-def test_unbounded_is_a_failure():
+def test_an_unbounded_problem_is_a_failure():
     with pytest.raises(DesignFailed, match="DualInfeasible"):
         bounds(lambda x: -x).solve("the request")
 
@@ -155,8 +156,8 @@ def test_a_refused_optimum_is_not_used():
         LEAST_TRACE.solve("it", accept=lambda x: False)
 
 
-def test_clarabel_reads_the_same_matrix_from_scipy():
-    """The solver's own interface takes a csc_matrix; the light stand-in for it gives the same bits."""
+def test_clarabel_reads_bare_columns_like_scipys_matrix():
+    """Clarabel takes a csc_matrix of SciPy. With `cone._columns` instead it gives the same solution to the last bit."""
     rng = np.random.default_rng(2)
     A = np.where(rng.random((9, 4)) < 0.6, rng.normal(size=(9, 4)), 0.0)
     A[:, 2] = 0.0  # a column without entries

@@ -1,4 +1,4 @@
-"""Tests of design.compare: curves match formulas by hand, and their maxima match the conditions' figures."""
+"""Tests of design.compare: curves match formulas by hand, and their maxima are the conditions' requirements."""
 
 import json
 import re
@@ -20,7 +20,7 @@ T, DELTA = 1.2e-3, 1.37
 
 HZ = np.array([0.3, 6.17, 40.0, 133.0, 400.0])
 
-#: Relative rounding error of a state-space response whose poles are 1e-3 from the unit circle.
+#: Largest relative rounding error of a state-space response whose poles are 1e-3 from the unit circle.
 ROUNDING = 1e-9
 
 
@@ -64,7 +64,7 @@ def test_an_undelayed_wall_feels_like_its_spring():
     np.testing.assert_allclose(felt.damping[:, 0], 0.0, atol=1e-12)
 
 
-def test_a_delayed_spring_feeds_and_a_damper_dissipates():
+def test_delayed_springs_and_dampers_have_closed_forms():
     """z^-1 K has the stiffness K cos wT and the damping -K sin(wT)/w.
 
     A damper B in backward Euler has the stiffness B (1 - cos wT)/T and the damping B sin(wT)/(wT).
@@ -121,7 +121,7 @@ def test_curves_of_delayed_environments_reach_the_ratio():
     assert 0 < demand.max() == pytest.approx(judged.requirements["any-environment"].ratio, rel=1e-9)
 
 
-def test_required_damping_is_perceived_with_the_hold():
+def test_perceived_damping_with_hold_gives_the_requirement():
     """For one channel, the minimum of T Im[F e^(-jw/2)]/(2 sin(w/2)) over frequency is -required."""
     loop = wall(900.0, 0.4, theta=2)
     judged = judge(loop, SpringDamper([2000.0], [0.3]))
@@ -159,8 +159,8 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_options_set_three_delays_and_skip_pictures(tmp_path):
-    """Three unequal devices get delays of 0, 1 and 2 samples by option."""
+def test_a_comparison_of_three_devices_skips_pictures(tmp_path):
+    """Three unequal devices with delays of 0, 1 and 2 samples have a curve each; --no-plot writes no picture."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
     assert main([*args, "--json", str(tmp_path / "r.json")]) == 0
     assert not list(tmp_path.glob("*.png"))
@@ -169,7 +169,7 @@ def test_options_set_three_delays_and_skip_pictures(tmp_path):
     assert np.shape(outcome["ideal"]["stiffness"])[1] == 3
 
 
-def test_a_missing_design_leaves_the_others(tmp_path, capsys):
+def test_an_impossible_design_leaves_the_other_couplings(tmp_path, capsys):
     base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
     assert main(["--coupling", "none,spring-damper:any-environment", *base]) == 1
     assert re.search(r"spring-damper\S*( \S+)?: not possible", " ".join(capsys.readouterr().out.split()))
@@ -191,6 +191,6 @@ def test_a_missing_design_leaves_the_others(tmp_path, capsys):
         (["--coupling", "missing.json"], "No such file"),
     ],
 )
-def test_bad_input_gets_one_line(argv, message, tmp_path):
+def test_bad_lists_of_couplings_are_refused(argv, message, tmp_path):
     with pytest.raises(InputError, match=message):
         main([*argv, "--out", str(tmp_path)])

@@ -28,7 +28,7 @@ LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
 F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
 
 
-def test_friction_needed_by_ten_micrometre_steps():
+def test_ten_micrometre_steps_need_known_friction():
     assert _l1_gain(F).sum(axis=1) == pytest.approx([10019.6547, 7563.3655], abs=1e-4)
     assert encoder_friction(F, [STEP, STEP]) == pytest.approx([0.050098, 0.037817], abs=1e-6)
     assert encoder_friction(F, [0.0, 0.0]) == pytest.approx([0.0, 0.0])
@@ -36,7 +36,7 @@ def test_friction_needed_by_ten_micrometre_steps():
         encoder_friction(F, [STEP])
 
 
-def test_a_published_bound_covers_no_encoder_step():
+def test_an_upper_friction_bound_covers_no_steps():
     coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
     needed = encoder_friction(F, steps)
     bounded = EncoderSteps.of(LOOP, coupling, steps, [0.0, 0.0], [0.26, 0.26])
@@ -118,7 +118,7 @@ def test_friction_is_compared_in_the_running_environment():
     ids=["design", "validate", "bridge"],
 )
 def test_commands_say_that_steps_are_not_covered(run, tmp_path, capsys):
-    """A device of a session always has counts, whatever its scenario declares."""
+    """A session's device always counts encoder steps, so bridge says so without a scenario that declares them."""
     source = (Path(scenario_module.__file__).parent / "scenarios" / "omega-pair.toml").read_text()
     (tmp_path / "s.toml").write_text(source.replace("force_limit = 12.0", "encoder_step = 1e-5\nforce_limit = 12.0"))
     run(tmp_path)
@@ -139,8 +139,8 @@ def test_first_order_gains_match_the_closed_form(pole):
     assert _l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
 
 
-def test_a_gain_that_decays_slowly_is_bounded():
-    slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed, but still bounded
+def test_slowly_decaying_responses_have_bounded_gains():
+    slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed; the gain is 1e9
     assert 1e9 <= _l1_gain(slow)[0, 0] < np.inf
 
 
@@ -151,7 +151,7 @@ def test_delays_keep_gains_and_integrators_are_unbounded():
 
 @pytest.mark.parametrize("amplitude", [0.05, 3.0, 100.0])
 def test_quantised_loops_gain_no_energy(amplitude):
-    """sum f'dx + dx' D dx + W |dx| >= 0 from rest near the edge of a step; without W small motions violate it."""
+    """sum f'dx + dx' Delta dx/T + W |dx| >= 0 from rest near the edge of a step; without W small motions violate it."""
     requirement = this_environment(F, LOOP.delta)
     delta, W = np.array(requirement.required) * (1 + 1e-9), encoder_friction(F, [STEP, STEP])
     hz, phase = np.geomspace(2, 400, 25), np.random.default_rng(1).uniform(0, 2 * np.pi, (25, 2)).T

@@ -66,7 +66,7 @@ def test_definiteness_agrees_with_eigenvalues():
         S[idle], S[:, idle] = 0, 0
         least = np.linalg.eigvalsh(S)[0]
         outcome = definiteness(Matrix.of(S.tolist()))
-        if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
+        if abs(least) > 1e-9:  # rounding may give a zero eigenvalue either sign
             assert outcome.definite == (least > 0)
             assert _strictly_positive(Matrix.of(S.tolist())) == (least > 0)
         assert outcome.semidefinite == (least > -1e-9)
@@ -90,7 +90,7 @@ def test_definiteness_agrees_with_eigenvalues():
         (np.diag([0, 3]), "the leading minor of order 1 is zero"),
     ],
 )
-def test_indefinite_matrices_name_a_minor_that_shows_it(S, words):
+def test_matrices_that_are_not_definite_name_a_minor(S, words):
     S = np.array(S)
     outcome = definiteness(Matrix.of(S.tolist()))
     assert str(outcome) == words
@@ -98,7 +98,7 @@ def test_indefinite_matrices_name_a_minor_that_shows_it(S, words):
     assert np.sign(round(minor)) == (0 if np.linalg.eigvalsh(S)[0] > -1e-9 else -1)
 
 
-def test_singular_matrices_with_negative_directions_are_rejected():
+def test_gram_matrices_are_semidefinite_but_not_definite():
     rng = np.random.default_rng(2)
     for rank in range(1, 5):
         half = rng.integers(-5, 6, (6, rank))
@@ -121,7 +121,7 @@ def test_definiteness_below_rounding_is_not_proved():
 
 @pytest.mark.parametrize("bits", [16, 24, 40])
 def test_matrices_that_rounding_makes_definite_are_not_proved(monkeypatch, bits):
-    """J + u M (J has ones, |M| <= 1/2) is indefinite; rounded to multiples of u it is J + u I, which is definite."""
+    """J + u M (J has ones, |M| <= 1/2, u = 2^-bits) is indefinite; rounded to multiples of u it is J + u I > 0."""
     monkeypatch.setattr(exact, "_BITS", bits)
     u, less = Fraction(1, 2**bits), Fraction(499, 1000)
     M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
@@ -190,7 +190,7 @@ def test_the_exact_force_map_is_what_runs(coupling, theta, psi):
     running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
     rng = np.random.default_rng(4)
     for z in rng.uniform(0.7, 1.5, 5) * np.exp(1j * rng.uniform(0, np.pi, 5)):
-        # Near a resonance a frequency response in floating point loses digits: the errors here are up to 2e-10.
+        # Near a resonance a response in floating point loses digits: here an entry errs by up to 2e-10 of its size.
         np.testing.assert_allclose(at(F, z), running.at(z), rtol=1e-8, atol=1e-8)
 
 
@@ -255,7 +255,7 @@ def test_a_static_block_is_refused_exactly(monkeypatch):
     assert reason
 
 
-def test_the_kyp_matrix_is_the_storage_increase():
+def test_the_kyp_form_is_supply_less_storage_increase():
     """The form of the KYP matrix, x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), is supply less storage increase."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
@@ -303,7 +303,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
 
 
 def test_floating_point_refuses_no_definite_matrix():
-    """M = e P with ill-conditioned P is definite, but as e is near the rounding unit, the computed M often is not."""
+    """P - A'PA = (1 - r^2) P is definite, but 1 - r^2 is near the rounding unit: computed in floats it often is not."""
     rng, indefinite = np.random.default_rng(7), 0
     for _ in range(60):
         n = int(rng.integers(2, 6))
@@ -348,7 +348,7 @@ def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
     assert not recwarn.list
 
 
-def test_models_with_too_many_states_are_reported():
+def test_proofs_are_limited_to_800_states():
     budgets.require_size(budgets.PROOF_STATES)
     with pytest.raises(TooLong, match=r"^a proof over 801 states takes long: up to 800 are tried$"):
         budgets.require_size(budgets.PROOF_STATES + 1)

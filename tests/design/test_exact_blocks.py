@@ -112,19 +112,19 @@ def test_the_exact_block_holds_the_damping_exactly():
 
 
 @pytest.mark.parametrize("theta", [0, 1, 4])
-def test_this_environment_against_a_spring(theta):
+def test_springs_need_the_closed_form(theta):
     """The limit is (theta + 1/2) K T."""
     F = loop(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
 
 
-def test_this_environment_against_a_spring_and_a_damper():
+def test_undelayed_spring_dampers_need_the_closed_form():
     """The limit is K T/2 + B."""
     F = loop(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda d: both(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
 
 
-def test_this_environment_over_two_channels_that_are_joined():
+def test_joined_channels_need_the_largest_eigenvalue():
     """The limit is (theta + 1/2) T times the largest eigenvalue of K relative to the dampings."""
     K, ratio = np.array([[900.0, -300.0], [-300.0, 400.0]]), np.array([1.0, 0.37])
     springs = (Spring(("a", "b"), 300.0), Spring(("a", "ground"), 600.0), Spring(("b", "ground"), 100.0))
@@ -134,7 +134,7 @@ def test_this_environment_over_two_channels_that_are_joined():
 
 
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 1), (1, 0))])
-def test_this_environment_against_a_dense_sweep(theta, psi):
+def test_figure_4_needs_what_a_sweep_finds(theta, psi):
     def needed(w):
         z = np.exp(1j * w)
         F = late(z, theta) @ sent(z, STIFF, psi)
@@ -163,7 +163,7 @@ def any_environment_limit(K: float, B: float, theta: int) -> float:
 
 @pytest.mark.parametrize("theta", [0, 1, 3])
 @pytest.mark.parametrize(("K", "B"), [(900.0, 0.0), (900.0, 0.4), (50.0, 2.0)])
-def test_any_environment_of_one_spring_damper(K, B, theta):
+def test_one_spring_damper_meets_its_any_environment_limit(K, B, theta):
     V = SpringDamper([K], [B]).compliance(rational(T))
     limit = any_environment_limit(K, B, theta)
     if not B:
@@ -173,7 +173,7 @@ def test_any_environment_of_one_spring_damper(K, B, theta):
     assert_limit(lambda d: both(any_environment_demand(V, (theta,), [d])), limit)
 
 
-def test_any_environment_of_a_full_compliance():
+def test_rotated_spring_dampers_need_the_larger_limit():
     """With spring-dampers along rotated axes, the one that needs more damping sets the limit."""
     turn = np.array([[Fraction(3, 5), Fraction(-4, 5)], [Fraction(4, 5), Fraction(3, 5)]])
     V = turn @ SpringDamper([900.0, 700.0], [0.4, 0.3]).compliance(rational(T)) @ turn.T
@@ -185,14 +185,14 @@ def test_any_environment_of_a_full_compliance():
 
 
 @pytest.mark.parametrize("psi", [1, 2, 5])
-def test_the_multiplier_of_a_delayed_spring(psi):
+def test_phi_of_a_delayed_spring_is_known(psi):
     """Phi must exceed (psi - 1/2) K T, as He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
     E = loop(to_ground(1000.0), (0,), (psi,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), (psi - 0.5) * 1000 * T)
 
 
-def test_the_multiplier_of_a_delayed_spring_damper():
+def test_phi_of_a_delayed_spring_damper_is_known():
     """The limit is K T/2 + B, from w = pi; w = 0 alone would need less."""
     E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
@@ -209,7 +209,7 @@ def test_figure_4s_multiplier_matches_a_dense_sweep():
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.45])
-def test_a_spring_behind_delay_with_its_multiplier(share):
+def test_a_coupling_spring_with_phi_meets_its_limit(share):
     """T/(2 delta) must be below (T/phi - 2/K)/(K (4 T/phi - 6/K)) at w = 0 and (T/phi - 2/K)/2 at w = pi."""
     K, a = 900.0, 1 / 900.0
     phi = share * K * T / 2
@@ -218,7 +218,7 @@ def test_a_spring_behind_delay_with_its_multiplier(share):
     assert_limit(lambda d: certificate._block(any_environment_demand(V, (1,), [d], phi=multiplier)), T / (2 * least))
 
 
-def test_a_spring_damper_behind_delay_with_its_multiplier():
+def test_a_spring_damper_with_phi_meets_its_limit():
     K, B, phi, theta = 900.0, 0.4, 0.2, 2
     w = np.concatenate([np.geomspace(1e-3, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)])
     z = np.exp(1j * w)
@@ -241,7 +241,7 @@ def test_a_spring_damper_behind_delay_with_its_multiplier():
 
 @pytest.mark.parametrize(("lo", "hi"), [(0, 1), (1, 3)])
 @pytest.mark.parametrize("weight", [0.5, 1.0, 3.0])
-def test_switching_against_a_spring(lo, hi, weight):
+def test_switching_before_a_spring_needs_the_closed_form(lo, hi, weight):
     """The limit is T (alpha/2 + h^2 K^2/(2 alpha) + K ((lo + hi)/2 + 1/2)), or (hi + 1/2) K T if alpha = h K."""
     K, h = 1000.0, (hi - lo) / 2
     alpha = weight * h * K
@@ -253,7 +253,7 @@ def test_switching_against_a_spring(lo, hi, weight):
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
-def test_switching_against_a_dense_sweep(lo, hi):
+def test_switching_needs_what_a_dense_sweep_finds(lo, hi):
     alpha = np.array([500.0, 300.0]) * (np.array(lo) < np.array(hi))
     h = (np.array(hi) - np.array(lo)) / 2
 
@@ -285,7 +285,7 @@ def test_the_longest_period_scales_each_block(longest):
 
 
 @pytest.mark.parametrize(("first", "last", "longest"), [(1.3e-4, 1.3e-4, T), (0.0, 5e-4, T), (2e-4, 6e-4, 1.5e-3)])
-def test_a_wall_that_latches_late(first, last, longest):
+def test_a_spring_with_latency_needs_the_closed_form(first, last, longest):
     """For latencies t1 to t2 the limit is the larger root d of (d/t2 - 3 K/2)(d/(T_max - t1) - K/2) = K^2."""
     K, a, b = 1000.0, 1 / last, 1 / (longest - first)
     limit = max(np.roots([a * b, -K * (a + 3 * b) / 2, -(K**2) / 4]))
@@ -294,8 +294,8 @@ def test_a_wall_that_latches_late(first, last, longest):
 
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
-def test_a_limited_spring(theta, c):
-    """The damping d adds [1, 1; 1, 1] d/T to the block, which is 0 on (1, -1): a Schur complement gives the limit."""
+def test_a_limited_spring_needs_the_computed_damping(theta, c):
+    """The damping d adds [1, 1; 1, 1] d/T to the block, so nothing on (1, -1): a Schur complement gives the limit."""
     K, rho = 1000.0, 20.0
 
     def needed(w):
@@ -311,7 +311,7 @@ def test_a_limited_spring(theta, c):
 
 
 @pytest.mark.parametrize(("theta", "g"), [(0, 1.0), (1, 2.0), (2, 0.7)])
-def test_a_wall_on_the_device_itself(theta, g):
+def test_walls_at_the_device_need_the_closed_form(theta, g):
     """The limit is (theta + 1 + g)^2 K T/(4 g + 2) with the multiplier g K; only the wall exerts a force."""
     wall = Wall(("tip", "ground"), 3000.0)
     network = Network(("tip",), (), walls=(wall,))
@@ -482,7 +482,7 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     made = prove(asked, coupling, "any-environment", [phi])
     assert forged(asked, coupling, made) is None
     claimed = from_ratio("any-environment", made.required[0] / 4.0, (4.0,), 1.0)
-    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # for any Phi
+    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # the sweep certifies with any Phi
 
     def with_phi(value: float) -> str | None:
         return forged(asked, coupling, made, multipliers={"Phi": (value,)})
@@ -494,7 +494,7 @@ def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     assert with_phi(-0.1) == "the multiplier Phi is not between 0 and the device damping on every channel"
 
 
-def test_figures_are_held_to_a_millionth():
+def test_stored_figures_are_checked_to_a_millionth():
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
     made = prove(asked, STIFF, "this-environment")
     for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
@@ -508,7 +508,7 @@ def test_figures_are_held_to_a_millionth():
     assert forged(asked, STIFF, made, margin=2 * made.margin).startswith(f"margin is {2 * made.margin:.9g}, the sweep")
 
 
-def test_switching_figures_hold_to_a_millionth():
+def test_stored_switching_figures_are_checked_to_a_millionth():
     soft = SOFT
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
     made = prove(asked, soft, "this-environment")

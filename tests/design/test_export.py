@@ -108,7 +108,7 @@ def limited_files(tmp_path_factory):
     ("name", "limit"), [("pair", (12.0, 5.0)), ("star", (2.0,) * 5), ("free", (3.0, 2.0, 1.0, 2.0))]
 )
 def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
-    """The simulator's solver gives the same forces but for rounding, where 20 to 90 % of the ticks reach a limit."""
+    """The simulator gives the same forces to 1e-7 of the largest limit, where 20 to 90 % of the ticks reach a limit."""
     stored = limited_files[1][name]
     block = process_block(stored, force_limit=limit)
     test, m = trial(block), len(limit)
@@ -150,7 +150,10 @@ def space(tmp_path_factory):
 
 
 def vectors(stored, psi):
-    """Return the limited process for delays `psi` in the environment; unequal ones make M block triangular."""
+    """Return the limited process for delays `psi` in the environment, with ten times the rho of the proof.
+
+    Unequal delays make the tick's matrix M = D_G + rho block triangular.
+    """
     block, loop = process_block(stored, force_limit=(2.0, 2.0, 1.0, 1.0), balls=stored.loop.devices), stored.loop
     G = msgspec.structs.replace(loop, psi=psi).sent(stored.built())
     limiter = Limiter(G, loop.theta, limit=block.limiter.limit, rho=10 * block.limiter.rho, balls=loop.devices)
@@ -158,8 +161,8 @@ def vectors(stored, psi):
 
 
 @pytest.mark.parametrize("psi", [(0, 0, 0, 0), (1, 1, 0, 0)])
-def test_limited_vectors_are_those_of_the_simulator(space, psi):
-    """The exported code gives the forces of the simulator, which begins with full steps of Newton's method."""
+def test_limited_force_vectors_are_those_of_the_simulator(space, psi):
+    """The export's test vector has the simulator's forces, though the simulator begins with full Newton steps."""
     block = vectors(space[0], psi)
     test = trial(block)
     buffer = StepBuffer(Process(block.limiter, np.full(4, np.inf), np.zeros(4)), len(test.inputs), 4)
@@ -194,8 +197,8 @@ def test_force_limits_are_of_vectors_or_axes(space, tmp_path, capsys):
         main([str(space[1]), "--process", "--force-limit", "2,1,1"])
 
 
-def test_a_vector_without_solution_is_zero(space, monkeypatch):
-    """A force vector that misses its tolerance, here after one step, is set to 0 and stays below its limit of 2 N."""
+def test_an_unsolved_vector_stays_below_its_limit(space, monkeypatch):
+    """A force vector that misses its tolerance, here after one step, is set to 0, and so never reaches its 2 N."""
     block = vectors(space[0], (0,) * 4)
     inputs = trial(block).inputs
     monkeypatch.setattr(export_module, "_MOST_STEPS", 1)
@@ -343,7 +346,7 @@ def test_the_process_is_the_papers_force_map():
         np.testing.assert_allclose(system.at(z), expected, rtol=1e-9)
 
 
-def test_without_theta_the_link_is_the_delay():
+def test_without_theta_the_process_omits_the_delay():
     stored = Stored.of(PAIR, SOFT)
     with_it, without = (process_block(stored, flag) for flag in (True, False))
     z = np.exp(0.3j)
@@ -409,7 +412,7 @@ def test_a_hostile_name_stays_inside_the_comment(tmp_path):
         (["{place}/none.json"], "export its process with --process"),
     ],
 )
-def test_bad_input_gets_one_line(place, options, message):
+def test_bad_export_options_are_refused(place, options, message):
     save(Stored.of(PAIR, NoCoupling()), place / "none.json")
     with pytest.raises(InputError, match=message), one_command():
         main([option.format(gains=place / "gains.json", place=place) for option in options])

@@ -61,7 +61,7 @@ def one(T, delta, theta=0, device=DEVICE, **more) -> Loop:
 
 
 def wall(K, B, theta, T) -> Lti:
-    """Return a spring-damper to ground whose force is `theta` samples late."""
+    """Return the force map of a spring-damper to ground whose force is `theta` samples late."""
     return taps([0.0] * theta + [K + B / T, -B / T], T)
 
 
@@ -95,7 +95,7 @@ def test_constants_of_a_period_match_separate_figures():
     cost = period_cost(one(1.2e-3, 1.37), 1.0, np.array([3e-5]))
     c0, c2, q, T = 1.2753875, 1.7998875e-6, 1.1073999408e-3, 1.2e-3
     expected = c0 / (T - q), c0 * q / (T - q), c0 * q * T / (T - q), c2 / q
-    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)  # T - q is known to 5e-10
+    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)  # the digits of q give T - q to 5e-10 of it
     own, first, last = cost.move[0], cost.mean[0] / 4 + cost.step[0], cost.mean[0] / 4 - cost.step[0]
     assert (own, -cost.cross[0] / 2) == pytest.approx((1.37730743e4, -7.62615086), rel=1e-8)
     assert (first, last) == pytest.approx((6.20101795e-3, 2.95036309e-3), rel=1e-8)
@@ -124,7 +124,7 @@ def test_required_damping_of_the_papers_loop(coupling, required, beta):
     ("K", "B", "theta", "T", "present", "required"),
     [(1200.0, 20.0, 0, 2.5e-4, 20.15, 0.00038), (1000.0, 5.0, 1, 1e-3, 5.525, 0.28290)],
 )
-def test_required_damping_of_damped_walls(K, B, theta, T, present, required):
+def test_damped_walls_need_the_known_damping(K, B, theta, T, present, required):
     found = sweep_of(wall(K, B, theta, T), one(T, 1.0, theta)).best(present)
     assert found.share == pytest.approx(required, rel=3e-3 if required < 0.001 else 1e-4)
 
@@ -136,7 +136,7 @@ def test_a_bare_spring_gains_nothing():
 
 
 @pytest.mark.parametrize(("theta", "known", "present"), [(0, 5913.6, 2283.3), (1, 1887.4, 1141.7), (2, 1029.7, 761.1)])
-def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present):
+def test_chi_gives_the_stiffest_linear_coupling(theta, known, present):
     """V(1) is twice the mean of `chi_by_hand` over the circle; for beta -> 0 this mean is n T/(4 delta)."""
     z = np.exp(2j * np.pi * (np.arange(512) + 0.5) / 512)
     loop, top = one(1.2e-3, 1.37, theta), 2 * np.sqrt(1.37 * 0.5) / 14500
@@ -167,7 +167,7 @@ def cost_by_hand(z, loop, beta):
     c0, c2 = loop.delta[0] - beta**2 * P / 4, beta * m - beta**2 * b / 4
     rate = np.sqrt(c0 / c2)
     q = 2 / rate * np.tanh(rate * T / 2)
-    mean, step = (1 + z) / 2, z - 1  # v times these is its mean over the period and its change
+    mean, step = (1 + z) / 2, z - 1  # v times these is vb = (v + v+)/2 and v+ - v
     rows = [(np.sqrt(c0 * q), 0, mean), (np.sqrt(c0 / (T - q)), 1, -q * mean), (np.sqrt(c2 / q), 0, step)]
     Lam = sum(
         scale**2 * np.array([[d * d * np.ones_like(z), d * v], [d * np.conj(v), np.abs(v) ** 2]])
@@ -197,7 +197,7 @@ def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_least_cost_of_a_period(seed):
+def test_no_discretised_period_costs_less(seed):
     """A discretised minimum approaches the least cost from above, with an error of second order in its step."""
     rng = np.random.default_rng(seed)
     T, beta = 1e-3, 5e-5 * rng.uniform(0.1, 0.9)
@@ -233,7 +233,7 @@ def test_the_cost_is_concave_in_damping_and_beta():
 
 
 def test_tangents_bound_a_sweep_over_beta():
-    """The search's bound rises to 0.9 of the least share, though the search starts far above it; c2 > 0 limits beta."""
+    """The search's bound rises to 0.9 of the least share of a sweep, though it starts at 3; c2 > 0 limits beta here."""
     T, high = 1e-3, 3.0
     loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
     sweep = sweep_of(wall(309.8, 3.44, 1, T), loop)
@@ -248,7 +248,7 @@ def test_tangents_bound_a_sweep_over_beta():
     assert x[-1] > 0.9 * least
 
 
-def test_the_cost_bounds_every_period_of_a_range():
+def test_no_period_of_a_range_costs_less():
     rng = np.random.default_rng(3)
     loop = one(1e-3, 1.3, T_max=1.4e-3, T_min=0.7e-3)
     for _ in range(20):
@@ -295,7 +295,7 @@ def test_held_forces_supply_the_least_cost(seed):
     """The inequality of step 4 holds from rest for hands with friction, a clutch and a stiffening spring."""
     rng = np.random.default_rng(seed)
     sides = rubbing_motor(rng, DEVICE, 1.3, 5e-5 * rng.uniform(0.2, 0.9), 60, 1e-3)
-    assert (sides[:, 0] >= sides[:, 1] - 1e-7 * np.abs(sides[:, 0]).max()).all()  # the integrator's tolerance
+    assert (sides[:, 0] >= sides[:, 1] - 1e-7 * np.abs(sides[:, 0]).max()).all()  # the integrator's error
 
 
 def test_a_lighter_motor_breaks_the_inequality():
@@ -322,7 +322,7 @@ def test_the_tail_costs_at_most_the_storage():
 
 @pytest.mark.parametrize("theta", [0, 2])
 def test_the_block_is_the_energy_of_periods(theta):
-    """The block's supply over a motion from rest that ends equals sum f'(dx + beta dv) + sum L."""
+    """The block's supply over a motion that starts and ends at rest equals sum f'(dx + beta dv) + sum L."""
     rng = np.random.default_rng(theta)
     loop, F, beta = one(1e-3, 1.3, theta), wall(900.0, 0.7, theta, 1e-3), np.array([3e-5])
     cost = period_cost(loop, 1.0, beta)
@@ -388,7 +388,7 @@ def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
             K[:, 2 + j, 2 + j] += ladders[:, j, 1]
             K[:, 1 + j, 2 + j] -= ladders[:, j, 1]
             K[:, 2 + j, 1 + j] -= ladders[:, j, 1]
-    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # unit of velocities
+    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # unit of speeds
     G = np.zeros((n, 2 * size + 1, 2 * size + 1))
     G[:, :size, size:-1] = fast * np.eye(size)
     G[:, size:-1, :size], G[:, size:-1, size:-1] = -K / mass[..., None] / fast, -D / mass[..., None]
@@ -606,7 +606,7 @@ def test_one_beta_serves_all_environments_of_ranges():
 
 
 @ONE_OR_PAIR
-def test_any_environment_couplings_are_proved_from_files(loop, coupling):
+def test_known_device_any_proves_what_any_environment_refuses(loop, coupling):
     assert not required_damping(loop, coupling, "any-environment").certified
     certificate = prove(loop, coupling, "known-device-any")
     assert certificate.guarantee == "any passive environment"
@@ -657,17 +657,17 @@ def test_impossible_bounds_are_refused_in_one_line(fields, said):
 # Designs.
 
 
-def test_the_slope_of_the_sampled_condition():
+def test_the_sampled_conditions_slope_equals_differences():
     """The slope equals central differences, in gains and in beta."""
     sampled = KnownDeviceLoop(KNOWN)
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
     steps = 1e-6 * np.eye(x.size)
     slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
-    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # beta's slope is a difference
+    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # room_slope differences beta
 
 
 @pytest.mark.slow
-def test_a_spring_damper_on_known_devices_feels_stiffer():
+def test_known_devices_permit_almost_rigid_spring_dampers():
     """The default loop is certified without a coupling, so the design makes its coupling almost rigid."""
     plain = design(KNOWN, "this-environment")
     assert required_damping(KNOWN, plain.coupling, "known-device").required[0] == pytest.approx(1.10, abs=0.02)
@@ -681,7 +681,7 @@ def test_a_spring_damper_on_known_devices_feels_stiffer():
     ).proved
 
 
-def test_the_stiffest_spring_damper_for_any_environment():
+def test_the_stiffest_spring_damper_meets_its_known_limit():
     """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid are certified."""
     loop = one(1.2e-3, 1.37)
     found = design_coupling(loop, "spring-damper", "known-device-any")
@@ -725,7 +725,7 @@ STIFFER = Ranges((UncertainSpring(("tip", GROUND), (1000.0, 1400.0)),))
 @pytest.mark.slow
 @pytest.mark.parametrize("ranges", [None, pytest.param(STIFFER, marks=pytest.mark.validate)])
 def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
-    """The block is positive on a dense sweep and the file proves it; this-environment leaves more mismatch."""
+    """The block is positive on a dense sweep and the certificate is verified; this-environment leaves more mismatch."""
     monkeypatch.setattr(budgets, "RANGE_STARTS", 1)
     network = Network(("tip",), (Spring(("tip", GROUND), 1200.0, 2.0),), {"tip": 0.2})
     loop = change(one(1e-3, 1.0, 1, environment=network), lam=(1,), ranges=ranges)
@@ -764,7 +764,7 @@ def test_spring_dampers_before_walls_use_the_device():
     assert hands_on_a_wall(loop, 2.0, ticks=1000, hands=50, coupling=found.coupling) == 0
 
 
-def test_designs_refuse_what_known_devices_exclude():
+def test_known_device_designs_refuse_limiter_or_missing_bounds():
     with pytest.raises(ValueError, match="not cover"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
@@ -840,7 +840,7 @@ def needs_by_hand(room, loop, near):
     return brentq(most, near / 2, 2 * near, rtol=1e-5)
 
 
-#: Relative error of a requirement: the search stops 1e-4 from the best beta, and these grids miss 1e-5 of a peak.
+#: Relative error of `needs_by_hand`: its beta is 1e-4 of the largest from the best, its grids miss 1e-5 of a peak.
 SETTLED = 3e-4
 
 
@@ -864,7 +864,7 @@ def test_any_environment_requirements_are_those_of_chi(K, B, theta):
 
 
 @pytest.mark.parametrize("theta", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_no_pair_grows_above_the_requirement(theta):
+def test_no_lossless_hand_and_environment_grow_together(theta):
     """With a lossless environment no lossless hand grows at 1.01 of the required damping; far below it some grow."""
     T, rng = 1e-3, np.random.default_rng(theta)
     loop = one(T, 1.0, theta)
@@ -943,7 +943,7 @@ def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=400
 
 
 @pytest.mark.slow
-def test_any_environment_covers_walls_and_limiter():
+def test_known_device_any_covers_walls_and_limiter():
     """At 1.01 of the need of known-device-any no lossless hand gains energy at a limited wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)
     loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])
@@ -1054,7 +1054,8 @@ def test_wall_requirements_are_those_of_the_block():
 def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
     """Count the lossless hands behind the transmission that have 2 % more energy at the end than in the middle.
 
-    Where delays switch, the force of the age that gives the most energy acts at every tick.
+    If a hand reaches 1e6 J, the count is that of hands above 1 J instead. Where delays switch, the force of the age
+    that gives the most energy acts at every tick.
     """
     rng = np.random.default_rng(seed)
     M, k = 10 ** rng.uniform(-3.5, 0.5, hands), 10 ** rng.uniform(0, 5, hands)
@@ -1169,7 +1170,7 @@ def test_limited_requirements_are_those_of_the_block(name):
 
 
 @LINEAR_OR_WALL
-def test_limited_forces_cost_little_on_known_devices(name):
+def test_limited_forces_need_less_on_known_devices(name):
     """Limited forces need no less damping than unlimited ones, and less than on a device of known damping only."""
     loop = LIMITED_LOOPS[name]
     unlimited = required_damping(loop, COUPLING, "known-device").required[0]
@@ -1187,7 +1188,7 @@ def test_no_hand_gains_energy_from_limited_forces(name):
 
 
 def test_the_block_is_the_energy_of_limited_periods():
-    """The block's supply over a motion from rest that ends equals sum f'(dx + beta dv) + sum L - sum (M f_e)'de."""
+    """The block's supply over a motion between rests equals sum f'(dx + beta dv) + sum L - sum (M f_e)'de."""
     rng, N, active, T, K, B = np.random.default_rng(6), 300, 40, 1e-3, 900.0, 0.7
     loop, beta, c = one(T, 1.3, 1), np.array([3e-5]), 0.4
     G = taps([K + B / T, -B / T], T)
@@ -1215,7 +1216,7 @@ def test_the_block_is_the_energy_of_limited_periods():
 
 @pytest.mark.parametrize("pair", [False, pytest.param(True, marks=pytest.mark.validate)])
 def test_limited_known_devices_are_proved_from_files(pair):
-    """The published gains for the pair need 0.966 of 1 N s/m with the limiter."""
+    """With the limiter the pair with published gains needs 0.966 N s/m of the available 1 N s/m."""
     if pair:
         loop, coupling, condition = change(KNOWN, delta=(1.0, 1.0)), PUBLISHED["I"], LimitedKnownDevice()
     else:

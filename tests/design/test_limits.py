@@ -37,7 +37,7 @@ def test_more_bases_approach_the_bound(most):
     assert -35.137 < last < min(first, -33.8 if most == 2 else -34.8)
 
 
-def test_the_printed_gains_match_hand_calculation():
+def test_published_gains_have_their_known_mismatch():
     E = environment(LOOP.environment, LOOP.T)
     expected = this_environment(force_map(E, PUBLISHED["I"], LOOP.theta, LOOP.psi), LOOP.delta)
     assert certify(LOOP, PUBLISHED["I"])["this-environment"].required == expected.required
