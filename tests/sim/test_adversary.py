@@ -33,19 +33,19 @@ def _few(monkeypatch):
 
 
 def test_the_search_destabilises_loops_below_the_requirement():
-    """With 5 % less damping than required, the search finds a lossless hand that destabilises each loop."""
+    """With 5 % less damping than required, the search finds lossless hands that destabilise each loop."""
     rows = attempts(LOOPS, np.array([0.05]), generations=60)
     assert all(row.worst.destabilises for row in rows)
 
 
-def test_nobody_destabilises_a_sufficiently_damped_loop():
+def test_the_search_fails_against_sufficient_damping():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
     # The growth with lossless hands approaches 0 from below, up to the rounding of eigenvalues.
     assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
-def test_the_search_assumes_the_latest_forces():
+def test_the_search_assumes_longest_periods_and_latest_forces():
     """The searched loops have the longest period and the largest latencies."""
     scenario = SCENARIO.replace(T_max=2e-3, latency=((1e-4, 3e-4), (0.0, 5e-4)))
     F, hands = assemble(scenario, NoCoupling()).F, HumanSets((SCENARIO.human,))
@@ -86,7 +86,7 @@ def both_hands(monkeypatch):
     assert adversary._PASSES
 
 
-def test_one_person_in_both_hands_is_found_too(monkeypatch):
+def test_one_person_holding_both_devices_is_found(monkeypatch):
     """The scene of one lossless person who holds both devices has the growth that the search found."""
     both_hands(monkeypatch)
     worst = search(SCENARIO, assemble(SCENARIO, NoCoupling()).F, generations=15)
@@ -100,7 +100,7 @@ def test_one_person_in_both_hands_is_found_too(monkeypatch):
     assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
 
 
-def test_one_person_cannot_beat_the_required_damping(monkeypatch):
+def test_one_person_destabilises_only_with_too_little_damping(monkeypatch):
     """One person with both devices destabilises the loop with 5 % too little damping, but not with enough."""
     both_hands(monkeypatch)
     light = SCENARIO.replace(device=(RigidDevice(mass=0.02),) * 2)
@@ -109,7 +109,7 @@ def test_one_person_cannot_beat_the_required_damping(monkeypatch):
     assert [row.worst.destabilises for row in rows] == [False, True]
 
 
-def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
+def test_a_found_person_replays_with_equal_spectral_radius(tmp_path, monkeypatch):
     both_hands(monkeypatch)
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--case", "none", "--engine", "exact", "--no-plot", "--out", str(out), "--json", str(file)]
@@ -122,6 +122,7 @@ def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
 
 
 def test_the_adversarys_search_is_repeatable():
+    """Its hands are lossless, and the scene of these hands has the growth that the search found."""
     F = assemble(SCENARIO, NoCoupling()).F
     worst, again = (search(SCENARIO, F, seed=4, generations=5) for _ in range(2))
     assert worst == again
@@ -132,7 +133,7 @@ def test_the_adversarys_search_is_repeatable():
     assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
 
 
-def test_the_command_keeps_the_human_for_a_replay(tmp_path):
+def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
     file, out = tmp_path / "r.json", tmp_path / "out"
     options = ["--case", "none", "--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
     options += ["--generations", "8"]
@@ -160,7 +161,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_attacks_succeed_only_at_a_shortage():
+def test_attacks_succeed_only_below_the_required_damping():
     rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 4))
     found = {short: [row.found for row in rows if row.short == short] for short in (0, 0.2)}
     assert found == {0: [False, False], 0.2: [True, True]}
@@ -169,7 +170,7 @@ def test_attacks_succeed_only_at_a_shortage():
 
 
 def test_a_wrong_condition_fails_the_check(monkeypatch):
-    """The search refutes a condition that requires less than a third of the true damping."""
+    """The search refutes a condition that requires 0.5 N s/m of each device, where 1.72 N s/m are needed."""
 
     class Third(ThisEnvironment):
         def required(self, loop, coupling, multiplier=None):

@@ -115,7 +115,7 @@ def rows(matrix: Array) -> str:
         ),
     ],
 )
-def test_refuses_impossible_axes_in_one_line(first: str, more: str, words: tuple[str, ...]) -> None:
+def test_impossible_axes_are_refused_in_one_line(first: str, more: str, words: tuple[str, ...]) -> None:
     with pytest.raises(InputError) as refused:
         scenario(first, more=more)
     assert "\n" not in str(refused.value)
@@ -262,7 +262,7 @@ def test_rotated_loops_have_rotated_trajectories(kind: str, engine: str) -> None
 
 
 def test_plant_with_matrices_equals_a_matrix_exponential() -> None:
-    """A device of 0.25 kg in a hand of 0.3 kg follows M x'' = -K x - B x' - f, with M = 0.55 kg."""
+    """A device of 0.25 kg in a hand of 0.3 kg follows 0.55 x'' = -K x - B x' - f; B is the sum of their dampings."""
     hand = np.array([[3.0, 0.5, 0.0], [0.5, 2.0, -0.4], [0.0, -0.4, 1.0]])
     K = np.array([[200.0, -50.0, 20.0], [-50.0, 150.0, 0.0], [20.0, 0.0, 90.0]])
     device = RigidDevice(axes=3, damping=tuple(map(tuple, DAMPING.tolist())))
@@ -304,7 +304,7 @@ def test_engines_agree_on_hands_in_space() -> None:
         assert (growths[0] != 0).all()
 
 
-def test_drawn_hands_are_saved_and_read(tmp_path: Path) -> None:
+def test_saved_hands_have_the_plant_of_drawn_ones(tmp_path: Path) -> None:
     space = scenario()
     crowd = Validation(space, COUPLING, 3, 6, 2, "exact", 0.0).crowd(4)
     path = save_humans(tmp_path / "hands.toml", crowd.humans(0), "drawn")
@@ -325,7 +325,7 @@ def test_voluntary_motion_follows_its_direction() -> None:
 # ---- forces at their limits
 
 
-def test_actuators_shorten_a_force_vector() -> None:
+def test_actuators_limit_forces_to_a_ball_or_box() -> None:
     process = assemble(scenario("force_limit = 3.0", "force_limit = [1.0, 2.0, 3.0]"), COUPLING).process
     asked = 5 * np.random.default_rng(0).normal(size=(6, 400))
     given = process.applied(asked)
@@ -360,7 +360,7 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
     assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
 
 
-def test_reports_do_not_cover_held_torques() -> None:
+def test_reports_say_held_torques_are_not_covered() -> None:
     rows = [dict(verdict.rows(assess(each.loop("I"), SpringDamper([3000.0] * m, [0.3] * m)))).get("held torques")
         for each, m in ((scenario(), 6), (line(), 2))]  # fmt: skip
     assert "not covered" in str(rows[0])
@@ -368,7 +368,7 @@ def test_reports_do_not_cover_held_torques() -> None:
 
 
 def test_search_shares_a_multiplier_within_a_device() -> None:
-    """The derivatives of `room` with respect to gains and multipliers equal central differences."""
+    """Derivatives of `LimiterLoop.room` by gains and by one multiplier per device equal central differences."""
     loop = LimiterLoop(scenario('clamped = ["x"]', 'clamped = ["x"]').loop("I"))
     x = loop.point(SpringDamper([3000.0, 4000.0, 2000.0, 2500.0], [0.3, 0.4, 0.5, 0.2]))
     x[8:] += [0.1, -0.2, 0.3, 0.05]

@@ -60,7 +60,7 @@ def test_a_killed_worker_ends_the_validation():
     np.testing.assert_array_equal(findings.exact, whole.exact[findings.index])
 
 
-def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
+def test_reports_count_humans_finished_before_memory_ran_out(tmp_path, monkeypatch, capsys):
     real, calls = crowds._examine, []
 
     def fails(*words):

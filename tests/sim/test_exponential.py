@@ -76,7 +76,7 @@ def simulation():
 
 
 def longer(matrix):
-    """Return exp(matrix) in extended precision: a series of exp(matrix / 2^40) - 1, doubled 40 times."""
+    """Compute exp(matrix) in extended precision: a series of exp(matrix / 2^40) - 1, squared 40 times as exp."""
     part = matrix.astype(np.longdouble) / np.longdouble(2) ** 40
     term, less_one = np.eye(len(matrix), dtype=np.longdouble), 0
     for k in range(1, 12):
@@ -235,7 +235,7 @@ def test_each_simulation_equals_its_own_scene(substeps):
 
 
 def test_many_sampled_plants_are_as_exact_as_one():
-    """Exponentials of a stack and of one plant equal SciPy's within rounding errors, 1e-14 of the largest entry."""
+    """Exponentials of a stack and of one plant equal SciPy's to 1e-12 of an entry plus 1e-14 of the largest entry."""
     plants = variants(SCENARIO.device, hands(20)).plants()
     together = hold(plants, SCENARIO.T)
     n, inputs = plants.B.shape[1:]
@@ -268,7 +268,7 @@ def test_the_default_follows_from_the_scene(simulation):
 
 @pytest.mark.parametrize(("mode", "rate"), [(0.0, 6.0), (0.0, 6.5), (1.3, 2.0), (0.1, 0.1)])
 def test_substeps_are_the_fewest_within_the_limits(mode, rate):
-    """A step is at most 0.2 rad of the fastest mode and less than one time constant; a period has at least 4 steps."""
+    """A step is at most 0.2 rad of the fastest mode and below the least time constant; a period has 4 steps or more."""
     count = _PlantSpeed(mode, rate).substeps(1.0)
     fits = [n for n in range(4, 20) if mode / n <= 0.2 and rate / n < 1]
     assert count == fits[0]
@@ -315,7 +315,7 @@ def cheapest(loop, error, ticks):
     return pick(compare_engines(loop, error, ticks), error)
 
 
-def test_smooth_scenes_choose_one_exponential_step(simulation):
+def test_one_exponential_step_is_cheapest_for_smooth_scenes(simulation):
     found = cheapest(simulation, 1e-9, 500)
     assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
     assert found.position_relative_rms < 1e-11
@@ -323,8 +323,8 @@ def test_smooth_scenes_choose_one_exponential_step(simulation):
 
 
 @pytest.mark.slow
-def test_friction_keeps_the_error_with_fewest_steps():
-    """Against RK4 x 64 the setting keeps the allowed error; RK4 with half its substeps exceeds a quarter of it."""
+def test_with_friction_the_cheapest_setting_keeps_the_error():
+    """RK4 x 64 is the reference; RK4 with half the chosen number of substeps exceeds a quarter of the allowed error."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
@@ -347,7 +347,8 @@ def test_friction_keeps_the_error_with_fewest_steps():
 def test_gaps_between_runs_bound_the_finest_error():
     """Gaps are distances between runs with n and 2 n substeps.
 
-    For runs x + c/n the bound is 1.5 c/n. If gaps shrink by a factor q > 0.6, it is the last gap times q/(1 - q).
+    For runs x + c/n the bound is 1.5 c/n of the largest n. If gaps shrink by a factor q > 0.6, it is the last gap times
+    q/(1 - q).
     """
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
@@ -376,7 +377,7 @@ def test_unreachable_errors_are_refused(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """By the first two runs, all runs would need 512 steps of 4 evaluations in 100 ticks, so no third run begins."""
+    """After two runs, the estimate for all runs is 512 steps of 4 evaluations in each of 100 ticks: no third begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
@@ -448,12 +449,12 @@ def test_an_undamped_oscillator_turns():
     np.testing.assert_allclose(turned, exact, atol=1e-12)
 
 
-def test_a_nilpotent_matrix_ends_its_series():
+def test_a_nilpotent_matrix_has_a_finite_series():
     shift = np.diag([1.0, 1.0], 1)
     np.testing.assert_allclose(expm_each(shift[None])[0], [[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], rtol=1e-15)
 
 
-def test_a_result_does_not_depend_on_its_neighbours():
+def test_an_exponential_does_not_depend_on_stacked_neighbours():
     matrices = np.random.default_rng(1).normal(size=(9, 6, 6)) * np.geomspace(0.01, 100, 9)[:, None, None]
     together = expm_each(matrices)
     for i in range(9):

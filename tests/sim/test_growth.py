@@ -30,7 +30,7 @@ def motion(seconds, *modes):
 @pytest.mark.parametrize(
     ("frequency", "rate"), [(f, g) for f in (6.2, 84.0) for g in (-3.0, -0.5, 0.4, 1.5)] + [(84.0, 6.0)]
 )
-def test_a_known_rate_comes_back(frequency, rate):
+def test_measured_rates_equal_known_ones(frequency, rate):
     """The error is at most four standard errors, plus 0.02 1/s because voluntary motion disturbs the slowest octave."""
     found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
     assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
@@ -49,20 +49,20 @@ def test_the_error_of_a_rate_is_its_scatter():
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(np.std(rates), rel=1 / 3)
 
 
-def test_a_person_and_an_encoder_are_no_oscillation():
+def test_voluntary_motion_and_encoder_steps_are_no_oscillation():
     found = growth(motion(6.0), T, STEP)
     assert found.growth_rate_per_s is None
     assert found.reason == "nothing oscillates above 1.1 um"
 
 
-def test_brief_flicker_below_the_named_size_is_nothing():
-    """A decaying 5 Hz mode of 0.6 um exceeds the rounding floor of its octave, but not the 1.1 um of the message."""
+def test_flicker_below_the_named_size_is_no_oscillation():
+    """A decaying 5 Hz mode, 0.6 um amid the first window, exceeds its octave's rounding, but not the 1.1 um named."""
     found = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
     assert found.reason == "nothing oscillates above 1.1 um"
 
 
 @pytest.mark.parametrize(("size", "rate", "end"), [(2e-5, 60.0, "still there"), (4e-10, -4.0, "gone")])
-def test_brief_oscillations_say_how_they_ended(size, rate, end):
+def test_reasons_say_how_brief_oscillations_ended(size, rate, end):
     found = growth(motion(6.0, (size, 84.0, rate)), T, STEP)
     assert found.growth_rate_per_s is None
     assert found.reason.endswith(f"was seen too briefly for a rate, and was {end} at the end")
@@ -90,7 +90,7 @@ def test_displacements_give_the_exact_engines_growth():
     assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
 
 
-def test_too_few_ticks_say_so():
+def test_too_few_ticks_give_a_reason():
     assert growth(motion(0.2), T, STEP).reason == "only 167 ticks; a growth rate needs 200"
 
 

@@ -19,9 +19,9 @@ SCENARIO = load()
 def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
     """Return the forces of Figure 4's network by backward Euler in positions, without a state space.
 
-    The mass M (1 kg) is between spring-dampers (800, 1) and (700, 1), with sums K and D: (M/T^2 + D/T + K) q =
-    M (2 q- - q--)/T^2 + D q-/T + the pull of both contacts; q- is the last q. The force of contact i is that of its
-    spring-damper, `late[i]` samples later.
+    The mass M (1 kg) is between spring-dampers (800 N/m, 1 N s/m) and (700, 1), whose sums are K and D:
+    (M/T^2 + D/T + K) q = M (2 q- - q--)/T^2 + D q-/T + the pull of both contacts; q- and q-- are q one and two ticks
+    before. The force of contact i is that of its spring-damper, `late[i]` samples later.
     """
     k, b, M = np.array([800.0, 700.0]), np.array([1.0, 1.0]), 1.0
     q, before, x_old, forces = 0.0, 0.0, np.zeros(2), []
@@ -72,7 +72,7 @@ def test_uncoupled_loops_are_ideal_despite_clipping():
     assert part.error_percent < 1e-8
 
 
-def test_undefined_errors_have_a_reason():
+def test_undefined_force_errors_are_none():
     still = np.zeros((5, 2))
     assert ForceError.of(still, still).reason == "the ideal environment would have rendered no force"
     assert ForceError.of(still[:0], still[:0]).error_percent is None
@@ -84,7 +84,8 @@ def test_undefined_errors_have_a_reason():
 
 @pytest.mark.slow
 def test_the_command_ranks_the_designs(tmp_path):
-    """The optimal coupling's error is below a fifth of this-environment's, which is below half of any-environment's."""
+    """The optimal coupling errs by under a fifth of the spring-damper for this environment, and that by under half of
+    the one for any environment."""
     errors = {}
     for name, condition in (
         ("optimal", None),

@@ -19,7 +19,7 @@ from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import load
 
-BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # its limited forces are proved safe in this environment
+BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # its limited forces are proved safe in omega-pair
 
 
 def weak(*limits):
@@ -44,8 +44,8 @@ def test_the_limiter_follows_from_the_requirements():
     assert "needs 1.385" in refused.reason
 
 
-def test_the_proved_limiter_is_what_runs(tmp_path):
-    """A run uses the limiter of the file, with beta = 0.03 instead of 0.01, even if the devices have more damping."""
+def test_limiters_use_the_beta_of_the_file(tmp_path):
+    """A run uses the beta of the file, 0.03 s instead of 0.01 s; rho = beta delta/T grows with the devices' damping."""
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
@@ -65,7 +65,7 @@ def test_the_proved_limiter_is_what_runs(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
 def test_both_engines_agree_on_limited_forces(coupling, rho):
-    """Motions of 3 cm agree to 1e-9 of their size, although forces are often at their limits and never above."""
+    """Motions of up to 3 cm agree to 1e-7 of their size, although forces are often at their limits and never above."""
     limits = np.array([0.3, 0.2])
     simulation = assemble(weak(*limits), coupling, rho)
     exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))
@@ -104,7 +104,7 @@ def test_limited_and_clipped_runs_agree_below_limits():
     np.testing.assert_allclose(limited.x, clipped.x, atol=1e-13)
 
 
-def test_a_script_limits_forces_as_the_command_does():
+def test_simulate_limits_forces_unless_told_to_clip():
     scenario = weak(0.3, 0.2)
     for limiter, rho in ((True, (0.0, 0.0)), (False, None)):
         trace = simulate(scenario, SOFT, "exact", limiter=limiter)

@@ -30,7 +30,7 @@ def around(scenario, coupling):
 
 @pytest.fixture(scope="module")
 def optimal():
-    """Return the optimal coupling of each scenario; that of three channels has a small basis."""
+    """Return the optimal coupling of each scenario; the one of the scenario with three channels has a small basis."""
     small = design(STAR.loop("I"), Options(bases=((6, 4),)))
     return {PAIR.name: choose(PAIR, "I", "optimal").coupling, STAR.name: small.coupling}
 
@@ -68,7 +68,7 @@ def densely(sweep, coupling_force, K, B):
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     """Ratios agree to 1e-5: a peak of width 0.01 exceeds points 5e-5 apart by at most (2.5e-5/0.01)^2 = 6e-6 of it.
 
-    With the slowest pole 0.0015 from 1, a supremum at 0 exceeds the value at 1e-6 rad/sample by (1e-6/0.0015)^2.
+    With the slowest pole 0.0015 from 1, a supremum at 0 exceeds the value at 1e-6 rad/sample by a share of 4e-7.
     """
     coupling = optimal[scenario.name]
     sweep = around(scenario, coupling)
@@ -138,7 +138,7 @@ OPTIONS = ["--coupling", "optimal", "--grid", "4", "--humans", "5", "--points", 
 
 
 @pytest.mark.slow
-def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
+def test_maps_of_optimal_couplings_report_their_guarantee(tmp_path, capsys):
     assert zwidth.main([*OPTIONS, "--out", str(tmp_path)]) == DONE
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["axes"] == "environment"

@@ -60,7 +60,7 @@ def files(tmp_path_factory):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_coupling_files_prove_and_drive_the_process(files, form):
-    """The forces are a convolution with the impulse response that samples of F on the circle |z| = 1.05 give."""
+    """Forces are displacements convolved with the impulse response that samples of F on the circle |z| = 1.05 give."""
     scenario, _, path = files[form]
     stored, loop = load_file(path), scenario.loop("I")
     assert verify(stored).proved
@@ -80,7 +80,7 @@ def test_coupling_files_prove_and_drive_the_process(files, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_single_runs_equal_batched_runs(files, form, tmp_path):
+def test_run_and_validate_take_couplings_of_each_form(files, form, tmp_path):
     _, name, path = files[form]
     common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
     asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]

@@ -1,4 +1,4 @@
-"""No random or lossless hand destabilises the optimal coupling, on compliant or rigid devices, in both engines."""
+"""With the optimal coupling no random or lossless hand destabilises compliant or rigid devices, in either engine."""
 
 from functools import cache
 
@@ -49,14 +49,14 @@ def exact_growth(scenario: str, lossless: bool) -> np.ndarray:
     return dominant_mode(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
 
 
-def test_the_same_coupling_is_designed_for_both():
+def test_rigid_and_compliant_scenarios_have_equal_loops():
     one, other = (load(name).loop("I") for name in DEVICES)
     assert one == other
 
 
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_random_and_lossless_hands_are_stable(scenario, lossless):
-    """Slow modes of lossless hands are on the unit circle, up to the rounding of eigenvalues."""
+    """Slow modes of lossless hands are on the unit circle, so rounding may give them a growth above 0."""
     growth = exact_growth(scenario, lossless)
     assert growth.size == HUMANS
     assert growth.max() < _DESTABILISED
@@ -67,7 +67,7 @@ def test_random_and_lossless_hands_are_stable(scenario, lossless):
 
 @pytest.mark.parametrize("scenario", DEVICES)
 def test_the_same_hands_upset_the_loop_without_coupling(scenario):
-    """Without coupling these hands destabilise the loop; on rigid devices only some lossless ones do."""
+    """Without coupling most of these hands destabilise the loop; on rigid devices only some lossless ones do."""
     F = assemble(load(scenario), NoCoupling()).F
     upset = {}
     for lossless in (False, True):
@@ -79,7 +79,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 
 
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
-def test_mujoco_says_the_same(scenario, lossless):
+def test_mujoco_gives_the_exact_verdicts(scenario, lossless):
     """The eigenvalues of MuJoCo's one-period map give the exact verdict for every hand."""
     simulation = assemble(load(scenario), optimal())
     loops = close(mujoco_plants(held(scenario, lossless), simulation.process), simulation.F)
@@ -90,8 +90,8 @@ def test_mujoco_says_the_same(scenario, lossless):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", [pytest.param(DEVICES[0], marks=pytest.mark.validate), DEVICES[1]])
-def test_no_adversary_succeeds(scenario, monkeypatch):
-    """With 12 % less damping one of an adversary's 24 sets of hands destabilises the loop; with all of it none does.
+def test_adversaries_succeed_only_with_too_little_damping(scenario, monkeypatch):
+    """With 12 % less damping one of an adversary's 24 sets of hands destabilises the loop; with full damping none does.
 
     `python -m sim.validate --coupling optimal --adversary` runs a long search.
     """

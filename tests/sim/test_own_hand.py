@@ -107,6 +107,7 @@ def test_a_vanishing_tissue_mass_changes_nothing():
 
 
 def test_impedances_are_exact_or_of_second_order():
+    """With hands as state spaces the exponential integrator is exact up to rounding, and RK4 is of second order."""
     simulation = assemble(held_by(Light(), MuscleBySpace()), PUBLISHED["I"])
     exact = run(simulation, "exact")
     assert rms(run(simulation).s, exact.s) < 1e-10  # rounding

@@ -150,7 +150,7 @@ def test_onsets_have_amplitudes_and_grey_times(drawn):
     assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom shows the credible part only
 
 
-def test_wrong_verdicts_are_crossed(undrawn):
+def test_wrong_verdicts_are_marked_by_crosses(undrawn):
     names = "integrator", "substeps", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error"
     rows = [("RK4", 1, 0.1, 1e-6, -1e-3), ("RK4", 4, 0.3, 1e-8, 1e-5), ("Euler", 1, 0.05, 0.0, 2.0)]
     rows = [SimpleNamespace(**dict(zip(names, row, strict=True)), verdict_correct=row[0] == "RK4") for row in rows]
@@ -299,7 +299,7 @@ def test_environment_maps_mark_their_design_point(drawn):
     empty = SimpleNamespace(points=[], effects=told().simulation.effects, nonlinear=False)
     figure = drawn(map_plot.plot_zwidth, k_b_map(), told(fixed=fixed, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
-    assert marks == [[[1.0, 15.0]]]  # the other one is not on the map
+    assert marks == [[[1.0, 15.0]]]  # the other spring is not on the map
     assert "this environment: certified inside this edge" in legend(figure)
 
 

@@ -51,13 +51,13 @@ BAD = [
 ]
 
 
-def test_a_misspelt_scenario_is_corrected():
+def test_a_misspelt_scenario_gets_a_suggestion():
     with pytest.raises(InputError, match=r"\(did you mean world-cube\?\); give a TOML file"):
         load("world-cub")
 
 
 @pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[new for _, new, _ in BAD])
-def test_bad_scenarios_are_one_line(old, new, message):
+def test_bad_scenarios_give_one_line(old, new, message):
     assert old in TEXT
     with pytest.raises(InputError) as caught:
         parse(TEXT.replace(old, new, 1), "mine.toml")
@@ -99,12 +99,12 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
         (".", "is a folder, expected a file"),
     ],
 )
-def test_missing_files_and_folders_are_refused(name, message):
+def test_folders_and_missing_files_are_refused(name, message):
     with pytest.raises(InputError, match=message):
         load(name)
 
 
-def test_a_scenario_is_loaded_by_name_or_file():
+def test_a_number_is_no_scenario():
     with pytest.raises(InputError, match=r"scenario is 3 \(int\), expected a TOML file or one of: .*omega-pair"):
         load(3)
 

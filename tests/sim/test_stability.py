@@ -68,7 +68,7 @@ def test_the_left_eigenvector_satisfies_its_equation():
     np.testing.assert_allclose(left @ loop.A, dominant_mode(loop).eigenvalue * left, atol=1e-9)
 
 
-def test_a_trace_that_says_nothing_gives_a_reason():
+def test_traces_without_a_growth_rate_give_a_reason():
     simulation = assemble(load().replace(duration=0.1), PUBLISHED["I"])
     loop = close(simulation.plant, simulation.F)
     limit = simulation.process.force_limit
@@ -103,7 +103,7 @@ def test_short_traces_do_not_contradict_eigenvalues():
 
 
 def test_free_hands_settle_by_their_speed():
-    """Without a spring the position stays away from zero, and the speed decays."""
+    """Without a spring the position keeps an offset, a mode of growth 0; the speed decays with the next mode."""
     hand, damper = Human((Link(0.3, 3.0, 0.0),)), Network(("a",), (Spring(("a", GROUND), 0.0, 0.5),))
     scenario = load("one-wall").replace(environment=damper, human=(hand,), tap=None)
     simulation = assemble(scenario, NoCoupling())
@@ -115,13 +115,13 @@ def test_free_hands_settle_by_their_speed():
 
 
 def test_figures_of_an_impulse_follow_from_its_trace():
-    """The energy is the least sum of f'dx + dx' delta dx/T; settling is the last quarter's speed over the second's."""
+    """Energy is the least sum of f'dx + dx' delta dx/T; settling is the speed in the last quarter over the second's."""
     late = Network(("a",), (Spring(("a", GROUND), 2000.0),))
     scenario = load("one-wall").replace(environment=late, theta=(2,), tap=None)
     question = Validation(scenario, NoCoupling(), 0, 3, 1, "exact", 0.25)
     found = _examine(question, range(3))
     assert (found.energy < 0).any()
-    assert (found.trace_error > 3.99 / 0.25).all()  # four time constants decide a sign
+    assert (found.trace_error > 3.99 / 0.25).all()  # a trace decides a sign after four time constants
     for i in range(3):
         simulation = assemble(scenario.replace(human=question.crowd(i).humans(0)), NoCoupling())
         knock = partial(impulse_forces, simulation.scene, simulation.scenario.T)
@@ -194,7 +194,7 @@ def test_ringing_equals_poles_of_the_held_plant():
 
 
 def test_ringing_is_that_of_the_slowest_contact():
-    """A wall is a spring or nothing; here the touching wall decays more slowly and has the least damping ratio."""
+    """A wall is a spring or nothing; here the touching loop decays more slowly and has the least damping ratio."""
     away, held = knocked(0.0), knocked(900.0)
     assert away.real < held.real
     said = ringing(assemble(parse(KNOCK + "walls" + SPRING), NoCoupling()))
@@ -230,6 +230,6 @@ def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys, monke
         (["--scenario", "world-cube"], "--decay: a world, or a loop with varying delays"),
     ],
 )
-def test_unreachable_damping_ratios_are_refused(options, message, tmp_path):
+def test_decay_is_refused_where_it_does_not_apply(options, message, tmp_path):
     with pytest.raises(InputError, match=message):
         design_command([*options, "--decay", "0.01", "--out", str(tmp_path / "c.json")])

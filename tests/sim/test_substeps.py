@@ -32,7 +32,7 @@ def simulation():
     return assemble(SCENARIO, PUBLISHED["I"])
 
 
-def test_pace_of_known_matrices():
+def test_pace_finds_the_fastest_mode_and_decay():
     """The plant is an oscillator of 3 rad/s with 10 % damping, a decay of 50 1/s and a free mass."""
     A = np.zeros((5, 5))
     A[:2, :2] = [[0, 1], [-9, -0.6]]
@@ -43,7 +43,7 @@ def test_pace_of_known_matrices():
     assert pace(np.zeros((2, 2))) == _PlantSpeed(0.0, 0.0)
 
 
-def test_the_default_scenario_needs_four_substeps(simulation):
+def test_the_default_scenario_needs_four_rk4_substeps(simulation):
     assert pace(plant(simulation.scene.model).A).mode == pytest.approx(520.8, abs=0.1)
     assert default_substeps(simulation) == 4
 
@@ -94,7 +94,7 @@ def test_unstable_steps_are_refused_with_advice():
 
 
 @pytest.mark.parametrize(("integrator", "edge"), [("RK4", 2.828), ("Euler", 2.0), ("implicitfast", 2.0)])
-def test_edges_of_the_stable_regions(integrator, edge):
+def test_stable_regions_end_at_the_textbooks_edge(integrator, edge):
     """Two masses of 1 kg on an almost undamped spring lose stability at the textbook's product of mode and step."""
     device = CompliantDevice(transmission_stiffness=1e4, motor_mass=1.0, handle_mass=1.0, damping=0.0, delta=None)
     human = Human((Link(0.0, 0.0, 0.0),))

@@ -114,7 +114,7 @@ def test_switching_can_grow_beyond_constant_delays():
     assert worst.growth > max(growth.values())  # a delay of 2 on channel 1 is bad (+1.68 1/s), switching is worse
 
 
-def test_greedy_ages_repeat_the_trajectory_that_chose_them():
+def test_loops_grow_under_greedy_not_under_random_ages():
     """The loop grows under packet delays that realise greedily chosen ages, and decays under random delays."""
     varying_delay, ticks = VaryingDelay((1, 1), (2, 2)), 1600
     process, held = ASSEMBLY.process, one(ASSEMBLY.plant)
@@ -151,7 +151,7 @@ def run(tmp_path, *options):
 
 def test_both_engines_meet_the_same_delays(tmp_path):
     report = run(tmp_path, "--varying-delay", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
-    # Both engines are exact here: when measured, their positions differed by rounding of 2e-14.
+    # Both engines are exact here: when measured, their positions differed by 2e-14 of their rms, which is rounding.
     assert report["error"]["position_relative_rms"] < 1e-7
     varying_delay = report["varying_delay"]
     assert not varying_delay["covered"]
@@ -178,7 +178,7 @@ def test_a_playout_buffer_is_the_constant_largest_delay(tmp_path):
     assert decisive(report)["certified"]
 
 
-def test_recorded_delays_and_total_loss(tmp_path):
+def test_reports_give_recorded_delays_and_lost_packets(tmp_path):
     (tmp_path / "delays.csv").write_text("# of one afternoon\n1, 2\n2 2\n1,-1\n")
     quick = ["--coupling", "published", "--engine", "exact", "--duration", "0.3"]
     report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), *quick)
@@ -229,7 +229,7 @@ def validated(tmp_path, *options):
 
 
 @pytest.mark.validate
-def test_random_humans_under_the_worst_switching(tmp_path):
+def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
     """The design for constant delays fails for half the humans or more, the one for switching delays for none."""
     coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
@@ -272,8 +272,8 @@ def held_alike(*links):
     return Crowd(np.array([[[link]] * 2 for link in links]))
 
 
-def test_delays_depend_on_the_hands_number():
-    """Equal hands with the same number have the same growth, at any place of a batch."""
+def test_delays_depend_on_the_index_of_hands():
+    """Equal hands with the same index have the same growth, at any place of a batch."""
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     held_by = variants(scenario.device, held_alike(*[(1.0, 20.0, 500.0)] * 3))
     growth = switched_crowd(assemble(scenario, SOFT), held_by, np.array([8, 3, 8]), 0, 2.0, None).exact
@@ -300,7 +300,7 @@ def test_a_lost_packet_holds_the_last_force():
 
 
 @pytest.mark.parametrize(("own", "worst"), [("unstable", "stable"), ("stable", "unstable"), ("stable", "stable")])
-def test_runs_grow_by_their_own_or_worst_delays(own, worst):
+def test_own_or_worst_delays_decide_instability(own, worst):
     met = _DelaysMet(None, [0, 0], [0, 0], 0.5, own, 4.0, _PeriodGrowth(3, -0.5, 0.9, worst))
     trace = close_loop(ASSEMBLY, "exact", ticks=20)
     told = switched_stability(ASSEMBLY, trace, VaryingDelays(DelaySpan((1,), (2,), "", 0, False, False), met, None))

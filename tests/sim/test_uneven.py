@@ -87,7 +87,7 @@ def test_taps_begin_at_their_time_in_uneven_ticks():
     np.testing.assert_array_equal(w[:, scene.tapped[tap.channel - 1]], expected)
 
 
-def test_even_ticks_without_latency_are_plain():
+def test_even_ticks_without_latency_equal_plain_ones():
     plain = run(assemble(PAIR, SOFT), "exact")
     same = run(assemble(PAIR.replace(latency=((0.0, 0.0),) * 2, period=Periods(PAIR.T, PAIR.T)), SOFT), "exact")
     assert abs(same.x - plain.x).max() < 1e-13 * abs(plain.x).max()
@@ -196,6 +196,7 @@ def test_growth_of_uneven_ticks_agrees_with_the_eigenvalues():
 
 
 def test_slow_rates_have_no_verdict():
+    """A trace of 20 s gives a verdict if it lasts at least four time constants."""
     assert [verdict_within(rate, 20.0) for rate in (-0.19, 0.19, -0.21, 0.21)] == [None, None, "stable", "unstable"]
 
 
@@ -211,7 +212,7 @@ def test_slow_creep_is_undecided():
     assert found.growth_rate_per_s == pytest.approx(-0.011 / 4.37, rel=1e-3)
 
 
-def test_periods_vary_beside_delays():
+def test_periods_and_delays_may_vary_together():
     scenario = PAIR.replace(period=DRAWN, varying_delay=VaryingDelay((1, 2), (2, 3)), theta=(1, 2))
     simulation = assemble(scenario, SOFT)
     assert len(run(simulation, "exact").t) == scenario.samples
@@ -273,7 +274,7 @@ def test_counted_dissipation_is_a_lower_bound():
 
 
 def test_late_balances_count_the_simulated_spans():
-    """A span of `length` [s] dissipates at least delta |dx|^2/length."""
+    """A span of `length` [s] dissipates at least delta |dx|^2/length, so its factor times its length is delta."""
     loop = PAIR.replace(latency=LATE, T_max=2e-3).loop("I")
     balance = Balance.of(variants(PAIR.device, HumanSets((PAIR.human,))), loop, [1.1e-4, 2e-4])
     np.testing.assert_allclose(balance.before[:, 0] * [1.1e-4, 2e-4], loop.delta)
@@ -300,7 +301,7 @@ def test_the_energy_audit_sees_late_forces():
 
 
 def test_the_energy_audit_agrees_with_ranges_of_latency():
-    """A spring of 1000 N/m one sample late needs 2.3173 N s/m for latencies of 0 to 0.4 T, and no hand gains energy."""
+    """A spring of 1000 N/m one sample late needs 2.3173 N s/m for latencies up to 0.4 T; no hand gains with 2.32."""
     spring, device = Network(("tip",), (Spring(("tip", GROUND), 1000.0),)), RigidDevice(mass=0.1, damping=2.32)
     fields = {"theta": (1,), "psi": (0,), "device": (device,), "human": PAIR.human[:1], "environment": spring}
     late = PAIR.replace(T=1.2e-3, latency=((0.0, 0.48e-3),), tap=None, **fields)
@@ -311,7 +312,7 @@ def test_the_energy_audit_agrees_with_ranges_of_latency():
 
 @pytest.mark.parametrize("timed", [True, False])
 @pytest.mark.parametrize("integrator", [EXPONENTIAL, "RK4"])
-def test_no_cycle_keeps_an_engine(integrator, timed):
+def test_no_reference_cycle_keeps_an_engine(integrator, timed):
     """An engine holds a MiB for every 125 hands; it is freed with its last reference, without garbage collection."""
     simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
     gc.disable()

@@ -141,11 +141,11 @@ def test_both_engines_agree_on_a_person():
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
-    # The tolerances suit RK4 x 4, too: speeds ring at 90 Hz after the tap, and it errs by 1.3e-5 of the largest speed.
+    # The tolerance suits RK4 x 4, too, which errs by 1.3e-5 of the largest speed: speeds ring at 90 Hz after the tap.
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
 
 
-def test_persons_are_validated_with_random_people(tmp_path):
+def test_the_worst_person_and_hands_replay(tmp_path):
     text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text()
     text += (
         "\n[[person]]\nholds = [1, 2]\nmass = 30.0\ndamping = 80.0\nstiffness = 900.0\ncross = { stiffness = 40.0 }\n"
@@ -176,7 +176,7 @@ def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
 
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
-def test_mujoco_maps_are_the_exact_maps(devices):
+def test_mujoco_maps_have_the_exact_growth(devices):
     """RK4 x 4 is within 1e-3 1/s of the exact growth for every human, so a verdict can change only near zero."""
     scenario = SCENARIO.replace(device=devices)
     simulation = assemble(scenario, PUBLISHED["I"])
@@ -286,7 +286,7 @@ def test_sampled_traces_are_those_of_all_hands():
     assert (more.witnessed, more.humans) == (chosen.sum(), 200)
 
 
-def test_designed_coupling_holds_for_everyone():
+def test_no_random_human_destabilises_the_designed_coupling():
     coupling = choose(SCENARIO, "I").coupling
     findings = validate(Validation(SCENARIO, coupling, 0, 200, 1, "both", 0.0))
     assert not unstable(findings.exact).any()
@@ -340,7 +340,7 @@ def test_the_worst_human_replays(tmp_path):
     assert own["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
 
 
-def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
+def test_a_wrong_engine_fails_the_command(tmp_path, monkeypatch):
     """MuJoCo's Euler calls unstable loops stable; the command must fail and store the humans."""
     monkeypatch.setattr(
         examine_module,
@@ -519,7 +519,7 @@ def test_own_engines_judge_every_hand(delays):
     assert not found.disagreements.any()
 
 
-def test_own_engines_need_even_ticks():
+def test_own_engines_refuse_latency():
     question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
     with pytest.raises(InputError, match=r"OwnEngine: only these engines simulate period and latency: mujoco"):
         examine_module._examine(question, range(2))

@@ -120,7 +120,7 @@ def press(running, *names):
 
 
 def test_the_session_is_the_simulation(none):
-    """Frames at any times show the run up to one rounding error per tick, amplified sevenfold by the unstable mode.
+    """Frames at any times show the run up to one rounding error per tick, which the unstable mode amplifies by up to 7.
 
     A block of ticks sums in another order than single ticks.
     """
@@ -151,7 +151,7 @@ def test_rest_is_where_a_held_position_leads(published):
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
-    # rounding: forces of 10 N as differences of numbers about 1e4 larger
+    # Forces of 10 N are differences of numbers about 1e4 times larger, which rounding changes by about 1e-11 N.
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
 
@@ -201,7 +201,7 @@ def replace_theta(prepared, theta):
     return first_loop(prepared.menu, SCENARIO.replace(theta=theta), prepared.label)
 
 
-def test_a_process_that_runs_away_starts_again():
+def test_a_diverged_loop_restarts_from_rest():
     """A soft coupling and a delayed environment make a process that is unstable by itself, of spectral radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
@@ -307,7 +307,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
 
 
-def test_the_mouse_draws_and_releases_handles():
+def test_the_mouse_pulls_and_releases_handles():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
     assert dominant_mode(close(_gripped(soft.simulation.scene, range(1, 2), SCENARIO.T), soft.simulation.F)).growth < 0
     running, quiet = session(soft), session(soft)
@@ -457,7 +457,7 @@ def test_the_drawn_springs_carry_the_forces(psi, K, B):
         np.testing.assert_allclose(trace.f[late:, i], force[: len(force) - late], rtol=0, atol=1e-9)
 
 
-def test_the_drawn_tip_stops_at_the_wall():
+def test_the_drawn_tip_feels_the_walls_force():
     """A wall at 5 mm with 3000 N/m and 2 N s/m pushes by max(0, K h + B (h - h_-)/T), one tick late."""
     scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
     h = np.maximum(q[:, 0] - 0.005, 0.0)
@@ -592,7 +592,7 @@ def test_the_window_loop_ends_at_its_time(none):
     assert window.synced == 7
 
 
-def test_keys_come_from_another_thread(none):
+def test_keys_may_come_from_another_thread(none):
     running = session(none)
     thread = threading.Thread(target=press, args=(running, "Up"))
     thread.start()
@@ -627,7 +627,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
     assert "NOT certified" in capsys.readouterr().out
 
 
-def test_flat_pictures_show_where_things_are(none):
+def test_flat_pictures_show_a_handles_displacement(none):
     """The first device's handle, found by its colour, moves by its displacement in pixels."""
     painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)

@@ -94,7 +94,7 @@ def test_no_hand_is_given_more_than_the_account(name, lossless):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_without_gravity_energy_never_rises(name):
+def test_without_gravity_energy_rises_within_the_account(name):
     """Hands' energy and the scene's kinetic energy rise by no more than W0 and what springs release."""
     loop = load(f"world-{name}").replace(theta=(0, 3))
     touch = Touch(loop, Hands(np.random.default_rng(5), 1, True, 0.3, T=T, delta=loop.delta), gravity=False)
@@ -249,7 +249,7 @@ def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
 
 
 @pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
-def test_contacts_that_multiply_a_mass_are_held_back(tmp_path, impedance, gives_J):
+def test_contacts_that_give_energy_are_held_back(tmp_path, impedance, gives_J):
     """Contacts of 0.1 kg hit walls: solimp 0.99 and MuJoCo's default give energy; the shell passes at most W0."""
     tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
     walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))

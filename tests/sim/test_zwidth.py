@@ -84,7 +84,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_maps_equal_requirements_of_single_couplings(name):
-    """Maps begin at 1e-6 rad/sample; the error that this causes grows with the square of the delay, here to 1e-11."""
+    """Maps begin at 1e-6 rad/sample; the relative error that this causes grows as the squared delay, here to 1e-11."""
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
@@ -429,7 +429,7 @@ def test_coarse_encoders_make_stable_loops_oscillate():
     assert (coarse.amplitude[2:] < 2e-4).all()
 
 
-def test_a_device_says_what_friction_it_may_have():
+def test_a_device_refuses_negative_friction():
     with pytest.raises(ValueError, match="friction is -1, allowed are 0 to 1000 N"):
         CompliantDevice(friction=-1.0)
 
@@ -605,7 +605,7 @@ def test_slices_cover_everything_once():
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],
 )
-def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
+def test_bad_input_gives_one_line(options, message, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["zwidth", *options, "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as leaving:
         execute(zwidth.main)
