@@ -52,7 +52,7 @@ _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Test random humans. Return 0 if all claims hold, 1 if not, 3 if workers were lost, 130 if interrupted."""
+    """Test humans. Return 0 if all claims hold, 1 if not, 3 if a worker died or memory ran out, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     args.humans = args.humans or (_IN_A_WORLD if is_world(scenario) else _HUMANS)

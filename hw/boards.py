@@ -209,7 +209,10 @@ class Boards:
         return [board.ages for board in self._boards]
 
     def info(self) -> wire.Info | None:
-        """Return one INFO for all axes; None until all came in. Raises SafetyStop if the boards do not fit together."""
+        """Return one INFO for all axes, or None until every board has sent its INFO.
+
+        Raises SafetyStop if the boards do not fit together.
+        """
         with self._together():
             for i, board in enumerate(self._boards):
                 self._infos[i] = self._infos[i] or board.device.info()

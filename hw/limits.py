@@ -234,7 +234,7 @@ class SafetyLimits:
 
 @dataclass
 class Gain:
-    """The factor that scales every force. It starts at 0, changes linearly in time and never jumps.
+    """The factor of the controller's forces. It starts at 0, changes linearly in time and never jumps.
 
     Any constant gain g within [0, 1] preserves a certificate: if this-environment holds for F, it holds for g F.
     """

@@ -153,7 +153,7 @@ class Ack(NamedTuple):
 
 
 class State(NamedTuple):
-    """Device to host, every tick after a CONFIG: state, encoder counts and applied forces."""
+    """Device to host, every tick after an accepted CONFIG: state, encoder counts and applied forces."""
 
     status: int  # phase, cause and deadman
     tick: int

@@ -71,8 +71,8 @@ class _Part:
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
-    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read, is not
-    XML, or is included twice.
+    A mesh that exists in several folders is listed once per folder. Raises ValueError if a file cannot be read, is
+    empty, too large or not XML, or is included twice.
     """
     files: dict[Path, None] = {}
     folders: list[Path] = []
@@ -121,7 +121,7 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 digest of the names and contents of all files of a scene, without their folders.
 
-    Raises ValueError if a file cannot be read or is not XML.
+    Raises ValueError as `files_of` does.
     """
     total = hashlib.sha256()
     for file in files_of(path):
