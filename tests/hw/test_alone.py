@@ -1,4 +1,4 @@
-"""Boards without a host arm right axes only, and stop: hw/firmware/haptic_alone.h, compiled for this processor.
+"""Boards without a host arm only right axes, and drop forces at faults: hw/firmware/haptic_alone.h, compiled here.
 
 The handle is a mass with damping, Coulomb friction and a constant force such as gravity, stepped ten times a tick.
 """
@@ -141,7 +141,7 @@ def test_wrong_axes_are_never_armed(board, noise, wrong, causes):
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_a_sensor_dying_under_force_ramps_out(board, noise):
+def test_forces_ramp_out_if_a_sensor_dies(board, noise):
     bench = Bench(board, 1, noise)
     assert bench.armed() == (RUNNING, 0)
     for k in range(1500):
@@ -155,7 +155,7 @@ def test_a_sensor_dying_under_force_ramps_out(board, noise):
         pushed.append(abs(bench.force[1]))
     assert told == (READY, DEAD)
     assert pushed[-1] == 0.0
-    assert max(np.abs(np.diff(pushed))) < 0.05 + 0.3 * noise  # a ramp of 100 ms
+    assert max(np.abs(np.diff(pushed))) < 0.05 + 0.3 * noise  # [N] in a tick: a ramp lasts 100 ms
 
 
 def test_a_fast_handle_cuts_the_ramp_short(board):
@@ -206,7 +206,7 @@ def test_an_invalid_position_at_rest_is_forgotten(board):
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
 @pytest.mark.parametrize("limit", range(3), ids=["range", "speed", "cap"])
-def test_limits_that_limit_nothing_are_not_armed(board, limit, value):
+def test_limits_that_limit_nothing_prevent_arming(board, limit, value):
     bench = Bench(board)
     for _ in range(150):
         bench.tick()

@@ -183,7 +183,7 @@ def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
     ],
     ids=["reversed-motor", "reversed-sensor", "dead-sensor", "dead-motor", "switch-released", "thrown"],
 )
-def test_the_hapkit_takes_its_force_away(hapkit, fault, cause):
+def test_the_hapkit_removes_its_force_at_faults(hapkit, fault, cause):
     _, told, state = paddle(hapkit[0], 1400, **{"hand": swing if "held" in fault else lambda k: 0.0} | fault)
     assert state == ("1", cause)
     assert (told[-190:, 2] == 0).all()

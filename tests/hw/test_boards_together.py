@@ -64,7 +64,7 @@ def watched(emulator):
 
 
 @pytest.mark.parametrize("deaf", [0, 1])
-def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf):
+def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, made, deaf):
     """The other board rests, which must not hide the force that the deaf one keeps."""
     faults = [(), ()]
     faults[deaf] = ("stuck@0.1",)
@@ -74,7 +74,7 @@ def test_one_deaf_board_of_two_contradicts_finished(scenario, alone, made, deaf)
 
 
 @pytest.mark.slow
-def test_two_clocks_keep_the_account(scenario, alone, made, tmp_path):
+def test_two_clocks_keep_the_energy_account(scenario, alone, made, tmp_path):
     """Across a slip of the clocks forces stay 1 and 2 ticks old, and the host's energies equal those at the devices."""
     rehearsal = rehearsal_of(scenario, alone, made, 1.0001, begin_us=SLIP_SOON)
     session, rows = rehearsal.session, []
@@ -108,7 +108,7 @@ ENDING = ["unplug", "up:drop=1", "down:drop=1", "stall=0.03", "trip", "estop", "
 
 
 @pytest.mark.parametrize(("board", "fault"), checkered([0, 1], ENDING))
-def test_a_fault_of_one_stops_both(scenario, alone, made, board, fault):
+def test_a_fault_of_one_board_stops_both(scenario, alone, made, board, fault):
     """A fault of either board or link ends the session, and both motors are at zero within 50 ms."""
     faults = [(), ()]
     faults[board] = (f"{fault}@0.6",)
@@ -201,7 +201,7 @@ class _Terminals:
                 select.select([end._slave], [], [], 1.0)
 
 
-def test_two_ports_reach_the_serial_stack(scenario, alone, made, monkeypatch, capsys, tmp_path):
+def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypatch, capsys, tmp_path):
     """In virtual time, the command runs over pyserial, two pseudo-terminals and clocks that differ by 100 ppm."""
     pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
     rehearsal = rehearsal_of(scenario, [nobody(one) for one in alone], (), 1.0001, begin_us=SLIP_SOON)

@@ -94,7 +94,7 @@ def test_an_unconfigured_device_only_answers_info():
     ("config", "reason"),
     [
         (Config(1, 4, 4, 0, (1,), (1,)), Refused.AXES),
-        (CONFIG._replace(hold=4, ramp=13), Refused.RELEASE),  # 17 ticks of 1.2 ms: 20.4 ms
+        (CONFIG._replace(hold=4, ramp=13), Refused.RELEASE),  # 17 ticks of 1.2 ms are 20.4 ms, above 20 ms
         (CONFIG._replace(cap=(24_001, 1)), Refused.CAP),
         (CONFIG._replace(cap=(1, 20_001)), Refused.CAP),
     ],
@@ -287,7 +287,7 @@ def test_the_watchdog_holds_then_ramps_out():
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
-def test_silent_hosts_are_held_equally_long():
+def test_holding_lasts_equally_long_after_each_arming():
     rig = armed()
     seen = [rig.tick() and rig.at for _ in range(9)]
     assert [phase for phase, _ in seen] == [Phase.HOLDING] * 4 + [Phase.RAMP] * 3 + [Phase.STOPPED] * 2
@@ -423,7 +423,7 @@ def test_counters_wrap():
     assert (rig.state.crc_errors, rig.state.misses) == (300 % 256, 301 % 256)
 
 
-def test_other_devices_frames_are_not_obeyed():
+def test_frames_of_wrong_kinds_are_not_obeyed():
     rig = armed()
     k = rig.device.k
     rig.say(Force(Command.RUN, k + 1, k, (900,)), Force(9, k + 1, k, (0, 0)), Ack(1, 0), INFO, rig.state)

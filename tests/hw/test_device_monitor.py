@@ -303,7 +303,7 @@ def test_a_clock_off_by_a_percent_is_found(factor, found):
         run_clock([factor * T_US] * 3 * _BLOCK)
 
 
-def test_one_freeze_is_no_drift_and_many_are():
+def test_one_freeze_is_no_drift_but_two_are():
     once = [T_US + 4000 * (n == 50) for n in range(_BLOCK)]
     run_clock(once)
     with pytest.raises(SafetyStop, match="by its own clock"):
@@ -458,7 +458,7 @@ def test_ages_while_forces_act_count_skipped_answers(scenario):
     assert shown["p99"] == pytest.approx(np.percentile(true, 99), abs=60)
 
 
-def test_an_identification_closes_no_loop_that_could_grow(scenario):
+def test_identifications_report_no_growth(scenario):
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=50))
     session.record = recorder
@@ -470,8 +470,8 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
     assert growths(recorder.trace(session.units, scenario.T, plain(report))) == []
 
 
-def test_estops_repeat_until_acknowledged(scenario):
-    """The first STOP may be lost, and so may the STATEs that would show the loss."""
+def test_unanswered_emergency_stops_repeat_for_50_ms(scenario):
+    """The first STOP may be lost, and so may the STATEs that would show the loss: STOP is sent once per tick."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)))
     session.start(0)
     stop = (Stop(Reason.ESTOP),)

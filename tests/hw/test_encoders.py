@@ -50,7 +50,7 @@ def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
-def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
+def test_of_two_dead_encoders_the_first_is_named(scenario, rungs):
     assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
 
 
@@ -164,7 +164,7 @@ def test_swapped_axes_are_named():
 
 
 @pytest.mark.parametrize(("scale", "refused"), [(1, False), (1.8, False), (0.55, False), (2.3, True), (0.45, True)])
-def test_motions_off_by_two_are_refused(scale, refused):
+def test_motions_wrong_by_over_twice_are_refused(scale, refused):
     if refused:
         with pytest.raises(SafetyStop, match=r"axis 1 moves .* times as far as expected of 0\.25 kg"):
             played(arming_test(), masses(scale=scale))
@@ -279,7 +279,7 @@ def test_a_moving_hand_is_no_motor(hand, closing):
 
 
 @pytest.mark.parametrize(("axis", "at"), checkered([1, 2], [0.7, 0.9]))
-def test_motors_that_died_never_finish(scenario, rungs, axis, at):
+def test_sessions_whose_motor_died_never_finish(scenario, rungs, axis, at):
     """Hands move at full amplitude. The same session without the fault finishes."""
     for faults, stage in ((("motor=1",), Stage.FINISHED), ((f"axis{axis}:motor=0@0.6",), Stage.STOPPED)):
         session, rehearsal = session_with(scenario, rungs, *faults, stop=at, seconds=at + 1.0)
@@ -318,14 +318,14 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
 
 
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
-def test_handles_that_are_let_go_finish(scenario, rungs, hand):
+def test_sessions_finish_once_handles_are_let_go(scenario, rungs, hand):
     """A firm hand is asked to let go, not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
     session = ended_live(scenario, rungs, hand, lets_go=2.5)
     assert session.stage == Stage.FINISHED, session.cause
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
 
 
-def test_handles_that_stay_held_never_finish(scenario, rungs):
+def test_sessions_with_held_handles_never_finish(scenario, rungs):
     session = ended_live(scenario, rungs, (0.4, 3.0, 100.0))
     assert session.stage == Stage.STOPPED
     assert session.cause == (
@@ -353,7 +353,7 @@ def test_a_stop_before_the_end_test_finishes_nothing(scenario, rungs, at):
     assert at == 0.3 or "before the motors of the last arming were tested" in session.cause
 
 
-def test_devices_of_three_axes_run_without_hands():
+def test_each_channel_in_space_expects_its_free_mass():
     """In each of six channels, the first tick moves the free mass by F T^2 / 2 m, and a heavy hand halves this."""
     space = load("omega-space")
     session = session_for(space, LinkSettings(held=False))
@@ -378,7 +378,7 @@ def test_the_expected_motion_is_the_closed_form():
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
-def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
+def test_dead_encoders_with_noise_are_found(scenario, rungs, noise):
     """Dead encoders with noise are found, before and while forces act.
 
     tests/checks/faults.py arms live encoders with the same noise, and has dead ones with a noise of 0.5 counts.

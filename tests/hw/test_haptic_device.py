@@ -276,7 +276,7 @@ def test_saturated_motors_are_device_faults(scenario):
     assert session.cause == "the device is in ramp, cause device"
 
 
-def test_the_emergency_stop_is_at_once(scenario):
+def test_emergency_stops_zero_forces_at_once(scenario):
     sdk = StandIn(scenario)
     sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # no push during arming
     held = []
@@ -303,7 +303,7 @@ def test_the_emergency_stop_is_at_once(scenario):
 # without the maker's library, and bad input
 
 
-def test_a_missing_library_is_one_line(monkeypatch):
+def test_a_missing_library_gives_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "forcedimension_core", None)
     with pytest.raises(InputError) as error:
         bridge.main(["--port", "force-dimension", "--arm", "--no-preflight", "--no-dead-man"])

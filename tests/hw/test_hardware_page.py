@@ -40,7 +40,7 @@ def test_the_pages_fault_table_equals_rehearsals(row, scenario, rungs):
         assert cause in outcomes[0].cause
 
 
-def test_the_table_of_faults_is_there():
+def test_the_page_has_seven_faults():
     assert len(ROWS) == 7
 
 

@@ -1,4 +1,4 @@
-"""Identification on the emulated device, in virtual time: known parameters come back, and a bound is a lower bound."""
+"""Identification on the emulated device, in virtual time: estimates equal known parameters, bounds are below them."""
 
 import json
 import math
@@ -52,7 +52,7 @@ def record_of(scenario, *faults, seconds=1.5, coulomb=0.0):
 
 
 @pytest.mark.slow
-def test_known_parameters_come_back():
+def test_identified_parameters_equal_known_ones():
     """Identify a compliant and a rigid device with dry friction that differ from the start of the search.
 
     Parameters are found to 0.2 %. The bound of the lighter axis is at most 1 % low, that of the heavier one 5 %, since
@@ -434,7 +434,7 @@ def test_a_record_with_gaps_gives_no_bound():
         (["--sittings", "0"], "--sittings is 0, allowed are 1 to 20"),
     ],
 )
-def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
+def test_bad_input_is_named(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
         identify_command(["--port", "x", "--arm", *options])
@@ -496,7 +496,7 @@ def test_ambiguous_friction_gives_no_bound():
         identify(x, force, T, step, rigid=True)
 
 
-def test_traces_with_other_forces_are_refused():
+def test_traces_with_fewer_forces_than_positions_are_refused():
     two, one = np.zeros((3, 2)), np.zeros((3, 1))
     with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
         Trace(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})

@@ -125,7 +125,7 @@ def test_the_power_of_overlong_ticks_is_bounded():
     assert _overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)
 
 
-def test_the_report_names_the_latency():
+def test_couplings_are_named_with_their_latency():
     (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
     assert made.assessment.loop.latency == ((3e-5, 2.3e-4),) * 2
     assert made.link == 0
@@ -133,7 +133,7 @@ def test_the_report_names_the_latency():
 
 
 @pytest.mark.slow
-def test_a_session_replays_bit_for_bit(tmp_path, capsys):
+def test_sessions_with_arrival_latching_replay_bit_for_bit(tmp_path, capsys):
     file = tmp_path / "r.json"
     options = ["--rehearse", "--theta", "0", "--latch", "arrival", "--duration", "0.3", "--no-plot"]
     assert bridge([*options, "--out", str(tmp_path), "--json", str(file)]) == 0

@@ -107,8 +107,8 @@ def test_an_impossible_gain_is_a_fault(gain):
         ("continuous", (1e-3,), (6.0,)),
     ],
 )
-def test_limits_cannot_be_loosened(field, least, most):
-    """Both ends are allowed, and nothing beyond."""
+def test_limits_stay_within_their_ranges(field, least, most):
+    """Both ends of a limit's range are allowed, and nothing beyond."""
 
     def limits(value):
         return SafetyLimits(**{"cap": (6.0,)} | {field: value})
@@ -122,7 +122,7 @@ def test_limits_cannot_be_loosened(field, least, most):
             limits(value)
 
 
-def test_devices_are_sent_limited_forces():
+def test_configs_carry_the_limits_in_device_units():
     """CONFIG gives a ramp-in of 0.25 s and a slew rate of 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN."""
     config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
@@ -160,7 +160,7 @@ def test_values_at_a_limit_are_allowed():
     assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # the limiter leaves forces at the cap
 
 
-def test_the_gain_stays_within_its_ends():
+def test_the_gain_stays_between_zero_and_one():
     gain = Gain(LIMITS, T)
     assert (gain.rise(10_000), gain.rise(), gain.fall(10_000), gain.fall()) == (1.0, 1.0, 0.0, 0.0)
 

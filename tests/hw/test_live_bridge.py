@@ -396,7 +396,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--rehearse", "--fault", "freeze@0.5+1"], "freeze does not end, so it takes no DURATION"),
     ],
 )
-def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
+def test_bad_input_is_named(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
         bridge.main(options)

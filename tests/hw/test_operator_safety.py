@@ -121,7 +121,7 @@ def test_a_touched_file_counts_once_per_touch(tmp_path):
 # options
 
 
-def test_a_first_session_is_gentle(scenario):
+def test_sessions_have_low_default_limits(scenario):
     args = _parser().parse_args(["--rehearse"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert limits.cap == (1.3, 1.3)
@@ -140,7 +140,7 @@ def test_the_identified_speed_limits_sessions(scenario):
         limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.6"]), slow)
 
 
-def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
+def test_live_sessions_use_a_deadman_unless_refused(scenario, monkeypatch):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     for options, asked in (([], "key"), (["--deadman", "device"], "device"), (["--no-dead-man"], None)):
         args = _parser().parse_args(["--port", "x", *options])
@@ -257,7 +257,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
 
 
 @pytest.mark.slow
-def test_doubts_reach_log_and_picture(tmp_path, capsys):
+def test_doubts_reach_report_and_incident_log(tmp_path, capsys):
     """At a cap of 0.05 N, forces are cut for most of a second: report and incident log state the same doubt."""
     words = "--rehearse --force-cap 0.05 --duration 1.5 --measure 60 --out"
     assert bridge.main([*words.split(), str(tmp_path)]) == 1
@@ -282,7 +282,7 @@ def test_the_preflight_says_what_the_machine_can_do():
     assert line.count("\n") == 1
 
 
-def test_a_busy_machine_is_told_what_to_do(monkeypatch):
+def test_long_stalls_advise_to_close_busy_programs(monkeypatch):
     for stall, told in ((5e-4, False), (5e-3, True)):
         monkeypatch.setattr(transport, "_worst_stall", lambda stall=stall: stall)
         assert ("close busy programs" in transport._stalls()) == told

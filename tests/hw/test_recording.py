@@ -151,7 +151,7 @@ def _meta(**changes):
         ({"meta": _meta(link_delay=9)}, "cannot be replayed: "),
     ],
 )
-def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
+def test_spoiled_traces_are_refused_in_one_line(trace, tmp_path, changes, words):
     path = _spoil(trace[0][0], tmp_path / "trace.npz", **changes)
     with pytest.raises(InputError, match=words) as error:
         replay_command.main([str(path)])
@@ -174,7 +174,7 @@ def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
             replay_command.main([str(tmp_path / "trace.npz")])
 
 
-def test_damaged_traces_are_one_line(trace, tmp_path):
+def test_damaged_traces_raise_only_input_errors(trace, tmp_path):
     with np.load(trace[0][0]) as archive:
         empty = {name: archive[name][:0] if archive[name].ndim else archive[name] for name in archive.files}
     np.savez_compressed(tmp_path / "empty.npz", **empty)

@@ -93,8 +93,8 @@ def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
     assert rehearsal.run(1e-6 * rehearsal.armed_us + 0.6).stage == Stage.STOPPED
 
 
-def test_free_handles_arm_in_the_table(scenario, rungs):
-    """A session with a faulty device arms if nobody holds it, so the table's speeds of free handles mean something."""
+def test_devices_with_free_handles_are_armed(scenario, rungs):
+    """A faulty device that nobody holds is armed, so tests/checks/faults.py prints true speeds of free handles."""
     session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 
@@ -137,7 +137,7 @@ def test_repeating_devices_count_as_lost(scenario, rungs):
         ({"status": Phase.SILENT}, "is in silent"),
     ],
 )
-def test_a_device_that_does_something_else_is_stopped(scenario, rungs, change, cause):
+def test_devices_that_contradict_the_session_are_stopped(scenario, rungs, change, cause):
     session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
     last = session.link.last
     assert last
@@ -259,7 +259,7 @@ def test_theta_is_a_guarded_quantile(ages, expected):
     assert Ages(tuple(ages)).link_delay(1200.0, 0.99, 100.0) == expected
 
 
-def test_softer_couplings_are_softer_and_certified(scenario, rungs):
+def test_reserves_are_softer_and_certified(scenario, rungs):
     fast, soft = rungs
     assert (fast.scenario.theta, soft.scenario.theta) == ((1, 2), (2, 2))
     assert (fast.link, soft.link) == (1, 2)
@@ -413,7 +413,7 @@ def test_faults_are_read(text, expected):
         ("drop@-1", "START"),
     ],
 )
-def test_a_wrong_fault_is_one_line(text, words):
+def test_wrong_faults_are_refused_in_one_line(text, words):
     with pytest.raises(InputError, match=words) as error:
         FaultInjection.parse(text)
     assert "\n" not in str(error.value)
@@ -488,7 +488,7 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
 # walls
 
 
-def test_a_rehearsed_wall_pushes_and_never_pulls():
+def test_rehearsed_forces_solve_coupling_and_wall_in_series():
     """Forces solve coupling and wall in series: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap).
 
     Here d is the deflection of the coupling, h the penetration of the wall, and dd and dh are their changes in a tick.

@@ -73,7 +73,7 @@ def test_bounds_contain_the_truth(m1, m2, k, b, delta):
 
 @pytest.mark.parametrize("held", [False, True])
 def test_derivatives_of_responses_are_exact(held):
-    """Central differences of these steps agree to 1e-5, which covers their second-order error and rounding."""
+    """Central differences agree to 1e-5 of the largest, which covers their second-order error and rounding."""
     free = signals(0.2)[0]
     spectra = Spectra(record(free, *RIGS[0]), free, T, held)
     p = np.array([*np.log(RIGS[0][:4]), 1.37, 3e-5, 2e-5, 0.3, 0.1])

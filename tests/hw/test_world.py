@@ -98,7 +98,7 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", [pytest.param(0.002, marks=pytest.mark.validate), 0.02])
-def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
+def test_rehearsals_hold_back_an_active_scene(tmp_path, capsys, budget):
     """The scene's motor has negative damping and forces are whole steps of 0.4 mN; the account still holds."""
     words = (
         "--scenario",

@@ -98,7 +98,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_session_is_rehearsed():
+def test_rehearsed_sessions_finish_with_their_guarantee():
     """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
     scenario = load().replace(T=1e-3, theta=(1, 1))
     session = rehearse(scenario, seconds=0.5)
@@ -172,7 +172,7 @@ def test_validate_passes_its_arguments_on(monkeypatch):
 
 
 def test_own_environments_start_without_energy():
-    """A passive spring is never limited, although W0 is 0; no eigenvalue decides its loop."""
+    """A passive spring is never limited, although W0 is 0; the trace has no linear stability verdict."""
     meta = simulate(SHORT, SOFT, "exact", environment=lambda u: 300.0 * u).meta
     assert meta["stability"] is None
     assert (meta["energy_budget"]["start_J"], meta["energy_budget"]["limited_ticks"]) == (0.0, 0)
@@ -191,7 +191,7 @@ def test_designs_are_certified_and_act_as_couplings():
 
 
 @pytest.mark.slow
-def test_delays_that_vary_are_simulated():
+def test_simulate_draws_varying_delays_from_its_seed():
     text = (SCENARIOS / "omega-pair.toml").read_text()
     scenario = parse(text + "\n[varying_delay]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)
     trace = simulate(scenario, SOFT, "exact", seed=1, limiter=False)
@@ -364,7 +364,7 @@ def test_a_trace_draws_itself(tmp_path):
         (np.full(2, np.nan), r"array\(\[nan, nan\]\), shape \(2,\),"),
     ],
 )
-def test_wrong_environment_answers_are_one_line(answer, shown):
+def test_wrong_environment_answers_are_refused_in_one_line(answer, shown):
     design = design_coupling(LOOP, condition="any-environment")
     with pytest.raises(InputError, match=rf"^environment .*{shown} expected an array of 2 finite forces \[N\], shape"):
         simulate(SHORT, design, environment=lambda u: answer)

@@ -44,7 +44,7 @@ def test_the_passivity_controller_returns_what_its_observer_misses(delta):
 
 
 def test_the_passivity_controller_is_the_published_one():
-    """The controller sends f + alpha v, with W += f v + alpha_- v_-^2, and alpha = -W/v^2 if W < 0, otherwise 0."""
+    """For a wanted force f the controller sends f + alpha v, with W += f v + alpha_- v_-^2, alpha = max(0, -W/v^2)."""
     rng, control = np.random.default_rng(17), PassivityControl(1, T)
     W = alpha = before = acted = 0.0
     for _ in range(500):
@@ -58,7 +58,7 @@ def test_the_passivity_controller_is_the_published_one():
     assert acted > 100
 
 
-def test_energy_bounding_sends_what_its_law_says():
+def test_energy_bounding_keeps_its_bound_in_a_run():
     scenario = load().replace(duration=1.5)
     trace = run(netted(assemble(scenario, NoCoupling()), Classic(EnergyBounding)), "exact")
     sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
@@ -77,7 +77,7 @@ def test_energy_bounding_sends_what_its_law_says():
         pytest.param("energy budget", (14.40, 0.216, 1.6, 35, 7, 0.131), marks=pytest.mark.validate),
     ],
 )
-def test_the_figures_of_the_classics(name, figures):
+def test_classics_have_the_figures_of_the_page(name, figures):
     """The figures have the digits that docs/energy-budget.md prints."""
     digits = (2, 3, 1, 0, 0, 3)
     assert tuple(round(value, n) for value, n in zip(row(ROWS[name]), digits, strict=True)) == pytest.approx(figures)

@@ -111,7 +111,7 @@ def test_folders_import_only_allowed_folders(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_packages_live_where_they_belong(path):
+def test_large_packages_are_imported_in_few_files(path):
     place = path.relative_to(ROOT).as_posix()
     for name in imported(path):
         homes = HOMES.get(name.split(".")[0])
@@ -185,7 +185,7 @@ def test_replaced_fields_exist():
     assert not wrong
 
 
-def test_installed_versions_satisfy_the_lower_bounds():
+def test_pinned_versions_satisfy_the_lower_bounds():
     """`floors` gives a least version for each dependency; each requirement admits the version in constraints.txt."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     named = [Requirement(one) for one in [*project["dependencies"], *project["optional-dependencies"]["dev"]]]

@@ -1,4 +1,4 @@
-"""The wheel works in a new environment, from a folder whose modules have the names of our folders."""
+"""The wheel works in a new environment, from a folder whose modules have the names of this package's folders."""
 
 import subprocess
 import sys
@@ -43,7 +43,7 @@ def _copied_sources(place: Path) -> Path:
 
 @pytest.fixture
 def users_folder(tmp_path):
-    """Return the folder of a user's project, whose modules are named like our folders."""
+    """Return the folder of a user's project, whose modules are named like this package's folders."""
     for name in ("models/__init__.py", "controller/__init__.py", "sim.py", "cli.py", "design.py", "hw.py"):
         file = tmp_path / name
         file.parent.mkdir(exist_ok=True)
