@@ -52,6 +52,7 @@ def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
     assert rows["spring-damper", "this-environment"]["force_error_percent"] == pytest.approx(error, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kinds"),
     [("one-wall", ["none", "spring-damper", "spring-damper"]), ("omega-pair-ranges", ["none", "spring-damper"])],

@@ -100,6 +100,7 @@ def count(*_):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "call",
     ["execute(count)", "api.known = count; design_coupling(load('omega-pair').loop('I'))"],

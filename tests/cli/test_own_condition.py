@@ -35,6 +35,7 @@ def run(command: str, *words: str) -> int:
     return import_module(f"haptic_loop.cli.{command}").main([*words, "--condition", OWN])
 
 
+@pytest.mark.slow
 def test_own_condition_designs_are_proved_and_tight(folder):
     report = json.loads((folder / "design.json").read_text())
     needs = report["assessment"]["requirements"][NAME]

@@ -148,6 +148,7 @@ def test_running_twice_gives_the_same_files(tmp_path):
     assert trace.meta["case"] == "I"
 
 
+@pytest.mark.slow
 def test_a_tampered_coupling_is_named(tmp_path):
     """A coupling with one gain changed by 1 % is judged anew; the report says that its file's certificate fails."""
     scenario = load()
@@ -255,6 +256,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     assert not any(stage in shown for stage in stages)
 
 
+@pytest.mark.slow
 def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
     """After Ctrl-C in the third block the first two are written, and the exit code is 130."""
     block, calls = loop.run_block, []

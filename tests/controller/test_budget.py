@@ -237,6 +237,7 @@ def test_encoder_errors_cost_their_worst_combination(told):
     assert budget.energy[0] == pytest.approx(energy, abs=1e-14)  # two units in the last place per tick
 
 
+@pytest.mark.slow
 def test_reserve_and_scale_match_brute_force():
     """By definition the reserve sums over the next ticks the largest loss of a packet of an allowed age.
 

@@ -273,6 +273,7 @@ def test_limiter_and_environment_are_passive_without_lag():
     assert energy.max() > 0.5
 
 
+@pytest.mark.slow
 def test_clipped_cycles_give_energy_limited_ones_none():
     """On a circle of radius 4 cm, clipping each force by itself gives two hands 0.616 J per turn at any speed."""
     coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)

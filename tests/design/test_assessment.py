@@ -77,6 +77,7 @@ def test_an_energy_account_covers_no_latency():
         assert assessment.reason.startswith("latency")
 
 
+@pytest.mark.slow
 def test_the_limiter_is_judged_with_switching_delays():
     """The limiter needs 0.70 of the damping with constant delays, and 1.04 of it with switching delays."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
@@ -138,6 +139,7 @@ def test_a_users_condition_must_name_switching_delays():
     assert (assessment.holds, assessment.force_limits.rho) == (False, None)
 
 
+@pytest.mark.slow
 def test_a_guarantee_names_its_limiters_known_devices():
     """This-environment certifies every device here, but its limiter needs 0.5 % more damping than is available."""
     bounds = DeviceBounds(0.1, 2000.0, 0.5, 2.0)
@@ -147,6 +149,7 @@ def test_a_guarantee_names_its_limiters_known_devices():
     assert "devices with at least 100 g" in limited.guarantee.hands
 
 
+@pytest.mark.slow
 def test_limited_forces_are_not_searched_between_vertices():
     """The limiter needs 0.9848 times 1.37 N s/m for a mass of 3 kg, and with this multiplier 0.03 % more for 0.2 kg."""
     springs = (LOOP.environment.springs[0], change(LOOP.environment.springs[1], stiffness=700.0))
@@ -195,6 +198,7 @@ def test_a_swept_limiter_makes_the_guarantee_sampled(monkeypatch):
     assert assess(LOOP, HERE_ONLY, limiter=False).guarantee.proof == "rational"
 
 
+@pytest.mark.slow
 def test_a_stored_limiter_proof_covers_no_longer_delay():
     """The stored proof is for a delay of 1 sample. With 801 samples the loop has more states than are proved."""
     loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
@@ -301,6 +305,7 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
 # At one wall every command reports the damping for making and breaking contact, not that for permanent contact.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.validate)])
 def test_commands_agree_on_the_requirement_of_a_wall(tmp_path, monkeypatch, every):
     monkeypatch.chdir(tmp_path)

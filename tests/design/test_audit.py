@@ -134,6 +134,7 @@ def test_the_stiffest_gains_respect_full_levels():
     assert "no multiple of K" in beyond.reason
 
 
+@pytest.mark.slow
 def test_axes_of_a_late_device_share_multipliers():
     """The stiffest K of the two axes are certified together, not only axis by axis."""
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
@@ -143,6 +144,7 @@ def test_axes_of_a_late_device_share_multipliers():
     assert requirement(loop, SpringDamper(K, [0.3] * 2), "any-environment").certified
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("B", [*(pytest.param(B, marks=pytest.mark.validate) for B in (0.62, 0.85)), 0.899])
 def test_the_stiffest_gains_of_late_forces_are_certified(B):
     """For large B no K is certified although B < delta, and a K near 0 may need more damping than a larger one."""
@@ -175,6 +177,7 @@ def test_the_papers_gains_are_not_certified():
     assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["margins"]["any-environment"]["stiffest"]["reason"]
 
 
+@pytest.mark.slow
 def test_optimal_gains_rounded_up_fail_any_environment():
     """Any-environment needs 0.02 % more damping than is available, and this-environment needs about half of it."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
@@ -243,6 +246,7 @@ def test_delayed_environments_need_a_multiplier():
     assert "multiplier" in stiffest(*subject, "any-environment").reason
 
 
+@pytest.mark.slow
 def test_any_coupling_can_be_audited():
     V = SAFE.compliance(T)
     general, structured = report(*pair(Compliance(V))), report(*pair(SAFE))
@@ -260,6 +264,7 @@ def test_any_coupling_can_be_audited():
     assert "needs a coupling" in needs(nothing, "any-environment")["reason"]
 
 
+@pytest.mark.slow
 def test_guarantees_name_their_environments():
     assert safe_with(report(*pair(SAFE))) == "any passive environment"
     assert assess(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2]))).guarantee.environments == "this environment"
@@ -350,6 +355,7 @@ def files(tmp_path):
     (tmp_path / "broken.json").write_text("{")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_stored_couplings_are_audited(run):
     for name in ("gains.json", "space.json"):
@@ -463,6 +469,7 @@ def test_help_has_an_example(run):
     assert "python -m design.audit --K 2870,2320 --B 5.47,5.55" in out
 
 
+@pytest.mark.slow
 def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
     argv = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
     needless = {"cvxpy", "scipy.linalg", "scipy.sparse"}  # SciPy's imports take a tenth of an audit

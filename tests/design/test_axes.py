@@ -213,6 +213,7 @@ def test_any_environment_with_a_latency_takes_levels() -> None:
     assert needs.ratio == pytest.approx(least_multiple(of_devices(*each), hermitian_part(V)), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_any_environment_with_switching_takes_levels() -> None:
     """He[V/(1-z)] > |vt|^2/4 (s Delta/T - alpha Delta'/2)^-1 + Delta'^-1/(2 alpha) is tight at the requirement s.
 
@@ -351,6 +352,7 @@ def turned(loop: Loop, Q: np.ndarray) -> Loop:
     return msgspec.structs.replace(loop, environment=loop.environment.turned(Q), delta=delta, levels=levels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [14, pytest.param(200, marks=pytest.mark.validate)])
 def test_turning_the_axes_keeps_each_requirement(turns: int) -> None:
     """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i per device keeps each requirement."""
@@ -608,6 +610,7 @@ def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> n
     return most / start
 
 
+@pytest.mark.slow
 def test_limited_force_vectors_give_no_energy() -> None:
     """At 1.02 of the requirement 0.518330 none of 60 lossless hands gains energy; at 0.6 of it five or more do."""
     assert (most_energy(1.02 * 0.518330, 1) <= 1 + 1e-9).all()
@@ -712,6 +715,7 @@ def switching_room(loop: Loop, coupling: ForceFilter, alpha: tuple[float, ...]) 
     return float(np.linalg.eigvalsh(root @ room @ root.T).min())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loop",
     [
@@ -743,6 +747,7 @@ def test_reports_show_the_diagonal_of_matrix_gains() -> None:
     assert rows == {"coupling, static": "1500, 800, 1000, 700 N/m"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [ONE_DEVICE, pytest.param(LOOP, marks=pytest.mark.validate)])
 def test_optimal_filters_take_limited_force_vectors(loop: Loop) -> None:
     """The multiplier of a design over two bases has one number per device."""
@@ -768,6 +773,7 @@ def _chains(stiffness: float, c: float) -> Loop:
     return Loop(1e-3, (0, 0), (1, 1), (0, 0), (1.0, 1.5), network, axes=(2,), levels=levels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stiffness", "c"),
     [(100.0, 0.91), *(pytest.param(*each, marks=pytest.mark.validate) for each in ((50.0, 0.93), (100.0, 0.9)))],

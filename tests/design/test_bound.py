@@ -71,6 +71,7 @@ def transformed(dual, x):
     return hermitian(D)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [*(pytest.param(name, marks=pytest.mark.validate) for name in ("I", "II", "n2")), "n3"],
@@ -220,6 +221,7 @@ def test_timing_scales_the_level_of_a_bound(monkeypatch, latency, factor):
     assert seen[0].T_max is None
 
 
+@pytest.mark.slow
 def test_no_bound_exceeds_a_late_loops_mismatch():
     """Without coupling a damper of 1.2 N s/m has no mismatch. A device of 1 N s/m is enough only for late forces."""
     damper = Network(("tip",), (Spring(("tip", GROUND), 1.0, 1.2),))

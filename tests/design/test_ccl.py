@@ -78,6 +78,7 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
 
 
+@pytest.mark.slow
 def test_fixed_order_designs_beat_spring_dampers(inner):
     loop, found = inner
     assert found.objective <= (4.31 if loop is LONE else 9.8)
@@ -140,6 +141,7 @@ def test_the_zeros_are_optimal_for_the_poles(inner):
     assert t.value == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loop", "order", "diagonal"), [(asked(), 1, False), (LONE, 3, True)], ids=["pair", "one"])
 def test_three_steps_beat_the_structured_design(loop, order, diagonal):
     """The start leaves a share `_START_ROOM` of the damping unused; three steps lower the norm by over ten shares."""

@@ -163,6 +163,7 @@ def test_environment_delay_needs_more_damping_for_any_environment():
         prove(loop, damped, "any-environment")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [12, pytest.param(60, marks=pytest.mark.validate)])
 def test_proof_and_sweep_agree_on_both_sides(count):
     """A random loop is proved if and only if its ratio is below 1, but from 1 - 1e-4 to 1 it need not be proved."""

@@ -230,6 +230,7 @@ def test_no_reading_of_figure_4_reproduces_tau():
     assert 60 < least < 73
 
 
+@pytest.mark.slow
 def test_a_rigid_wall_is_not_the_worst_environment():
     """A wall needs 1.3659 N s/m, a mass of 36 g 1.3769, and any passive environment 1.5160."""
     K, B, theta = 610.0, 0.545, 2

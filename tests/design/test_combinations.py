@@ -222,6 +222,7 @@ def test_some_hands_gain_energy_far_below_the_requirement(names):
     assert growing(loop, COUPLING, 0.5 * least_of(names), rho, ticks=TICKS // 8) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.validate)], ids="-".join
 )

@@ -177,6 +177,7 @@ def test_clarabel_reads_bare_columns_like_scipys_matrix():
     assert solutions[0] == solutions[1]
 
 
+@pytest.mark.slow
 def test_a_design_loads_no_modelling_language(tmp_path):
     """A proved design and the imports of runs and other designs load neither cvxpy nor these SciPy modules."""
     words = ["--condition", "any-environment", "--out", str(tmp_path / "coupling.json")]

@@ -248,6 +248,7 @@ def test_the_c_file_repeats_its_test_vector(place, name, what):
         assert "repeat to the last bit" in done.stdout
 
 
+@pytest.mark.slow
 @needs_cc
 @pytest.mark.parametrize(
     ("name", "limit"),

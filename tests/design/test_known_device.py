@@ -524,6 +524,7 @@ def test_the_paper_loop_is_proved_exactly():
     assert find_storage(block)[0] is None
 
 
+@pytest.mark.slow
 @ONE_OR_PAIR
 def test_the_block_is_singular_at_the_requirement(loop, coupling):
     """The least eigenvalue of the block vanishes at the required damping, for this and for any environment."""
@@ -561,6 +562,7 @@ def test_bounds_of_q_enclose_it_and_are_checked():
 # Certificates, files, ranges and refusals.
 
 
+@pytest.mark.slow
 def test_files_are_proved_and_forgeries_are_refused():
     coupling = PUBLISHED["I"]
     assert not required_damping(KNOWN, coupling, "this-environment").certified
@@ -595,6 +597,7 @@ def test_the_smaller_requirement_is_taken():
     assert verify(Stored.of(loop, coupling, prove(loop, coupling, "known-device"))).proved
 
 
+@pytest.mark.slow
 def test_one_beta_serves_all_environments_of_ranges():
     loop = change(limited(1), ranges=Ranges(masses={"tip": (0.04, 0.06)}))
     certificate = prove(loop, COUPLING, "known-device")
@@ -681,6 +684,7 @@ def test_known_devices_permit_almost_rigid_spring_dampers():
     ).proved
 
 
+@pytest.mark.slow
 def test_the_stiffest_spring_damper_meets_its_known_limit():
     """The limit is 5223.8 N/m with 7.352 N s/m; with 0.5 % more stiffness no beta and B of a grid are certified."""
     loop = one(1.2e-3, 1.37)
@@ -1021,6 +1025,7 @@ WALLS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
 def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, plain):
     """Separate code with a coarse sweep and the multiplier m = 0 gives `known`; permanent contact needs less."""
@@ -1103,6 +1108,7 @@ def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, p
     assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta), ticks=2000) == 0
 
 
+@pytest.mark.slow
 def test_hands_that_never_leave_walls_need_less_damping():
     """A hand that never leaves the wall feels a spring-damper; at 0.9 of its need some lossless hand grows."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
@@ -1122,6 +1128,7 @@ def test_hands_grow_on_walls_far_below_the_requirement():
     assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3, ticks=2000) > 0
 
 
+@pytest.mark.slow
 def test_walls_on_known_devices_are_proved_from_files():
     loop = on_a_wall(1000.0, 5.0, 0)
     stored = Stored.of(loop, NoCoupling(), prove(loop, NoCoupling(), "known-device"))
@@ -1214,6 +1221,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [False, pytest.param(True, marks=pytest.mark.validate)])
 def test_limited_known_devices_are_proved_from_files(pair):
     """With the limiter the pair with published gains needs 0.966 N s/m of the available 1 N s/m."""
@@ -1251,6 +1259,7 @@ def together_needs(name):
     return required_damping(loop, COUPLING, condition).required[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -118,6 +118,7 @@ def by_a_dense_program(loop, coupling, latencies):
     return cp.Problem(cp.Minimize(s / loop.delta[0]), limits).solve(solver=cp.CLARABEL) * loop.delta[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("coupling", "range", "needs"),
     [(SOFT, (0.0, 0.4 * T), 0.691186), pytest.param(STIFF, (0.1 * T, 0.6 * T), 1.324571, marks=pytest.mark.validate)],

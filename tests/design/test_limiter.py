@@ -285,6 +285,7 @@ def test_a_spring_damper_designed_with_the_block():
         design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 
 
+@pytest.mark.slow
 def test_the_command_stores_proofs_of_limited_forces(tmp_path):
     out = tmp_path / "limited.json"
     assert design_main(["--condition", "this-environment", "--limiter", "--out", str(out)]) == 0

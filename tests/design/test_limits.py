@@ -21,6 +21,7 @@ def optimum(damping, bases):
     return loop, design_by_kind(loop, "optimal", bases=_BASES[:bases])
 
 
+@pytest.mark.slow
 def test_more_damping_is_never_worse():
     """The feasible set grows with the damping."""
     found = [optimum(damping, 1) for damping in (1.3, 1.37)]
@@ -30,6 +31,7 @@ def test_more_damping_is_never_worse():
         assert max(certify(loop, design)["this-environment"].required) < loop.delta[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [2, pytest.param(3, marks=pytest.mark.validate)])
 def test_more_bases_approach_the_bound(most):
     """The bound of -35.137 dB was computed separately; `make validate` computes it in tests/design/test_bound.py."""

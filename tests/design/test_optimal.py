@@ -169,6 +169,7 @@ def test_causal_parts_match_the_transform():
     np.testing.assert_allclose(_causal(grid, heights, w[at]), -np.fft.rfft(D, n=2**18)[:, at].T, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [2, *(pytest.param(n, marks=pytest.mark.validate) for n in (3, 4))])
 def test_parallel_walls_have_one_walls_bound(channels):
     """Parallel walls are separate problems, so their bound is that of one wall."""
@@ -177,11 +178,13 @@ def test_parallel_walls_have_one_walls_bound(channels):
     assert several.rms > 0.1
 
 
+@pytest.mark.slow
 def test_the_bound_of_safe_environments_is_zero():
     """The environment of this loop is safe without a coupling, so its mismatch and its bound are zero."""
     assert bound(loop_of("o02"), knots=8).rms == 0
 
 
+@pytest.mark.slow
 def test_safe_environments_get_no_coupling():
     found = best("o02")
     assert isinstance(found.coupling, NoCoupling)
@@ -256,6 +259,7 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
+@pytest.mark.slow
 def test_sixteen_samples_beside_slow_poles_are_proved():
     """P has a condition number above 1e15, and all its digits are stored.
 
@@ -367,6 +371,7 @@ def test_switching_delays_match_a_separate_formula():
     assert plain < found.figures.rms_mismatch < 1
 
 
+@pytest.mark.slow
 def test_the_supremum_and_the_cap_are_kept():
     loop, short = loop_of("n3"), ((8, 6),)
     rms, sup = best("n3"), design(loop, Options(bases=short, objective="sup"))
@@ -558,6 +563,7 @@ def test_entrywise_inequalities_equal_dense_ones():
         np.testing.assert_allclose(np.triu(one), np.triu(other), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_entrywise_program_equals_dense_for_three_devices(monkeypatch):
     loop = loop_of("n5")
     case = program.Case(loop, loop.E(), (program.this_environment(loop),))
@@ -735,6 +741,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys, br
     assert compared["robustness"] == found["robustness"]
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch, brief):
     """The verdict is printed and the proof is stored before the bound and the robustness are computed."""
     file, printed = tmp_path / "c.json", []
@@ -775,6 +782,7 @@ def test_late_walls_match_their_closed_form():
     assert found.g >= 0.49
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n2", "n4"))]
 )
@@ -808,6 +816,7 @@ def test_limited_forces_are_not_designed_for_ranges():
         design(ranged, replace(SHORT, limiter=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, *(pytest.param(n, marks=pytest.mark.validate) for n in (12, 14))])
 def test_every_loop_gets_an_answer_and_proof(seed):
     """The loops are extreme: 15 samples of delay, 54 kg, springs of 0.03 N/m, dampings of 0.04 N s/m."""

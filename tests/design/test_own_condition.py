@@ -184,6 +184,7 @@ def test_an_own_fact_matches_a_dense_sweep(repeats):
     assert min(dense(a) for a in others) > found.ratio * (1 - 1e-6)
 
 
+@pytest.mark.slow
 def test_an_own_fact_is_proved_and_mapped(repeats):
     own, scenario = repeats["RepeatedForces"](), load("omega-pair")
     certificate = prove(PAIR, SOFT, own)

@@ -235,6 +235,7 @@ def least_room(network: Network, coupling, points: int = 2000) -> float:
     return float(np.linalg.eigvalsh(T / 1.37 * (H + np.conj(np.swapaxes(H, 1, 2))) / 2 + np.eye(1)).min())
 
 
+@pytest.mark.slow
 def test_vertex_force_maps_match_raw_matrices(robust):
     w = np.array([1e-3, 0.04, 0.3, 2.0])
     for member in LOOP.members():
@@ -260,6 +261,7 @@ def test_the_sweep_agrees_with_the_condition_by_hand(robust):
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_an_absent_environment_needs_no_damping():
     """At the vertex without both springs the object exerts no force, so no damping is required."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in LOOP.network.springs))
@@ -398,6 +400,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
     assert validated["worst"]["environment"] in validated["environments"]["names"]
 
 
+@pytest.mark.slow
 def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
     """These gains need 0.978 of the damping in the nominal environment, and 1.007 at the stiffest vertex."""
     stiff = ["--K", "2150", "--B", "1.0"]
@@ -441,6 +444,7 @@ def test_missing_ranges_cannot_be_sampled(tmp_path):
         validate_main(["--environments", "ranges", "--out", str(tmp_path)])
 
 
+@pytest.mark.slow
 def test_scenarios_may_have_ranges_and_walls():
     """One set of multipliers serves every member, so no member may need more damping when it is judged alone."""
     walls = '\n[[environment.walls]]\nbetween = ["mass", "ground"]\nstiffness = 3000.0\ndamping = 2.0\ngap = 5e-3\n'

@@ -30,6 +30,7 @@ def hurried(clock):
     return lambda: 1e4 * clock()
 
 
+@pytest.mark.slow
 def test_a_racing_clock_changes_no_byte(monkeypatch):
     """A design over two bases is the same with the real clocks and with clocks ten thousand times as fast."""
     loop = load(LOOPS / "o01-wall-light-device.toml").loop("I")

@@ -75,6 +75,7 @@ def test_the_objective_is_the_returned_norm():
     assert found.objective == pytest.approx(by_hand, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", [60, pytest.param(200, marks=pytest.mark.validate)])
 @pytest.mark.parametrize("case", CASES)
 def test_no_certified_gains_do_better(case, draws):
@@ -233,6 +234,7 @@ def test_this_environment_designs_stabilise_delayed_environments():
     assert force_map(loop.E(), found.coupling, loop.theta, loop.psi).is_stable()
 
 
+@pytest.mark.slow
 def test_failed_searches_claim_no_impossibility():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
         design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")

@@ -45,6 +45,7 @@ def growing(loop, hands=HANDS, seconds=SECONDS):
     return int((switched_crowd(loop, held_by, np.arange(hands), 0, seconds, None).exact > 0).sum())
 
 
+@pytest.mark.slow
 def test_the_designed_gains_are_proved_for_any_switching(made):
     report, coupling = made
     loop = load().loop("I")
@@ -87,6 +88,7 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
         main([*options, "--out", str(tmp_path / "c.json")])
 
 
+@pytest.mark.slow
 def test_any_environment_designs_take_varying_delays(tmp_path):
     """The search assumes constant delays. It is repeated with less damping until switching delays are certified."""
     with pytest.raises(ValueError, match="this-environment only"):
@@ -96,6 +98,7 @@ def test_any_environment_designs_take_varying_delays(tmp_path):
     assert switching_sweep(loop.sent(coupling), *RANGE, loop.delta).certified
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("basis", "most_db"),
     # measured: -12.85 dB and -13.37 dB; the designed spring-damper has -3.4 dB

@@ -269,6 +269,7 @@ def told(capsys, main, *options) -> tuple[int, dict]:
     return code, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys):
     code, report = told(capsys, check_main, file)
     assert (code, report["proved"]) == (0, True)
@@ -416,6 +417,7 @@ def test_certify_judges_every_vertex_of_the_ranges(K, certified):
     assert found.proof == ("rational" if certified else "sampled")
 
 
+@pytest.mark.slow
 def test_the_bridge_reports_the_longest_hold(tmp_path):
     """The ages that the delay line computes for isolated missed answers lie within the range on file."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))

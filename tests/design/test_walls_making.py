@@ -229,6 +229,7 @@ class Walled:
         return f, output[self.m :], p
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True], ids=["springs", "dampers"])
 def test_every_step_of_the_proof(damped):
     """On random motions of the running law the balance of Z holds at every tick, and Z >= min(0, its first value)."""
@@ -355,6 +356,7 @@ def test_hands_rest_at_the_requirement_not_below(damping, short):
     assert swinging(loop, coupling, short * need, ticks // 3)[0] > 0.5  # These hands never rest.
 
 
+@pytest.mark.slow
 def test_damped_wall_designs_are_tight_and_proved():
     """The design is stiffer than any-environment allows, and softer than all frozen states alone allow (1772 N/m)."""
     wall = Wall(("tip", GROUND), 3000.0, 2.0, 0.005)

@@ -116,6 +116,7 @@ def test_a_peak_is_found_wherever_it_lies(top):
     assert found.worst[0].ratio > 0.99
 
 
+@pytest.mark.slow
 def test_many_parameters_find_the_worst_vertex():
     """The ratio is largest with parameters 1, 3, .. 9 at their upper ends and the others at their lower ends."""
     region = cube(10)
@@ -160,6 +161,7 @@ def test_progress_ends_at_its_total():
 # In RANGED, VERTICES_ONLY is certified at every vertex and at 64 random points, and violated on an edge.
 
 
+@pytest.mark.slow
 def test_edge_violations_match_a_dense_sweep(known):
     """The worst member has its springs at their upper ends and a mass between 0.5 and 2 kg."""
     found = known.searched.worst[0]

@@ -63,6 +63,7 @@ def watched(emulator):
     return ticks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, made, deaf):
     """The other board rests, which must not hide the force that the deaf one keeps."""
@@ -107,6 +108,7 @@ def test_two_clocks_keep_the_energy_account(scenario, alone, made, tmp_path):
 ENDING = ["unplug", "up:drop=1", "down:drop=1", "stall=0.03", "trip", "estop", "jump=5"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("board", "fault"), checkered([0, 1], ENDING))
 def test_a_fault_of_one_board_stops_both(scenario, alone, made, board, fault):
     """A fault of either board or link ends the session, and both motors are at zero within 50 ms."""
@@ -135,6 +137,7 @@ def test_clocks_that_are_not_covered_are_refused(scenario, alone, made, clock, b
     assert re.match(cause, rehearsal.session.cause)
 
 
+@pytest.mark.slow
 def test_a_faster_clock_stops_forces(scenario, alone, made, monkeypatch):
     """Without the comparison of clocks, the session stops before an answer is late."""
     monkeypatch.setattr(boards, "_COMPARED", 10**6)
@@ -201,6 +204,7 @@ class _Terminals:
                 select.select([end._slave], [], [], 1.0)
 
 
+@pytest.mark.slow
 def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypatch, capsys, tmp_path):
     """In virtual time, the command runs over pyserial, two pseudo-terminals and clocks that differ by 100 ppm."""
     pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")

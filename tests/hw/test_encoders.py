@@ -278,6 +278,7 @@ def test_a_moving_hand_is_no_motor(hand, closing):
         played(arming_test(closing=closing), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "at"), checkered([1, 2], [0.7, 0.9]))
 def test_sessions_whose_motor_died_never_finish(scenario, rungs, axis, at):
     """Hands move at full amplitude. The same session without the fault finishes."""
@@ -325,6 +326,7 @@ def test_sessions_finish_once_handles_are_let_go(scenario, rungs, hand):
     assert hand[0] < 0.3 or "let go of the handle of axis 1" in [event.cause for event in session.log]
 
 
+@pytest.mark.slow
 def test_sessions_with_held_handles_never_finish(scenario, rungs):
     session = ended_live(scenario, rungs, (0.4, 3.0, 100.0))
     assert session.stage == Stage.STOPPED

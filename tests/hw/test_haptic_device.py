@@ -197,6 +197,7 @@ def test_certificates_say_that_the_host_clocks(scenario):
     assert said == f"forces act as they come: certified for {kept}, as measured"
 
 
+@pytest.mark.slow
 def test_host_clocks_charge_microseconds_not_ticks(scenario):
     """A coupling needs less damping if its forces act 0.13 ms after a sample than if they act a tick after it."""
     judged, link = timed(scenario.replace(theta=(0, 1)), Ages((50,) * 50 + (130,) * 50), 1.0, 0.0, at_once=True)
@@ -214,6 +215,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
     assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("read", "write", "holds"), [(40, 50, True), (500, 500, False)])
 def test_a_force_that_takes_too_long_is_refused(scenario, read, write, holds):
     session, *_ = held_session(scenario, StandIn(scenario, read, write), seconds=0.05)

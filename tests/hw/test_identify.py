@@ -108,6 +108,7 @@ def test_dry_friction_is_told_from_viscous():
     assert 0.98 * 1.37 < found.friction.delta < 1.37
 
 
+@pytest.mark.slow
 def test_a_knob_is_identified_in_radians():
     """A knob of 100 g cm2 has viscous friction of 0.2 mN m s/rad and dry friction of 0.1 mN m; its lever is 20 mm."""
     T, lever, count = 1.2e-3, 0.02, 1e-4
@@ -243,6 +244,7 @@ def test_no_bound_exceeds_friction_that_is_not_viscous(judged, name):
         assert found.delta <= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(name for name in NOT_VISCOUS if "thins" in name or "memory" in name))
 def test_thinning_and_memory_are_refused(judged, name):
     words = "energy of a stroke does not grow" if "thins" in name else "damping falls with frequency"
@@ -258,6 +260,7 @@ def test_a_lag_hides_no_memory(odd, records):
     assert "damping falls with frequency" in doubt(found, odd[rig.name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "share"), [("viscous", 0.85), ("viscous, half the mass", 0.93)])
 def test_viscous_friction_keeps_most_of_its_bound(judged, name, share):
     """The bound allows for a memory of 2 ms that encoder steps of 5 um might hide. A lighter device hides less."""
@@ -289,6 +292,7 @@ def sitting(odd, *names):
     return [Estimate(odd[name], None, Viscosity(0.5, 0.0, 0.0, odd[name].delta, 1e-3, False)) for name in names]
 
 
+@pytest.mark.slow
 def test_damping_hands_are_detected_by_two_sittings(odd):
     """One record does not reveal a hand's 0.3 N s/m: its bound is about 30 % above the truth of 1."""
     assert odd["firm"].delta == pytest.approx(1.29, abs=0.01)
@@ -369,6 +373,7 @@ def test_a_device_of_three_axes_is_one_table():
         assert read.credible_speed == pytest.approx(0.6 - 0.1 * (len(axes) - 1), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_fast_swings_of_unknown_masses_are_no_jumps(tmp_path, monkeypatch):
     """A compliant device swings at 84 Hz by 1 mm, more than the forces would move the declared mass.
 
@@ -461,6 +466,7 @@ def coarse():
     return T, step, force, played(force, T, 0.3, 0.5, 0.02)
 
 
+@pytest.mark.slow
 def test_bounds_hold_wherever_the_encoder_stands(coarse):
     """For five origins of the encoder within a step, bounds are below the truth by at most 2 %.
 

@@ -27,6 +27,7 @@ LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] delay of an emulated link
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.1])
 def test_the_last_force_holds_until_the_answer(share):
     """Recompute the trace's positions from its forces, by matrix exponentials before and after each latch.
@@ -125,6 +126,7 @@ def test_the_power_of_overlong_ticks_is_bounded():
     assert _overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_couplings_are_named_with_their_latency():
     (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
     assert made.assessment.loop.latency == ((3e-5, 2.3e-4),) * 2

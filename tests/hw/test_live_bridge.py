@@ -97,6 +97,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
     assert replay.main(["out/bridge-I/trace.npz"]) == 0
 
 
+@pytest.mark.slow
 def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
     """The scene runs in the session behind its energy shell, and the report has the shell's account."""
     monkeypatch.chdir(tmp_path)

@@ -165,6 +165,7 @@ def rehearsal_until_finished(scenario, rungs):
     return session
 
 
+@pytest.mark.slow
 def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     """With a cap of 10 mN, more than half of the forces at full gain are cut."""
     recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
@@ -303,6 +304,7 @@ def rehearsed(tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 def test_rehearsals_have_a_sessions_stages_and_files(rehearsed):
     report, _, out = rehearsed[0]
     stages = ["connecting", "configuring", "measuring", "measured", "configuring", "disarmed", "arming", "armed"]

@@ -48,6 +48,7 @@ def trace(scenario, rungs, tmp_path_factory):
     return save(out, session, recorder, report, plot=True), recorder
 
 
+@pytest.mark.slow
 def test_a_sessions_trace_loads_as_a_simulations(trace):
     files, recorder = trace
     result = Trace.load_npz(files[0])
@@ -218,6 +219,7 @@ class Dared(CertifiedCoupling):
     certified = True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
 def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
     """Without coupling the file gives the exact engine's growth rate, to 2e-3 1/s since forces are rounded.

@@ -37,6 +37,7 @@ from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 # faults
 
 
+@pytest.mark.slow
 def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
     """The host cannot remove the force of a deaf device, but it says so, and the session has not finished."""
     planned = _rehearse_case(
@@ -51,6 +52,7 @@ def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
     assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "the dev"]
 
 
+@pytest.mark.slow
 def test_rehearsals_wait_for_deaf_devices(tmp_path, capsys):
     """A device must be at rest 30 ms after STOP; a rehearsal that ended earlier would call the session finished."""
     words = ["--rehearse", "--case", "I", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)]
@@ -300,6 +302,7 @@ def test_nothing_uncertified_is_loaded(scenario, rungs):
     assert session.stage == Stage.REFUSED
 
 
+@pytest.mark.slow
 def test_reserves_take_over_after_arming(scenario, rungs):
     """After 10 % late answers the session ramps out and loads the next coupling; only arm() brings forces back."""
     faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
@@ -342,6 +345,7 @@ def assert_in_reserve(rungs):
         assert needs[1] < min(needs[0], 1)
 
 
+@pytest.mark.slow
 def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
     fast, soft = optimal_rungs
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
@@ -357,6 +361,7 @@ def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
     assert "no reserve" not in table
 
 
+@pytest.mark.slow
 def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_path):
     path = tmp_path / "stiff.json"
     save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
@@ -461,6 +466,7 @@ def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tm
     assert part.reserved_J <= part.energy_J
 
 
+@pytest.mark.slow
 def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path):
     """The budget limits an active controller over a lossy line, and the replay repeats this bit by bit."""
     for module in ("control", "recording"):
@@ -488,6 +494,7 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
 # walls
 
 
+@pytest.mark.slow
 def test_rehearsed_forces_solve_coupling_and_wall_in_series():
     """Forces solve coupling and wall in series: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap).
 
@@ -516,6 +523,7 @@ def test_rehearsed_forces_solve_coupling_and_wall_in_series():
     np.testing.assert_allclose(felt, pushes[399:-121], atol=6e-4)  # the force is rounded to steps of 0.5 mN
 
 
+@pytest.mark.slow
 def test_walls_on_the_bridge_replay_bit_by_bit(tmp_path, capsys):
     words = ["--scenario", "one-wall", "--duration", "1", "--out", str(tmp_path), "--no-plot"]
     assert bridge.main(["--rehearse", *words]) == 0

@@ -69,6 +69,7 @@ def account(trace, link, coupling, T):
     return least
 
 
+@pytest.mark.slow
 def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
     """The energy given stays within the budget, and a session in a world has no replay."""
     code, report, shown = session(tmp_path, capsys, "--scenario", "world-ball", "--duration", "0.4")
@@ -83,6 +84,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
         replay.main([str(tmp_path / "out" / "trace.npz")])
 
 
+@pytest.mark.slow
 def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
     """Without repetitions, the steps that do not settle are those with a force at the cap."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
@@ -205,6 +207,7 @@ def test_a_force_in_steps_never_overdraws_the_shell():
     assert 0 < dearer < 2000
 
 
+@pytest.mark.slow
 def test_a_rehearsal_from_python_takes_a_world():
     rehearsed = rehearse(load("world-door"), seconds=0.3)
     assert rehearsed.stage == "finished"

@@ -88,6 +88,7 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
     assert port.unsettled == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radial", [True, False])
 def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
     """m (v+ - v)/h equals the force, which is G (u0 - u) limited to a ball or a box."""

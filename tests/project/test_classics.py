@@ -69,6 +69,7 @@ def test_energy_bounding_keeps_its_bound_in_a_run():
     assert (np.abs(sent[k]) <= np.where(dx[k - 1] == 0, np.abs(sent[k - 1]), most) + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "figures"),
     [

@@ -27,6 +27,7 @@ def report(tmp_path_factory):
     return code, json.loads((place / "r.json").read_text())
 
 
+@pytest.mark.slow
 def test_errors_and_verdicts_of_four_integrators_are_known(report):
     code, outcome = report
     assert code == 0

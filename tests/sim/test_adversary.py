@@ -38,6 +38,7 @@ def test_the_search_destabilises_loops_below_the_requirement():
     assert all(row.worst.destabilises for row in rows)
 
 
+@pytest.mark.slow
 def test_the_search_fails_against_sufficient_damping():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
@@ -63,6 +64,7 @@ def test_the_condition_is_tight_with_long_delays():
     assert 6 < rows[1].worst.frequency_hz < 10
 
 
+@pytest.mark.slow
 def test_known_devices_are_searched_within_their_bounds(tmp_path):
     """The nominal motors are heavy; the search finds the lightest motor that the guaranteed bounds allow."""
     heavy = {"motor_mass": 1.0, "transmission_stiffness": 3000.0}
@@ -121,6 +123,7 @@ def test_a_found_person_replays_with_equal_spectral_radius(tmp_path, monkeypatch
     assert stability["spectral_radius"] == pytest.approx(found["spectral_radius"], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_adversarys_search_is_repeatable():
     """Its hands are lossless, and the scene of these hands has the growth that the search found."""
     F = assemble(SCENARIO, NoCoupling()).F
@@ -133,6 +136,7 @@ def test_the_adversarys_search_is_repeatable():
     assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
     file, out = tmp_path / "r.json", tmp_path / "out"
     options = ["--case", "none", "--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]

@@ -360,6 +360,7 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
     assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
 
 
+@pytest.mark.slow
 def test_reports_say_held_torques_are_not_covered() -> None:
     rows = [dict(verdict.rows(assess(each.loop("I"), SpringDamper([3000.0] * m, [0.3] * m)))).get("held torques")
         for each, m in ((scenario(), 6), (line(), 2))]  # fmt: skip

@@ -8,6 +8,7 @@ from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 SLOW = ("limited, any environment", "energy budget")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GUARANTEES]
 )

@@ -167,6 +167,7 @@ def _one_period(process: Process, engine: Engine, outside: int):
     return np.stack(columns, axis=1)
 
 
+@pytest.mark.slow
 def test_friction_makes_the_engine_first_order():
     """Coulomb friction switches within a step, so the error against RK4 x 32 only halves with the step."""
     loop = assemble(RUBBING, PUBLISHED["I"])
@@ -394,6 +395,7 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
     assert pick(list(choices.values()), 1.0).verdict_correct
 
 
+@pytest.mark.slow
 def test_engines_are_compared_on_the_actual_run():
     scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
     for net in (None, EnergyNet(0.0)):

@@ -64,6 +64,7 @@ def densely(sweep, coupling_force, K, B):
     return max(swept(np.geomspace(1e-6, 1e-5, 10)).max(), swept(fine[near]).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     """Ratios agree to 1e-5: a peak of width 0.01 exceeds points 5e-5 apart by at most (2.5e-5/0.01)^2 = 6e-6 of it.

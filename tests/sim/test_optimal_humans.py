@@ -54,6 +54,7 @@ def test_rigid_and_compliant_scenarios_have_equal_loops():
     assert one == other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_random_and_lossless_hands_are_stable(scenario, lossless):
     """Slow modes of lossless hands are on the unit circle, so rounding may give them a growth above 0."""

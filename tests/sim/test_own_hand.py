@@ -124,6 +124,7 @@ def test_impedances_run_in_uneven_late_ticks():
         assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
 
 
+@pytest.mark.slow
 def test_friction_with_an_impedance_needs_runge_kutta():
     rubbing = held_by(Light(), Light())
     devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
@@ -134,6 +135,7 @@ def test_friction_with_an_impedance_needs_runge_kutta():
     assert rms(coarse, fine) < 1e-4  # RK4 is of first order where a device sticks
 
 
+@pytest.mark.slow
 def test_impedance_populations_agree_in_both_engines():
     found = validate(held_by(Light(), Light()).replace(population=Muscles(Light)), None, humans=10, duration=0.3)
     assert 0 < (found.exact > 0).sum() < 10
@@ -171,6 +173,7 @@ def test_own_hand_populations_agree_in_both_engines():
     assert (found.damping == 0).all()  # the series spring has no damper
 
 
+@pytest.mark.slow
 def test_the_adversary_searches_what_the_population_draws():
     """The search finds more growth than a quarter as many random draws, and reports the true growth of its hands."""
     population = Muscles()
@@ -200,6 +203,7 @@ def test_the_adversary_fails_against_enough_damping():
     assert not worst.destabilises
 
 
+@pytest.mark.slow
 def test_the_adversary_takes_a_population_file(tmp_path):
     file, report = tmp_path / "who.py", tmp_path / "r.json"
     file.write_text(
@@ -323,6 +327,7 @@ def test_a_state_space_is_no_coupling():
         simulate(SCENARIO, PUBLISHED["I"].compliance(SCENARIO.T))
 
 
+@pytest.mark.slow
 def test_engines_agree_on_a_population_at_walls():
     """Both engines' verdicts are those of the worst frozen contact state; traces touch the wall and give no energy."""
     scenario = load("one-wall")

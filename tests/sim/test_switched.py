@@ -160,6 +160,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
     assert min(varying_delay["lost_packets"]) > 0
 
 
+@pytest.mark.slow
 def test_the_adversarial_pattern_shows_growth(tmp_path):
     coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     options = ["--coupling", str(tmp_path / "stiff.json"), "--varying-delay", "1,2", "--pattern", "adversarial"]
@@ -170,6 +171,7 @@ def test_the_adversarial_pattern_shows_growth(tmp_path):
     assert any("not covered" in remark for remark in report["remarks"])
 
 
+@pytest.mark.slow
 def test_a_playout_buffer_is_the_constant_largest_delay(tmp_path):
     report = run(tmp_path, "--varying-delay", "1-2,2-3", "--playout", "--duration", "1", "--engine", "exact")
     assert report["run"]["theta"] == [2, 3]
@@ -243,6 +245,7 @@ def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
     assert code == 0
 
 
+@pytest.mark.slow
 def test_the_population_meets_lost_packets(tmp_path):
     code, part = validated(tmp_path, "--pattern", "bursty", "--loss", "0.1", "--humans", "8")
     assert code == 0

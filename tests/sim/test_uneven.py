@@ -179,6 +179,7 @@ def test_engines_agree_on_hands_at_uneven_ticks(tmp_path):
     assert report["disagreements"] == 0
 
 
+@pytest.mark.slow
 def test_growth_of_uneven_ticks_agrees_with_the_eigenvalues():
     """Fast decays must not hide the slow growth of this loop, with drawn hands or with the scenario's own."""
     springs = (Spring(("a", "m"), 397.7, 0.0), Spring(("b", "m"), 23.85, 0.2625), Spring(("c", "m"), 911.5, 0.2725))
@@ -290,6 +291,7 @@ def test_both_engines_trace_late_forces():
     np.testing.assert_allclose(found.mujoco, found.exact, atol=1e-3)  # MuJoCo steps by RK4 here
 
 
+@pytest.mark.slow
 def test_the_energy_audit_sees_late_forces():
     """With a certified coupling no loop gives energy; without coupling some do, and all of these are unstable."""
     late = PAIR.replace(latency=LATE)

@@ -260,6 +260,7 @@ class EveryThirdLossless:
         return [Human(tuple(replace_fields(link, damping=0.0) for link in hand.links)) for hand in hands]
 
 
+@pytest.mark.slow
 def test_sampled_traces_are_those_of_all_hands():
     """MuJoCo traces lossless hands, those nearest to instability and a random sample; the exact engine, the others."""
     people = SCENARIO.replace(population=EveryThirdLossless())

@@ -424,6 +424,7 @@ def test_the_digest_is_of_contents_not_of_places(tmp_path):
 # ---- a linear model
 
 
+@pytest.mark.slow
 def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     """Each contact is on a spring and a damper; the linear model has their E(z), with the contacts' masses."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody>

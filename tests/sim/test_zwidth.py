@@ -411,6 +411,7 @@ def with_devices(sweep, **changes):
     return replace(sweep, devices=tuple(msgspec.structs.replace(device, **changes) for device in sweep.devices))
 
 
+@pytest.mark.slow
 def test_friction_stops_growing_oscillations():
     free = points(rigid(1), [1500.0, 2500.0], [0.0, 0.2])
     assert free.oscillates.all()
@@ -461,6 +462,7 @@ def audit(tmp_path_factory):
     return code, json.loads((out / "report.json").read_text()), out
 
 
+@pytest.mark.slow
 def test_chai3ds_limit_of_an_omega3_is_not_certified(audit):
     code, report, _ = audit
     (mark,) = report["marks"]
