@@ -89,10 +89,13 @@ class OverRanges:
     def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
         """Evaluate a coupling over the members; members that exert no force have no mismatch."""
         ratios, figures = [], {}
+        # One set of multipliers for delays that switch serves all members, as in a proof.
+        multiplier = THIS_ENVIRONMENT.judge(loop, coupling).multiplier if loop.varying_delay else None
         for member in members:
             here = loop.at(member.network)
             E, F = here.E(), here.F(coupling)
-            ratios.append(this_environment(F, loop).ratio)
+            needs = THIS_ENVIRONMENT.judge(here, coupling, multiplier) if multiplier else this_environment(F, loop)
+            ratios.append(needs.ratio)
             if E.D.any():
                 figures[member.name] = transparency(F, E, loop.lam)
         nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)

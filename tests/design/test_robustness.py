@@ -3,12 +3,15 @@
 import json
 
 import pytest
+from msgspec.structs import replace
 
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.compare import judge
+from haptic_loop.design.coverage import OverRanges
 from haptic_loop.design.robustness import robustness_nearby
 
 K, T, DELTA = 400.0, 1e-3, 1.0
@@ -32,6 +35,16 @@ def test_comparisons_judge_delays_that_switch():
     assert needs.ratio >= 2.5 * K * T / DELTA * (1 - 1e-6)
     needs, *_ = judge(CONSTANT, NoCoupling()).requirements.values()
     assert needs.ratio == pytest.approx(1.5 * K * T / DELTA, rel=1e-6)
+
+
+def test_tables_over_ranges_count_switching():
+    """The vertex of 500 N/m needs 2.5 (500) T of 1 N s/m at the constant 2, and 1.5 (500) T at the constant 1."""
+    ranges = Ranges((UncertainSpring(("tip", "ground"), (K, 500.0)),))
+    for loop, samples, violated in ((CONSTANT, 1.5, 0), (SWITCHING, 2.5, 2)):
+        ranged = replace(loop, ranges=ranges)
+        row = OverRanges.of("spring", ranged, NoCoupling(), ranged.members())
+        assert row.required_over_available.worst >= samples * 500.0 * T / DELTA * (1 - 1e-6)
+        assert row.violated == violated
 
 
 def test_robustness_is_that_of_the_simulated_vertex(tmp_path):
