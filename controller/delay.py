@@ -51,11 +51,13 @@ def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
 
 
 def packet_delays(values: ArrayLike) -> Ticks:
-    """Return a read-only array of delays (ticks, m, nsim), in whole samples or LOST; fractions are cut off.
+    """Return a read-only array of delays (ticks, m, nsim), in samples or LOST.
 
-    Raises ValueError for another number of axes, or for a number below LOST.
+    Raises ValueError for another number of axes, for a fraction, or for a number below LOST.
     """
     delays = np.array(values, dtype=np.int64)
+    if not np.array_equal(delays, values):
+        raise ValueError("delays have fractions, expected whole numbers of samples")
     if delays.ndim != 3:
         raise ValueError(f"delays have the shape {delays.shape}, expected (ticks, channels, simulations)")
     if (delays < LOST).any():
@@ -150,10 +152,9 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             lengths = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
             raise ValueError(f"{lengths}: give one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
-            if not 0 <= lo <= hi <= _LONGEST:
-                raise ValueError(
-                    f"varying_delay on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {_LONGEST} samples"
-                )
+            if not 0 <= lo <= hi <= _LONGEST or lo % 1 or hi % 1:
+                expected = f"expected whole numbers of samples, 0 <= lo <= hi <= {_LONGEST}"
+                raise ValueError(f"varying_delay on channel {i + 1} is {lo} to {hi}, {expected}")
         if not 0 <= self.loss <= 1:
             raise ValueError(f"varying_delay.loss is {self.loss:g}, allowed are probabilities 0 to 1")
         for name in ("calm", "burst"):
@@ -169,7 +170,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if len(row) != len(self.lo):
             raise ValueError(f"varying_delay.recorded, packet {k}: {len(row)} delays for {len(self.lo)} channels")
         for i, n in enumerate(row):
-            if n != LOST and not self.lo[i] <= n <= self.hi[i]:
+            if n != LOST and (n % 1 or not self.lo[i] <= n <= self.hi[i]):
                 allowed = f"{self.lo[i]} to {self.hi[i]} samples, or {LOST} for a lost packet"
                 raise ValueError(f"varying_delay.recorded, packet {k}, channel {i + 1}: delay {n}, allowed {allowed}")
 

@@ -121,10 +121,12 @@ def test_playout_delays_all_packets_to_the_largest():
     [
         ({"lo": (1,), "hi": (2, 2)}, "one each per channel"),
         ({"lo": (3,), "hi": (2,)}, "channel 1 is 3 to 2"),
+        ({"lo": (1.2,), "hi": (2.9,)}, "channel 1 is 1.2 to 2.9, expected whole numbers"),
         ({"lo": (1,), "hi": (2,), "loss": 1.5}, "varying_delay.loss is 1.5"),
         ({"lo": (1,), "hi": (2,), "burst": 0}, "varying_delay.burst is 0"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded"}, "go together"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((3,),)}, "packet 0, channel 1: delay 3"),
+        ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((1.7,),)}, "channel 1: delay 1.7, allowed"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((1, 1),)}, "2 delays for 1 channels"),
     ],
 )
@@ -143,6 +145,8 @@ def test_a_process_refuses_delays_that_do_not_fit():
     G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
     with pytest.raises(ValueError, match="1 channels, expected 2"):
         Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
+    with pytest.raises(ValueError, match="delays have fractions"):
+        Process(Law(G), NO_LIMIT, IDEAL, delays=np.full((5, 2, 1), 1.7))
     buffer = StepBuffer(Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
     buffer.tick(0)
     with pytest.raises(ValueError, match="given for 1 ticks"):
