@@ -79,7 +79,7 @@ def test_pairs_with_latency_need_the_known_damping(range, needs):
 
 @pytest.mark.parametrize("theta", [0, 1])
 @pytest.mark.parametrize("range", [(0.0, 0.4 * T), (0.1 * T, 0.6 * T)])
-def test_a_range_costs_a_wall_its_latest_latency(theta, range):
+def test_a_wall_needs_what_its_latest_latency_needs(theta, range):
     """The needed delta is the larger root of a quadratic equation for the latest latency t2.
 
     The equation is (delta/t2 - (theta + 3/2) K)(delta/(T - t2) - (theta + 1/2) K) = (theta + 1)^2 K^2.
@@ -129,7 +129,7 @@ def test_pair_requirements_match_a_dense_program(coupling, range, needs):
     assert found.required[0] == pytest.approx(needs, rel=2e-6)
     assert by_a_dense_program(loop, coupling, 9) == pytest.approx(needs, rel=5e-4)  # its grid has few frequencies
     apart = least_scale_of(this_environment_demand(loop.F(coupling), PAIR.delta, latency=loop.latency))
-    assert 0.8 < found.ratio / apart < 0.87
+    assert 0.8 < found.ratio / apart < 0.87  # separate weights of both parts of a period need more
     assert (
         found.ratio > required_damping(change(PAIR, latency=((range[1],) * 2,) * 2), coupling, THIS_ENVIRONMENT).ratio
     )
@@ -140,7 +140,7 @@ def least_scale_of(demand):
     return least_scale(demand, frequencies(PAIR.F(SOFT), points=4000)).max()
 
 
-def test_weights_are_admitted_where_every_latency_admits_them():
+def test_weights_are_admitted_if_every_latency_admits_them():
     """`Latency` accepts Q exactly if eigenvalues at many latencies show that it is allowed, also an indefinite Q."""
     rng, agreed = np.random.default_rng(0), np.zeros(2, dtype=int)
     for _ in [None] * 200:
@@ -295,7 +295,7 @@ class OneSampleMore(ThisEnvironment):
         (OneSampleMore(), change(PAIR, theta=(1, 2))),
     ],
 )
-def test_own_conditions_are_proved_like_ours(own, shipped, tmp_path):
+def test_users_conditions_are_proved_like_shipped_conditions(own, shipped, tmp_path):
     found, wanted = (required_damping(*asked) for asked in ((PAIR, SOFT, own), (shipped, SOFT, "this-environment")))
     assert found.required == pytest.approx(wanted.required, rel=1e-8)
     assert found.condition == own.name

@@ -25,7 +25,7 @@ from haptic_loop.design.spring_damper import design
 from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import InputError
 
-LAG = LIMITER.rho(PAIR)
+LAG = LIMITER.rho(PAIR)  # the limiter's rho [N/m], by device
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block
 
 
@@ -34,7 +34,7 @@ def required(coupling, c=None, lag=LAG) -> float:
     return limiter(PAIR.sent(coupling), PAIR.theta, DELTA, lag, c).required[0]
 
 
-def test_the_block_of_one_channel():
+def test_one_channels_block_has_the_known_entries():
     """The block at w = 1 equals figures that were computed by hand; sampled responses give the same."""
     G, z = Lti.constant([[1000.0]], 1.0), on_circle(np.array([1.0]))
     upper = 984.010315 - 411.642518j
@@ -46,7 +46,7 @@ def test_the_block_of_one_channel():
 
 
 def test_the_block_is_a_limited_loops_energy():
-    """The sum of f'dx + dx'D dx - (M f_e)'de over time is the mean of the block's form over the circle.
+    """The sum of f'dx + dx' Delta dx/T - (M f_e)'de over time is the mean of the block's form over the circle.
 
     The motions begin and end at rest in the same place; M = z + sum_j c_j sum_{i<j} (z - z^-i).
     """
@@ -81,7 +81,7 @@ def test_the_block_is_a_limited_loops_energy():
 
 
 @pytest.mark.parametrize("theta", [0, 1, 2, 4])
-def test_closed_forms_of_a_spring(theta):
+def test_limited_springs_meet_their_closed_forms(theta):
     """A spring needs (theta + 1)^2 K T/2 at c = 0 and (theta + 1/2) K T, as without limiter, at c_1 = theta."""
     K = 800.0
     G = Lti.constant([[K]], T)
@@ -100,7 +100,7 @@ def test_the_multiplier_sets_a_delayed_springs_need(c, factor):
     assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
 
 
-def test_the_coupling_designed_with_the_block():
+def test_a_limited_coupling_needs_the_known_damping():
     """BUILT needs 1.30132 N s/m in the linear loop and more with the limiter, depending on the multiplier."""
     assert this_environment(PAIR.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
     for c, expected in (((0, 0), 1.42465), ((0.3, 0.3), 1.34059), ((0.278, 0.632), 1.32327)):
@@ -121,7 +121,7 @@ def test_the_coupling_designed_with_the_block():
     ],
     ids=["none", "published", "any-environment", "this-environment", "built"],
 )
-def test_the_default_loop_with_its_best_multiplier(coupling, expected):
+def test_the_best_multiplier_needs_the_known_damping(coupling, expected):
     found = limiter(PAIR.sent(coupling), PAIR.theta, DELTA, LAG)
     assert found.required[0] == pytest.approx(expected, abs=1e-4)
     assert found.ratio <= found.bound * (1 + 2e-5)
@@ -149,14 +149,14 @@ def test_many_devices_use_the_zero_multiplier(monkeypatch):
     assert required_damping(PAIR, BUILT, LIMITER, best.multiplier).required == pytest.approx(best.required)
 
 
-def test_unequal_weights_need_enough_lag():
-    """F(1) couples the channels, so c = (0.2, 0.4) is infeasible at beta = 1e-4, but feasible at 0.01."""
+def test_unequal_multipliers_need_enough_rho():
+    """F(1) couples the channels: c = (0.2, 0.4) is infeasible at rho = 1e-4 Delta/T, but feasible at 0.01 Delta/T."""
     unequal = ((0.2,), (0.4,))
     assert np.isinf(required(BUILT, unequal, LimitedForces(1e-4).rho(PAIR)))
     assert required(BUILT, unequal) < 1.36
 
 
-def test_bad_requests_are_named():
+def test_bad_multipliers_and_betas_are_refused():
     G = PAIR.sent(BUILT)
     with pytest.raises(ValueError, match="equally many per device"):
         limiter(G, (1, 2), DELTA, LAG, ((0.1,),))
@@ -169,7 +169,7 @@ def test_bad_requests_are_named():
 
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
-def test_the_least_multiple_of_a_singular_gain(rank):
+def test_the_least_multiple_makes_the_block_singular(rank):
     """The least eigenvalue of free + s gain is 0 at the least s, positive just above it and not positive below."""
     rng = np.random.default_rng(rank)
     for _ in range(20):
@@ -209,7 +209,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 
 
 def test_linear_proofs_survive_a_refused_limiter(tmp_path):
-    """STIFF needs 1.385 with the limiter: its linear proof stays, the limiter's is refused and names the figure."""
+    """STIFF needs 1.385 N s/m with the limiter: its linear proof stays, the limiter's is refused with this figure."""
     stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert plain.facts == ()
@@ -259,7 +259,7 @@ def test_a_changed_storage_matrix_proves_nothing(stored):
     assert "limiter: " in str(verify(tampered(stored, matrices={"P": tuple(map(tuple, P))})).reason)
 
 
-def test_any_environment_does_not_cover_delayed_limits():
+def test_any_environment_with_psi_covers_no_limiter():
     loop = msgspec.structs.replace(PAIR, psi=(1, 1))
     some = Certificate(
         "any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, {}, "", {}
@@ -271,7 +271,7 @@ def test_any_environment_does_not_cover_delayed_limits():
 # Designs
 
 
-def test_a_spring_damper_designed_with_the_block():
+def test_limiter_designs_use_all_the_damping():
     """The limited loop needs over 99.9 % of the damping, and the design is over 1.3 dB better than BUILT."""
 
     def rms_db(coupling) -> float:

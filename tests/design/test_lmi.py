@@ -46,7 +46,7 @@ def random_stable(rng, order, m=2):
 
 
 def near_the_boundary(rng, V, theta, delta):
-    """Return V, scaled in up to 60 trials until it needs half to twice the damping `delta`, and not within 1 %."""
+    """Return V, scaled in up to 60 trials until it needs half to twice `delta`, but not within 1 % of `delta`."""
     for _ in range(60):
         ratio = any_environment(V, theta, delta).ratio
         if not np.isfinite(ratio):
@@ -75,13 +75,13 @@ def test_balancing_leaves_the_response_alone(seed):
     np.testing.assert_allclose(found.at(Z), padded.at(Z), atol=1e-8 * np.abs(padded.at(Z)).max())
 
 
-def test_units_preserve_the_loop():
+def test_units_preserve_the_eigenvalues_of_e_v():
     E, V = environment(FIGURE_4, T), SpringDamper([500, 900], [1, 2]).compliance(T)
     scaled = unit_environment(E, (2.0, 0.8)).at(Z) @ unit_coupling(V, (2.0, 0.8)).at(Z)
     np.testing.assert_allclose(np.linalg.eigvals(scaled), np.linalg.eigvals(E.at(Z) @ V.at(Z)), rtol=1e-9)
 
 
-def test_the_realisation_16_and_its_quotient():
+def test_realisation_16_and_its_quotient_are_v_hat():
     V = unit_coupling(SpringDamper([500, 900], [1, 2]).compliance(T), DELTA)
     theta = (1, 3)
     hat = (1 - 1 / Z)[:, None, None] * (V.at(Z) - theta_hat(theta).at(Z))
@@ -114,7 +114,7 @@ def test_lemma_1_agrees_with_the_frequency_response(seed):
         assert (found > 0) == (room > 0)
 
 
-def test_lemma_2_is_lemma_1():
+def test_lemma_2_is_equivalent_to_lemma_1():
     rng = np.random.default_rng(1)
     G = Ports.same(random_stable(rng, 3))
     for _ in range(200):
@@ -130,7 +130,7 @@ def test_lemma_2_is_lemma_1():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_lemma_3_is_the_norm(seed):
+def test_lemma_3_holds_above_the_norm_only(seed):
     G = random_stable(np.random.default_rng(seed), 3)
     norm = np.linalg.norm(G.at(on_circle(frequencies(G, points=3000))), 2, axis=(1, 2)).max()
     for factor in (0.99, 1.01):
@@ -212,7 +212,7 @@ def scalar_any_environment(V, E, theta, psi, delta):
 
 
 @pytest.mark.parametrize("count", [9, pytest.param(30, marks=pytest.mark.validate)])
-def test_environment_delay_agrees_with_lemma_4(count):
+def test_analysis_with_psi_agrees_with_scalar_lemma_4(count):
     rng = np.random.default_rng(3)
     verdicts = []
     for _ in range(count):
@@ -228,7 +228,7 @@ def test_environment_delay_agrees_with_lemma_4(count):
     assert count / 6 < sum(verdicts) < len(verdicts) - count / 6
 
 
-def test_separate_channels_have_the_smallest_margin():
+def test_separate_channels_have_the_smaller_margin():
     network = Network(("a", "b"), (Spring(("a", "ground"), 80.0, 0.1), Spring(("b", "ground"), 120.0, 0.1)))
     E = environment(network, T)
     V = SpringDamper([200, 300], [0.3, 0.4])
@@ -254,7 +254,7 @@ def test_unstable_or_asymmetric_couplings_are_refused_without_inequalities(V, wo
     assert word in found.reason
 
 
-def test_an_active_environment_is_refused_by_name():
+def test_analysis_refuses_an_active_environment():
     active = Lti.constant([[-5.0]], T)
     with pytest.raises(ValueError, match="not passive"):
         analysis(Lti.constant([[1e-3]], T), active, [0], [0], [1.0])

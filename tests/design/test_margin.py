@@ -37,7 +37,7 @@ def test_this_environment_figures(coupling, required):
     assert result.certified == (required < 1.37)
 
 
-def test_any_environment_figures():
+def test_any_environment_needs_the_known_damping():
     assert any_environment_per_channel(PUBLISHED["I"].channels(T), THETA, DELTA).required == pytest.approx(
         (7.63, 7.84), abs=0.005
     )
@@ -49,7 +49,7 @@ def test_any_environment_figures():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_any_environment_is_the_trigonometric_maximum(seed):
+def test_any_environment_needs_the_trigonometric_maximum(seed):
     """The need is max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), n = theta + 1, vt = 1 + .. + z^-theta."""
     rng = np.random.default_rng(seed)
     theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))
@@ -61,7 +61,7 @@ def test_any_environment_is_the_trigonometric_maximum(seed):
 
 
 @pytest.mark.parametrize(("K", "B", "theta", "factor"), [(5000, 0, 0, 0.5), (5000, 30, 0, 0.5), (2000, 0, 1, 1.5)])
-def test_rigid_wall_closed_forms(K, B, theta, factor):
+def test_a_rigid_wall_needs_its_closed_form(K, B, theta, factor):
     """The requirement is Colgate's K T/2 + B without delay, and 3 K T/2 for a spring with one sample of delay."""
     wall = environment(Network(("a",), (Spring(("a", GROUND), float(K), float(B)),)), 1e-3)
     F = force_map(wall, NoCoupling(), [theta], [0])
@@ -114,7 +114,7 @@ def test_unequal_devices_need_a_common_factor():
     assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
 
 
-def test_the_needier_channel_decides():
+def test_the_channel_with_the_largest_ratio_decides():
     """With B = 0 any-environment needs K T (theta + 1)^2/2 per channel: 1.08 of 2 N s/m and 0.96 of 0.9 N s/m."""
     coupling = SpringDamper([1800.0, 400.0], [0.0, 0.0])
     for order in (slice(None), slice(None, None, -1)):
@@ -131,7 +131,7 @@ def test_the_needier_channel_decides():
 
 @pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
 def test_a_free_mass_is_not_refused_by_rounding(mass):
-    """F(1) of a free mass is exactly 0, and the mass needs the same damping as a rigid wall."""
+    """F(1) of a free mass is exactly 0, and from 0.3 kg on it needs the damping of a rigid wall to 0.3 %."""
     free = environment(Network(("a",), masses={"a": mass}), T)
     F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
     assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
@@ -190,7 +190,7 @@ def test_the_regular_part_keeps_the_hermitian_part():
     np.testing.assert_allclose(hermitian(_regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
 
 
-def test_supremum_finds_a_needle():
+def test_supremum_finds_a_narrow_peak():
     """An even grid would miss a peak of width 1e-7. The grid of `frequencies` contains the frequency of the pole."""
     pole = (1 - 1e-7) * np.exp(1j * 1.2345)
     A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])

@@ -16,13 +16,13 @@ T = 1e-3
 
 
 def window(theta, delta, factor=1.0):
-    """Return factor T/(2 delta) (1 + ... + z^-theta), the moving average without a constant."""
+    """Return factor T/(2 delta) (1 + ... + z^-theta), a moving average without the design's constant e."""
     return taps([factor * T / (2 * delta)] * (theta + 1), T)
 
 
 @pytest.mark.parametrize("theta", range(5))
 @pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.5])
-def test_scaled_moving_averages_need_less_damping(theta, factor):
+def test_scaled_moving_averages_need_inversely_scaled_damping(theta, factor):
     """V and the window share their zeros, where no damping is required. The ratio is 1/factor elsewhere."""
     needs = any_environment(window(theta, 1.3, factor), [theta], [1.3])
     assert needs.reason is None
@@ -61,7 +61,7 @@ def test_moving_averages_beat_spring_dampers(name, case):
     assert certify(loop, stiff)["any-environment"].proof == "rational"
 
 
-def test_delay_in_the_environment():
+def test_moving_averages_are_proved_with_psi():
     """With psi = (1, 0) the design is proved under any-environment, and its exact simulation is stable."""
     scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))
     loop = scenario.loop("I")

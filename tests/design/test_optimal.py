@@ -310,8 +310,8 @@ def test_random_loops_get_a_proved_design(seed):
     assert found.figures.rms_mismatch < 1.001
 
 
-def test_ties_prefer_less_error_at_small_forces():
-    """At 0.6 Hz hands that move together should feel under 2 % of the largest force; they feel it to 5 %."""
+def test_designs_keep_small_forces_accurate():
+    """At 0.6 Hz hands that move together should feel under 2 % of the largest force; they feel it with 5 % of error."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)
@@ -326,7 +326,7 @@ def test_ties_prefer_less_error_at_small_forces():
 
 @pytest.mark.parametrize("theta", [0, 1, 16])
 def test_scaled_walls_need_the_closed_form(theta):
-    """g K behind theta samples needs g K (theta + 1/2) T, and a scaled filter scales its need exactly."""
+    """g K behind theta samples needs g K (theta + 1/2) T, and half of a filter needs half of the damping."""
     loop = wall(3000.0, theta, 1.3)
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
@@ -338,7 +338,7 @@ def test_scaled_walls_need_the_closed_form(theta):
 
 @pytest.mark.parametrize("theta", [1, 16])
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
-    """F(1) T/2 <= delta/(theta + 1): it is the mass at z = 1 of a measure of total delta with zero moments 1 .. theta.
+    """F(1) T/2 is the mass at z = 1 of a measure of total delta and zero moments 1 .. theta: at most delta/(theta + 1).
 
     A plain spring reaches delta/(2 theta + 1); a designed filter reaches more, but less than delta/(theta + 1).
     """
@@ -372,7 +372,7 @@ def test_switching_delays_match_a_separate_formula():
 
 
 @pytest.mark.slow
-def test_the_supremum_and_the_cap_are_kept():
+def test_designs_keep_their_objective_and_their_cap():
     loop, short = loop_of("n3"), ((8, 6),)
     rms, sup = best("n3"), design(loop, Options(bases=short, objective="sup"))
     assert sup.figures.relative_mismatch < rms.figures.relative_mismatch
@@ -392,7 +392,7 @@ def test_the_supremum_and_the_cap_are_kept():
         ({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}),
     ],
 )
-def test_demands_are_kept_together(further, asked):
+def test_several_demands_can_be_combined(further, asked):
     """Each demand has separate unknowns in the program, so several demands can be combined."""
     loop = msgspec.structs.replace(loop_of("n3"), **asked)
     found = design(loop, replace(SMALLEST, **further))
@@ -499,7 +499,7 @@ def test_the_rms_bound_bounds_the_supremum(monkeypatch):
     assert "nor than" in found.words
 
 
-def test_requests_that_make_no_sense_are_refused():
+def test_invalid_options_and_walls_are_refused():
     with pytest.raises(ValueError, match="objective is 'max'"):
         Options(objective="max")
     with pytest.raises(ValueError, match=r"high_gain is 0\.5"):
@@ -547,7 +547,7 @@ def test_the_barrier_reaches_a_cone_solvers_optimum():
     assert Program(A, b, c, (block,)).feasible(np.linalg.solve(U, y))
 
 
-def test_entrywise_inequalities_equal_dense_ones():
+def test_entrywise_and_dense_inequalities_are_equal():
     """The form is He[left X right] with two functions in each entry of X, plus an unknown that makes it positive."""
     rng = np.random.default_rng(4)
     k, r = 5, 3
@@ -761,7 +761,7 @@ def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch,
 # the period, the latency and the limiter ------------------------------------------------------------------------------
 
 
-def test_a_longer_period_is_a_smaller_damping():
+def test_a_longer_period_acts_like_smaller_damping():
     """Periods up to T_max act like the damping times T/T_max: a design reaches the same mismatch with either."""
     loop = msgspec.structs.replace(loop_of("n3"), T_max=0.0012)
     found = design(loop, SMALLEST)
@@ -786,7 +786,7 @@ def test_late_walls_match_their_closed_form():
 @pytest.mark.parametrize(
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n2", "n4"))]
 )
-def test_limited_forces_are_part_of_designs(name):
+def test_limiter_designs_satisfy_the_limiters_block(name):
     """With D = Delta/T, He[[Theta G/(z-1) + D, -rho Theta/z], [N G + 2 D, D - rho Theta/z + rho M/z]] > 0 on a grid."""
     loop = loop_of(name)
     found, without = design(loop, replace(SMALLEST, limiter=True)), smallest(name)
@@ -818,7 +818,7 @@ def test_limited_forces_are_not_designed_for_ranges():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, *(pytest.param(n, marks=pytest.mark.validate) for n in (12, 14))])
-def test_every_loop_gets_an_answer_and_proof(seed):
+def test_extreme_loops_get_a_proved_design(seed):
     """The loops are extreme: 15 samples of delay, 54 kg, springs of 0.03 N/m, dampings of 0.04 N s/m."""
     found = design(hostile(np.random.default_rng(seed)), SMALLEST)
     assert found.proved

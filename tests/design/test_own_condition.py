@@ -1,4 +1,4 @@
-"""Tests of a user's own conditions, facts and couplings: only what they state is assumed."""
+"""Tests of conditions, facts and couplings that a user writes: only what they state is assumed."""
 
 import re
 from dataclasses import dataclass
@@ -165,7 +165,7 @@ def test_facts_and_conditions_need_one_method_each():
 
 
 def test_an_own_fact_matches_a_dense_sweep(repeats):
-    """A dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) gives the same s, and no smaller s for other a."""
+    """The ratio s is the least with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid; no other a has less."""
     own = repeats["RepeatedForces"]()
     found = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
@@ -245,7 +245,7 @@ class Mean(Coupling):
         return Compliance(self._V(PAIR.T, self.kept)).form()
 
 
-def test_a_coupling_equals_its_stored_form():
+def test_a_coupling_must_equal_its_stored_form():
     assert isinstance(filed(PAIR, Mean(400.0)), Compliance)
     assert filed(PAIR, SOFT) is SOFT
     certificate = prove(PAIR, Mean(400.0), "this-environment")

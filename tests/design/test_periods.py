@@ -1,4 +1,4 @@
-"""Varying periods: the required damping of each condition, and exact simulations with random periods."""
+"""Tests of varying periods: the required damping of each condition, and exact simulations with random periods."""
 
 import json
 from fractions import Fraction
@@ -50,7 +50,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
     assert uneven.available == LOOP.delta
 
 
-def test_longest_period_scales_switching_and_multipliers():
+def test_the_longest_period_scales_switching_and_multipliers():
     switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
     even, uneven = (required_damping(change(switching, T_max=longest), SOFT, SWITCHING) for longest in (None, LONG))
     # Two searches for the multiplier alpha end at slightly different points.
@@ -67,7 +67,7 @@ def test_longest_period_scales_switching_and_multipliers():
 
 
 def test_the_longest_period_scales_limited_forces():
-    """The controller sets the limiter's rho, so no period changes it. The exact certificate states the requirement."""
+    """The controller sets the limiter's rho, so no period changes it. The certificate states the swept requirement."""
     loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
     longer = change(loop, T_max=LONG)
     even, uneven = (required_damping(one, SOFT, LIMITER, (0.3, 0.3)) for one in (loop, longer))
@@ -130,7 +130,7 @@ ONE, COUPLING = Loop(T, (1,), (0,), (1,), (1.0,), HELD), SpringDamper([1000.0], 
 
 
 def plants(damping, rng):
-    """Return A (hands, 2, 2) and B (hands, 2, 1) of devices in lossless hands: 1 g to 1 kg on springs."""
+    """Return A (hands, 2, 2) and B (hands, 2, 1) of devices in lossless hands: 1 g to 1 kg on 1 to 1000 N/m."""
     mass, spring = (10 ** rng.uniform(*limits, HANDS) for limits in ((-3, 0), (0, 3)))
     A, B = np.zeros((HANDS, 2, 2)), np.zeros((HANDS, 2, 1))
     A[:, 0, 1] = 1

@@ -92,7 +92,7 @@ def test_vertices_are_range_ends_and_absences():
 
 
 def test_an_added_spring_may_be_absent():
-    """The environment has no spring to the ground; a vertex without this spring would repeat it, so both have one."""
+    """The nominal environment lacks the spring, so no vertex repeats its absence, but drawn environments may."""
     ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
     nominal, *vertices = members(FIGURE_4, ranges)
     assert len(nominal.network.springs) == 2
@@ -129,7 +129,7 @@ def chain(links: int) -> tuple[Network, Ranges]:
 
 
 @pytest.mark.parametrize("links", [8, 11, 30])
-def test_any_three_parameters_meet_in_all_ends(links):
+def test_any_three_parameters_take_all_end_combinations(links):
     chosen = members(*chain(links))[1:]
     ends = np.array([[spring.stiffness for spring in member.network.springs] for member in chosen])
     assert len(ends) == 128
@@ -229,7 +229,7 @@ def by_hand(network: Network, coupling, w):
 
 
 def least_room(network: Network, coupling, points: int = 2000) -> float:
-    """Return the least eigenvalue of T/delta He[F/(z-1)] + I at all frequencies: positive if the condition holds."""
+    """Return the least eigenvalue of T/delta He[F/(z-1)] + I on a dense grid: positive if the condition holds."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, points), np.linspace(1e-3, np.pi, points)])
     H = by_hand(network, coupling, w) / (np.exp(1j * w) - 1)[:, None, None]
     return float(np.linalg.eigvalsh(T / 1.37 * (H + np.conj(np.swapaxes(H, 1, 2))) / 2 + np.eye(1)).min())
@@ -241,14 +241,14 @@ def test_vertex_force_maps_match_raw_matrices(robust):
     for member in LOOP.members():
         F = force_map(environment(member.network, T), robust.coupling, THETA, (0,)).at(np.exp(1j * w))
         expected = by_hand(member.network, robust.coupling, w)
-        # Both computations divide by (z - 1)^2, which is 1e-6 at the lowest frequency, and near a resonance.
+        # Both computations lose digits near a resonance and by dividing by (z - 1)^2, 1e-6 at the lowest frequency.
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
 def test_one_filter_holds_at_every_vertex(robust, nominal_only):
     rooms = [least_room(m.network, robust.coupling) for m in LOOP.members()]
     alone = [least_room(m.network, nominal_only.coupling) for m in LOOP.members()]
-    # two thousandths of the damping are the design's own margin
+    # The design leaves two thousandths of the damping unused.
     assert min(rooms) > 0.0015
     assert alone[0] > 0.0015
     assert min(alone) < -0.01
@@ -257,7 +257,7 @@ def test_one_filter_holds_at_every_vertex(robust, nominal_only):
 def test_the_sweep_agrees_with_the_condition_by_hand(robust):
     check = check_ranges(LOOP, robust.coupling, samples=0)
     for member, requirement in zip(check.members, check.at_members, strict=True):
-        # The sweep by hand has no point exactly at the peak near 6 Hz, so its value is a little lower.
+        # The sweep by hand has no point exactly at the peak near 6 Hz, so its ratio is lower, here by 6e-7.
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
 
 
@@ -274,7 +274,7 @@ def test_an_absent_environment_needs_no_damping():
 
 
 @pytest.mark.validate
-def test_ranges_however_wide_have_an_answer():
+def test_wide_ranges_have_a_proved_design():
     ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
     found = optimal.design(change(LOOP, ranges=ranges), SMALLEST)
     assert found.proved
@@ -327,7 +327,7 @@ def test_violating_samples_leave_ranges_unproved(robust):
 
 
 @pytest.mark.slow
-def test_fixed_couplings_may_cover_ranges():
+def test_spring_dampers_may_be_proved_for_ranges():
     soft, stiff = (SpringDamper((K,), (0.52,)) for K in (550.0, 1500.0))
     assert prove(LOOP, soft, "any-environment").guarantee == "any passive environment"
     check = check_ranges(LOOP, stiff, samples=8)
@@ -434,7 +434,7 @@ def test_spring_dampers_for_this_environment_cover_the_ranges(scenario_file, tmp
         (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no ranges"),
     ],
 )
-def test_missing_vertices_are_refused(scenario_file, tmp_path, options, message):
+def test_invalid_vertices_are_refused(scenario_file, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         run_main(["--scenario", str(scenario_file), "--out", str(tmp_path), *options])
 

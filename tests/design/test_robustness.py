@@ -1,4 +1,4 @@
-"""Robustness is that of the loop that runs. A spring k alone needs (theta + 1/2) k T of damping, theta constant."""
+"""Tests that robustness is that of the loop that runs. For a constant theta a spring K needs (theta + 1/2) K T."""
 
 import json
 
@@ -21,7 +21,7 @@ SWITCHING = CONSTANT.switching(DelayRange((1,), (2,)))
 
 
 def test_robustness_counts_delays_that_switch():
-    """Switching within [1, 2] includes the constant 2, for which a spring that is 10 % stiffer needs 2.5 (1.1 k) T."""
+    """Switching within [1, 2] includes the constant 2, for which a spring that is 10 % stiffer needs 2.5 (1.1 K) T."""
     constant, switching = (robustness_nearby(loop, NoCoupling()) for loop in (CONSTANT, SWITCHING))
     assert constant.required_over_available == pytest.approx(1.5 * 1.1 * K * T / DELTA, rel=1e-6)
     assert switching.required_over_available >= 2.5 * 1.1 * K * T / DELTA * (1 - 1e-6)
@@ -30,7 +30,7 @@ def test_robustness_counts_delays_that_switch():
 
 
 def test_comparisons_judge_delays_that_switch():
-    """The constant 2 needs 2.5 k T; a row for the constant 1 alone would show 1.5 k T."""
+    """Switching within [1, 2] needs at least the 2.5 K T of the constant 2; the constant 1 needs 1.5 K T."""
     needs, *_ = judge(SWITCHING, NoCoupling()).requirements.values()
     assert needs.ratio >= 2.5 * K * T / DELTA * (1 - 1e-6)
     needs, *_ = judge(CONSTANT, NoCoupling()).requirements.values()

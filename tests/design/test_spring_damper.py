@@ -99,7 +99,7 @@ def test_a_handful_of_convex_problems_suffices():
 
 
 def stiffest(loop):
-    """Return the gains of largest total stiffness, which is the largest stiffness of each channel."""
+    """Return the gains of largest total stiffness, and so of the largest stiffness in each channel."""
     gains = _GainSet(loop).solve(np.repeat([-1.0, 0.0], loop.channels), "a test")
     return spring_damper._coupling(loop, gains)
 
@@ -113,7 +113,7 @@ def stiffest_at(B, theta, delta, T):
 
 
 @pytest.mark.parametrize(("theta", "K"), list(enumerate([2283.0, 878.86, 551.94, 405.1, 320.8])))
-def test_the_largest_stiffness_by_delay(theta, K):
+def test_each_delay_allows_its_known_stiffness(theta, K):
     found = stiffest(asked((0,), WALL, (theta,), (0,), (1.37,)))
     assert pytest.approx(K * (1 - RESERVE), rel=2e-4) == found.K
     # A root search on the condition gives the same K for this B.
@@ -155,9 +155,9 @@ def test_the_gain_set_is_exact(theta, sigma, most_stored):
 @pytest.mark.parametrize("phi", [0.0, 0.3])
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_the_gain_set_equals_its_block(theta, phi):
-    """k/2 + b - |c|^2, which the search keeps positive, is |W|^2 times the block of any-environment for V = 1/W.
+    """The search keeps k/2 + b - |c|^2 positive, where `rows` gives c. For V = 1/W it is |W|^2 times the block's value.
 
-    With phi > 0 it is |W|^2 times the Schur complement of the row of the multiplier phi.
+    The block is that of any-environment. With phi > 0 its value is the Schur complement of the row of the multiplier.
     """
     loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
@@ -183,7 +183,7 @@ def test_unlike_channels_are_as_stiff_as_alone():
     np.testing.assert_allclose(found.coupling.K, alone, rtol=1e-4)
 
 
-def test_weights_shift_the_optimum():
+def test_designs_minimise_the_norm_with_their_weight():
     """By the norm with a flat weight, the design for this weight is no worse than that for the default low-pass."""
     flat = Lti.constant(np.eye(2), T)
     loop = asked((0, 0))
@@ -213,7 +213,7 @@ def test_zero_multiplier_gives_the_plain_condition():
 
 
 @pytest.mark.parametrize(("case", "rms_db"), [("I", -10.98), ("II", -7.99)])
-def test_this_environment_designs_use_the_objects_damping(case, rms_db):
+def test_this_environment_designs_exceed_any_environments_stiffness(case, rms_db):
     loop = asked(CASES[case])
     found = design(loop, "this-environment")
     assert 20 * np.log10(found.objective) <= rms_db
@@ -224,7 +224,7 @@ def test_this_environment_designs_use_the_objects_damping(case, rms_db):
 
 
 def test_this_environment_designs_stabilise_delayed_environments():
-    """An almost rigid coupling would need more than the damping."""
+    """An almost rigid coupling would need more than the available damping."""
     held = Network(("c",), (Spring(("c", "m"), 800.0, 1.0), Spring(("m", "ground"), 700.0, 1.0)), {"m": 1.0})
     loop = asked((0,), held, (2,), (1,), (2.0,))
     found = design(loop, "this-environment")
@@ -314,7 +314,7 @@ def switching_loop(loop):
 @pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop, switching_loop])
 @pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
 def test_slopes_match_finite_differences(sampled, psi):
-    """Derivatives by hand equal central differences to 1e-8, the one-sided differences of the poles to 3e-7."""
+    """Slopes by hand differ from central differences by 1e-8 at most, one-sided differences of the poles by 3e-7."""
     at = sampled(load().replace(psi=psi).loop("I"))
     x = np.array([6.5, 6.1, 0.3, 0.45, *(-0.7, 0.6)[: at.active.size]])
     x[4:] = np.abs(x[4:]) if sampled is LimiterLoop else x[4:]
@@ -337,8 +337,8 @@ def test_designs_that_take_minutes_are_refused_early():
         spring_damper.design_with(late, "this-environment")
 
 
-def test_many_device_searches_match_exhaustive_starts(monkeypatch):
-    """Above FEW channels the search uses the likeliest start only. Its objective is within 5 % of the usual one."""
+def test_one_start_comes_close_to_all_starts(monkeypatch):
+    """Above FEW channels the search uses the likeliest start only. Its objective is within 5 % of that of all."""
     usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)
     monkeypatch.setattr(gain_search, "FEW", 1)
@@ -348,8 +348,8 @@ def test_many_device_searches_match_exhaustive_starts(monkeypatch):
     assert all(float(f"{gain:.5g}") == gain for gain in (*made.coupling.K, *made.coupling.B))
 
 
-def test_no_limiter_search_follows_a_failed_linear_one() -> None:
-    """Where no coupling is certified for free forces, no search is spent on limited ones."""
+def test_no_limiter_search_follows_a_failed_linear_search() -> None:
+    """Where no coupling is certified for unlimited forces, no search is spent on limited forces."""
     loop, limited = asked((0,), WALL, (1,), (1,), (1e-3,)), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spring_damper, "LimiterLoop", lambda *args: limited.append(args))

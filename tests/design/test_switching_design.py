@@ -68,7 +68,7 @@ def test_no_lossless_human_grows_under_the_worst_switching(made):
     assert growing(assemble(placed[1], coupling)) > 0
 
 
-def test_a_range_that_is_too_wide_says_so():
+def test_designs_refuse_too_wide_ranges_of_delays():
     loop = load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I")
     starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
@@ -83,7 +83,7 @@ def test_a_range_that_is_too_wide_says_so():
         ["--condition", "this-environment", "--varying-delay", "1"],
     ],
 )
-def test_requests_that_make_no_sense_are_refused(options, tmp_path):
+def test_invalid_varying_delays_are_refused(options, tmp_path):
     with pytest.raises(InputError, match="--varying-delay"):
         main([*options, "--out", str(tmp_path / "c.json")])
 
@@ -104,7 +104,7 @@ def test_any_environment_designs_take_varying_delays(tmp_path):
     # measured: -12.85 dB and -13.37 dB; the designed spring-damper has -3.4 dB
     [((4, 3), -12.8), pytest.param((14, 10), -13.3, marks=pytest.mark.validate)],
 )
-def test_an_optimal_coupling_for_switching_delays(basis, most_db):
+def test_optimal_couplings_for_switching_delays_are_proved(basis, most_db):
     """The design is proved and a sweep confirms it; under adversarial switching no lossless hand grows."""
     asked = load().loop("I")
     made = design_with(asked.switching(DelayRange(*RANGE)), bases=(basis,))

@@ -162,7 +162,7 @@ def test_repaired_digests_do_not_forge_a_proof(stored):
     assert "positive number where the delay varies and 0 elsewhere" in narrow
 
 
-def test_a_proof_goes_with_its_range(stored):
+def test_facts_must_match_the_range_of_delays(stored):
     bare = sealed(change(stored.certificate, facts=()))
     assert verify(change(stored, certificate=bare)).reason == "facts are [], expected ['switching']"
     smuggled = sealed(change(stored.certificate, scenario=digest(PAIR, SOFT.form())))
@@ -186,7 +186,7 @@ def test_negative_multipliers_are_refused():
         ({"lo": [1, 1], "high": [2, 2]}, "unknown field `high`"),
     ],
 )
-def test_impossible_ranges_make_no_file(file, tmp_path, fields, message):
+def test_files_with_impossible_ranges_are_refused(file, tmp_path, fields, message):
     text = json.loads((tmp_path / "proof.json").read_text())
     text["loop"]["varying_delay"] = fields
     (tmp_path / "bad.json").write_text(json.dumps(text))
@@ -229,7 +229,7 @@ def test_one_alpha_serves_switching_at_every_vertex(ranged, tmp_path):
 
 
 @pytest.mark.validate
-def test_switching_over_ranges_is_guaranteed_as_ranges(ranged):
+def test_switching_over_ranges_is_guaranteed_for_ranges(ranged):
     found = assess(RANGED, SOFT, certificate=ranged, ranges_samples=0)
     assert found.holds
     assert (found.guarantee.environments, found.guarantee.facts) == ("these ranges", ("switching", "ranges", "limiter"))
@@ -326,7 +326,7 @@ def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     line = "the file covers only constant delays, so delays switching within [1, 2] samples are judged anew here"
     assert line in plain["remarks"]
     assert not plain["varying_delay"]["covered"]
-    # A playout buffer makes the delay (2, 2), which needs 1.70 of 1.37 N s/m: it does not help these gains.
+    # A playout buffer makes the delay (2, 2), for which these gains need 1.70 N s/m, more than the available 1.37.
     assert "the constant [2, 2], which no certificate covers either" in plain["varying_delay"]["covers"]
     lossy = run(file, "--varying-delay", "1,2", "--loss", "0.1")["varying_delay"]
     assert not lossy["covered"]
@@ -343,7 +343,7 @@ def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
 
 
 @pytest.mark.slow
-def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
+def test_validate_and_audit_say_what_files_cover(file, constant_file, tmp_path, capsys):
     quick = ["--humans", "3", "--engine", "exact", "--duration", "0", "--no-plot", "--out", str(tmp_path / "v")]
     _, outcome = told(capsys, validate_main, "--coupling", file, "--varying-delay", "1,2", *quick)
     assert "proved in the coupling's file" in outcome["switching"]["covers"]
@@ -380,7 +380,7 @@ def test_ranges_without_theta_are_refused(tmp_path):
 # scripts and the bridge
 
 
-def test_the_scenarios_range_is_the_loops():
+def test_the_loop_has_the_scenarios_range():
     scenario = scenario_of().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     assert scenario.loop("I") == LOOP
     for steady in (
@@ -423,7 +423,7 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve is found
+    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # has no reserve
     covered = "a force that is held through 1 missed answer is covered by the file's proof"
     assert first.remarks() == [f"{covered} while forces stay below their limits"]
     late = change(LOOP, theta=(2, 2), lam=(2, 2), varying_delay=DelayRange((2, 2), (2, 2)))

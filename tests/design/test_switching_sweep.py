@@ -58,8 +58,8 @@ def test_springs_need_the_damping_of_their_longest_delay(lo, hi):
     """
     K = 800.0
     found = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
-    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # twice _SETTLED
-    assert found.multiplier[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # flat around its optimum
+    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # 2 _SETTLED, where the search ends
+    assert found.multiplier[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # the need is flat in alpha
 
 
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
@@ -87,7 +87,7 @@ def test_the_least_factor_matches_a_convex_solver():
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
     solve(problem)
-    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # a peak 0.5 % from a sample costs the square of that
+    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # a peak 0.5 % from a sample loses some 0.5 % squared
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
@@ -181,7 +181,7 @@ def test_uncertified_switching_has_no_exact_proof():
     assert storage(less)[0] is None
 
 
-def test_a_wall_with_damping():
+def test_a_damped_wall_needs_each_constant_delays_damping():
     """A wall with delays of 0 to 1 samples needs at least the damping of each constant delay."""
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
@@ -197,7 +197,7 @@ def audit(tmp_path, *options):
 
 
 @pytest.mark.slow
-def test_audit_reports_switching_beside_the_constants(tmp_path):
+def test_audit_reports_switching_beside_constant_delays(tmp_path):
     code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--varying-delay", "1,2")
     assert code == 1  # certified for the constant (1, 2), not for switching
     assert report["assessment"]["requirements"]["this-environment"]["certified"]
@@ -208,12 +208,12 @@ def test_audit_reports_switching_beside_the_constants(tmp_path):
     assert report["switching"]["proof"] == "rational"
 
 
-def test_audit_of_a_wall_with_varying_delays(tmp_path):
+def test_audits_of_springs_need_the_closed_form(tmp_path):
     """A spring of 800 N/m at 1 ms with delays of 0 to 1 samples needs KT (hi + 1/2)."""
     options = ["--rigid", "--K", "800", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "1.37"]
     code, report = audit(tmp_path, *options, "--varying-delay", "0,1")
     assert code == 0
-    assert report["switching"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # twice _SETTLED
+    assert report["switching"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # 2 _SETTLED, the search's error
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
     for theta, need in enumerate(needs):
         loop = bare(stiffness, damping, theta)
         found = required_damping(loop, NoCoupling(), "this-environment")
-        assert found.required[0] == pytest.approx(need, rel=5e-5)  # The search stops within this.
+        assert found.required[0] == pytest.approx(need, rel=5e-5)  # the search's gap to its bound
         assert found.bound == pytest.approx(found.ratio, rel=5e-5)
         touching = this_environment(loop.at(loop.environment.frozen()[-1]).F(NoCoupling()), loop.delta)
         assert touching.required[0] <= found.required[0] * (1 + 1e-9)
@@ -95,7 +95,7 @@ def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
         assert found.required[0] == pytest.approx(need, abs=6e-5)
 
 
-def test_without_m_closed_forms_hold():
+def test_without_m_closed_forms_bound_the_requirement():
     """With m = 0 the need is at least (k/2 + b) T at theta = 0, (k/2 + b + k^2/(4 b)) T at 1, and 7.5 N s/m at 2."""
     k, damping = 3000.0, 2.0
     b = damping / T
@@ -139,7 +139,7 @@ def test_vanishing_walls_give_the_plain_condition():
 
 
 def walls_by_hand(loop):
-    """Return stiffness, damping over T, gap and steepest slope of the walls, shape (w,) each."""
+    """Return stiffness k, damping over T b, gap and the largest slope k + 2 b of the walls, shape (w,) each."""
     walls = loop.environment.walls
     stiff, gap = (np.array([getattr(w, name) for w in walls]) for name in ("stiffness", "gap"))
     b = np.array([w.damping for w in walls]) / loop.T
@@ -197,7 +197,7 @@ def steps_of(damped):
     S1 = G.dc()
     S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
     m_ = np.array(need.multiplier).reshape(4, -1)[3]
-    return delta, G, block.floats(), P.floats() / 2, S, m_  # KYP is twice the balance of Z.
+    return delta, G, block.floats(), P.floats() / 2, S, m_  # P proves twice the balance of Z.
 
 
 class Walled:
@@ -231,7 +231,7 @@ class Walled:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True], ids=["springs", "dampers"])
-def test_every_step_of_the_proof(damped):
+def test_the_balance_of_z_holds_at_ticks(damped):
     """On random motions of the running law the balance of Z holds at every tick, and Z >= min(0, its first value)."""
     rng, loop = np.random.default_rng(0), DAMPED if damped else PAIR
     delta, _, block, P, S, m_ = steps_of(damped)
@@ -290,7 +290,7 @@ def test_longer_periods_scale_wall_requirements():
     )
 
 
-def test_uncovered_wall_loops_are_named():
+def test_uncovered_wall_couplings_are_refused():
     loop = held(3000.0)
     with pytest.raises(NotProved, match="cannot include the walls"):
         prove(loop, _InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
@@ -302,7 +302,7 @@ def test_uncovered_wall_loops_are_named():
 
 
 def test_couplings_may_be_stiffer_than_any_environment_allows():
-    """At a wall of 3000 N/m without a damper 1300 N/m is proved, which any-environment refuses by over a fifth."""
+    """At a wall of 3000 N/m a coupling of 1300 N/m is proved, and any-environment needs over 1.2 of the damping."""
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, gap=0.005),)))
     coupling = SpringDamper([1300.0], [0.45])
     assert any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).ratio > 1.2

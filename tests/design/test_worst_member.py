@@ -72,7 +72,7 @@ def point_of(member: Member) -> np.ndarray:
 # the regions
 
 
-def test_every_set_of_contacts_has_a_region():
+def test_every_set_of_present_springs_has_a_region():
     ranges = Ranges(
         (
             UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
