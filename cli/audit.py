@@ -271,9 +271,11 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 def _tables(result: Audit) -> list[render.Table]:
     from rich.table import Table
 
-    assessment, needs = result.assessment, result.assessment.requirements
+    assessment, needs = result.assessment, result.constant
     gains = assessment.gains
     title = f" K {listed(gains['K'])} N/m, B {listed(gains['B'])} N s/m" if "K" in gains else ""
+    title += ", in the nominal environment" if assessment.ranges else ""
+    title += ", for constant delays" if result.switching else ""
     table = Table("", *result.margins, title=f"{assessment.coupling.kind}{title}", title_justify="left")
     for name, cell in _ROWS.items():
         table.add_row(name, *(cell(needs[condition], part) for condition, part in result.margins.items()))
@@ -288,7 +290,7 @@ def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:
-        if result.assessment.requirements[condition].certified:  # The audited K is certified itself.
+        if result.constant[condition].certified:  # The audited K is certified itself.
             return f"The stiffest wall with {damper} was not found: {margin.reason}."
         return f"No wall with {damper} was found to be certified: {margin.reason}."
     return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."
@@ -322,9 +324,8 @@ _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
 def _remarks(report: _Report) -> Iterator[str]:
     audited = report.audit
     yield from (f"{note}." for note in report.notes)
-    requirements = audited.assessment.requirements
     for condition, part in audited.margins.items():
-        needs = requirements[condition]
+        needs = audited.constant[condition]
         sensitivity = part.sensitivity.reason if needs.certified else None
         reasons = {
             "": needs.reason,
@@ -332,7 +333,7 @@ def _remarks(report: _Report) -> Iterator[str]:
             ", sensitivity": sensitivity,
         }
         yield from (f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason)
-    if not audited.assessment.holds:
+    if not (audited.assessment.holds or audited.switching):
         yield from _proposed(audited.helps)
     if audited.switching:
         yield from _switching_remarks(audited.switching)

@@ -376,8 +376,9 @@ class Audit:
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
+    constant: dict[str, Requirement] = off_table("left out")  # requirements there
     switching: SwitchingFigures | None
-    helps: list[Help]
+    helps: list[Help]  # empty for delays that switch, for which no change is searched
     not_covered: str = CAVEATS
     left_over: LeftOver | None = off_table("if given", None)  # the damping of Theorem A for known devices
 
@@ -418,11 +419,13 @@ def audit(
         from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start without it.
 
         switching = SwitchingFigures.of(loop, coupling, needs["switching"])
+        needs = {name: each.judge(constant, coupling) for name, each in conditions.items()}
     return Audit(
         assessment,
         {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
+        {name: needs[name] for name in conditions},
         switching,
-        _helps(constant, coupling, conditions[fails]),
+        [] if switching else _helps(constant, coupling, conditions[fails]),
         left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )
 

@@ -15,7 +15,7 @@ from haptic_loop.cli.audit import main
 from haptic_loop.cli.execute import execute
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import budgets, certificate, coupling_file
@@ -497,3 +497,19 @@ def test_long_computations_are_refused_or_ended(monkeypatch):
     }
     monkeypatch.setattr(budgets, "SWEEPS", 1e-5)
     assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason
+
+
+def test_tables_of_switching_delays_are_for_constants(run):
+    """A wall K needs K T/2 without delay; switching within [0, 1] needs 3/2 K T, which the verdict says."""
+    loop, coupling = wall(1000.0, 0.0)
+    audited = audit(loop.switching(DelayRange((0,), (1,))), coupling)
+    for condition in CONDITIONS:
+        assert audited.constant[condition].ratio == pytest.approx(1000.0 * 1e-3 / 2 / 1.37, rel=1e-6)
+        assert audited.margins[condition].stiffest.K[0] == pytest.approx(2 * 1.37 / 1e-3, rel=1e-6)
+    assert not audited.assessment.holds
+    assert audited.helps == []
+    options = ("--rigid", "--K", "1000", "--B", "0", "--T", "1e-3", "--theta", "0", "--varying-delay", "0,1")
+    code, out, _ = run(*options)
+    assert code == 1
+    assert "for constant delays" in out
+    assert "What helps" not in out
