@@ -66,7 +66,7 @@ def watched(emulator):
 @pytest.mark.slow
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, made, deaf):
-    """The other board rests, which must not hide the force that the deaf one keeps."""
+    """A deaf board ignores messages and keeps its force; the other one rests, which must not hide this force."""
     faults = [(), ()]
     faults[deaf] = ("stuck@0.1",)
     stop = (0.4, lambda session, now: session.stop("asked to", now))

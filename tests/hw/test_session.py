@@ -39,7 +39,7 @@ from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 @pytest.mark.slow
 def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
-    """The host cannot remove the force of a deaf device, but it says so, and the session has not finished."""
+    """The host cannot remove the force of a device that ignores it, but says so, and the session has not finished."""
     planned = _rehearse_case(
         Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop"), lasts=1.3), scenario, rungs
     )[0]

@@ -153,7 +153,7 @@ def in_the_ball_world(name, *faults):
 
 
 @pytest.mark.slow
-def test_motors_in_worlds_are_tested_at_last():
+def test_sessions_in_worlds_finish_within_their_account():
     """The devices give at most W0 and what was released; their motion and the applied forces show this."""
     session, given = in_the_ball_world("world-space")  # two devices of three axes
     assert session.stage == Stage.FINISHED, session.cause

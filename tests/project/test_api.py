@@ -185,7 +185,7 @@ def test_designs_are_certified_and_act_as_couplings():
     requirements = certify(loop, found)
     assert requirements["any-environment"].certified
     assert requirements["any-environment"].proof == "rational"
-    assert requirements["any-environment"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # (1 - 1e-4) of 1.37
+    assert requirements["any-environment"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # 0.9999 of 1.37
     assert certify(loop, found.coupling)["this-environment"].required == requirements["this-environment"].required
     assert (validate(load(), found, humans=10, engine="exact", duration=0).exact < 0).all()
 

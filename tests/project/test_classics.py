@@ -44,7 +44,10 @@ def test_the_passivity_controller_returns_what_its_observer_misses(delta):
 
 
 def test_the_passivity_controller_is_the_published_one():
-    """For a wanted force f the controller sends f + alpha v, with W += f v + alpha_- v_-^2, alpha = max(0, -W/v^2)."""
+    """For a wanted force f at the speed v the controller sends f + alpha v, with alpha = max(0, -W/v^2).
+
+    W is the sum of f v + alpha_- v_-^2 over the ticks; alpha_- and v_- are those of the tick before.
+    """
     rng, control = np.random.default_rng(17), PassivityControl(1, T)
     W = alpha = before = acted = 0.0
     for _ in range(500):

@@ -56,7 +56,7 @@ def test_the_search_assumes_longest_periods_and_latest_forces():
 
 @pytest.mark.slow
 def test_the_condition_is_tight_with_long_delays():
-    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping a hand destabilises."""
+    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping hands destabilise it."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
     print([(row.short, row.worst.growth) for row in rows])
@@ -152,7 +152,7 @@ def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
 
 
 def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
-    """The search attacks the uncoupled loop instead and so contradicts the certificate; the command must fail."""
+    """Here the search attacks the uncoupled loop, which contradicts the coupling's certificate: the exit code is 1."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(
         adversary, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)

@@ -76,7 +76,7 @@ def simulation():
 
 
 def longer(matrix):
-    """Compute exp(matrix) in extended precision: a series of exp(matrix / 2^40) - 1, squared 40 times as exp."""
+    """Compute exp(matrix) in extended precision: by a series of exp(matrix / 2^40) - 1 and 40 squarings."""
     part = matrix.astype(np.longdouble) / np.longdouble(2) ** 40
     term, less_one = np.eye(len(matrix), dtype=np.longdouble), 0
     for k in range(1, 12):
@@ -354,7 +354,7 @@ def test_gaps_between_runs_bound_the_finest_error():
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
     assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
-    assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding errors need not contract
+    assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # gaps that are rounding errors need not shrink
     assert _missed([0.0, 0.0, 0.0]) == 0
     # Measured on two uncoupled omegas with 0.02 N of friction for 6 s; `apart` is the error against 512 substeps.
     gaps = [1.05, 0.167, 0.0794, 0.0849, 0.0183, 0.0117]

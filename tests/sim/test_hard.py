@@ -109,14 +109,14 @@ def test_certified_loops_may_keep_clipping_with_lossless_hands():
 
 
 def test_encoder_steps_move_traces_less_than_a_step():
-    """With encoder steps, motions stay within a step of the ideal encoder's, and idle devices within a step of 0."""
+    """With encoder steps, motions stay within a step of those with ideal ones, and idle devices within a step of 0."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (run(assemble(s, PUBLISHED["I"]), "exact") for s in (scenario, coarse))
     distance = np.abs(ideal.s[:, :2] - stepped.s[:, :2]).max()
     print(f"encoder steps of 1e-5 m: at most {distance:.1e} m from the ideal encoder")
     assert 0 < distance < 1e-5
-    # rounding is discontinuous: a difference of 1e-9 m between engines can become one step, not more
+    # Rounding is discontinuous: a difference of 1e-9 m between engines can become one step, not more.
     assert np.abs(run(assemble(coarse, PUBLISHED["I"])).s[:, :2] - stepped.s[:, :2]).max() < 1e-5
     alone = assemble(coarse, PUBLISHED["I"])
     free = run(alone, "exact", partial(outside_forces, coarse, alone.scene, voluntary=False)).s[-1000:]

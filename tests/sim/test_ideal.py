@@ -46,7 +46,7 @@ def test_the_ideal_force_follows_the_measured_motion(case, late):
     record = record_of(simulation, 2.0)
     alike = force_error(simulation, record, SCENARIO.loop(case).lam)
     expected = by_hand(SCENARIO.T, record.x, late)
-    # rounding errors of 1700 ticks of a lightly damped mass add up
+    # The rounding errors of 1700 ticks of a lightly damped mass add up.
     np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
     asked = record.f
     np.testing.assert_allclose(alike.asked, asked, atol=1e-12)  # nothing is clipped here

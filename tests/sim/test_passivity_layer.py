@@ -37,7 +37,7 @@ def given(simulation, trace):
 
 
 def test_budgets_are_idle_with_damping_to_spare():
-    """A budget uses 95 % of the damping, so any-environment must need at most as much on every channel."""
+    """A budget is idle if any-environment needs at most 95 % of each damping, and neither clipping nor a cap exists."""
     clipped, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
     unlimited = replace(clipped, process=clipped.process.unlimited)
 
@@ -90,7 +90,7 @@ def test_budgets_act_where_walls_store_energy():
 
 
 def test_a_budget_acts_on_clipped_forces():
-    """Clipped at 0.3 and 0.1 N, a certified coupling gives 2 mJ per slow closed path, so the budget must limit it."""
+    """Clipped at 0.3 and 0.1 N, a certified coupling gives 1.3 mJ on this closed path, so the budget must limit it."""
     loop, most = SHORT.loop("I"), np.array([[0.3], [0.1]])
     G, budget = loop.sent(SpringDamper([600.0, 400.0], [0.5, 0.5])), EnergyBudget(loop.delta, loop.T, Packets((1, 2)))
     corners = 1e-3 * np.array([[0, 0], [-10, -10], [-13, -10], [-3, 0], [0, 0]])

@@ -1,4 +1,4 @@
-"""Growth rates equal the expected figures; a trace that cannot give one gives a reason."""
+"""Growth rates equal independent ones; a trace that cannot give a rate gives a reason."""
 
 import json
 from dataclasses import replace
@@ -103,7 +103,7 @@ def test_short_traces_do_not_contradict_eigenvalues():
 
 
 def test_free_hands_settle_by_their_speed():
-    """Without a spring the position keeps an offset, a mode of growth 0; the speed decays with the next mode."""
+    """Without a spring the position keeps an offset, a mode of growth 0; the measured growth is the next mode's."""
     hand, damper = Human((Link(0.3, 3.0, 0.0),)), Network(("a",), (Spring(("a", GROUND), 0.0, 0.5),))
     scenario = load("one-wall").replace(environment=damper, human=(hand,), tap=None)
     simulation = assemble(scenario, NoCoupling())

@@ -271,7 +271,7 @@ def test_both_engines_see_hands_grow_alike():
 
 
 def held_alike(*links):
-    """Return humans of whom each holds both devices with the same mass, damping and stiffness."""
+    """Return sets of two equal hands, one set for each (mass, damping, stiffness) of `links`."""
     return Crowd(np.array([[[link]] * 2 for link in links]))
 
 

@@ -65,7 +65,7 @@ def test_both_engines_move_from_latch_to_latch(ticks):
     assert abs(run(simulation, "mujoco").s - exact.s).max() < 1e-11 * scale
     rk4 = [run(simulation, make_engine(simulation, "mujoco", "RK4", n)).s for n in (8, 16)]
     assert abs(rk4[1] - exact.s).max() < 2e-7 * scale
-    assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # RK4 is of fourth order
+    assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # fourth order gives 16
 
 
 def test_block_sizes_do_not_change_runs():
@@ -202,7 +202,7 @@ def test_slow_rates_have_no_verdict():
 
 
 def test_slow_creep_is_undecided():
-    """A hand and a spring of 0.011 N/m in all creep against 4.37 N s/m; the mass changes this rate by 0.03 %."""
+    """A hand and a spring, 0.011 N/m together, creep against 4.37 N s/m; the mass changes their rate by 0.03 %."""
     human, spring = Human((Link(0.3, 3.0, 0.01),)), Network(("a",), (Spring(("a", GROUND), 1e-3),))
     changes = {"device": (RigidDevice(damping=1.37),), "human": (human,), "tap": None, "environment": spring}
     scenario = load("one-wall").replace(T=0.02, theta=(1,), period=Periods(0.018, 0.02), duration=1.0, **changes)
@@ -303,7 +303,7 @@ def test_the_energy_audit_sees_late_forces():
 
 
 def test_the_energy_audit_agrees_with_ranges_of_latency():
-    """A spring of 1000 N/m one sample late needs 2.3173 N s/m for latencies up to 0.4 T; no hand gains with 2.32."""
+    """A spring of 1000 N/m a sample late needs 2.3173 N s/m for latencies to 0.4 T; with 2.32 no hand gains energy."""
     spring, device = Network(("tip",), (Spring(("tip", GROUND), 1000.0),)), RigidDevice(mass=0.1, damping=2.32)
     fields = {"theta": (1,), "psi": (0,), "device": (device,), "human": PAIR.human[:1], "environment": spring}
     late = PAIR.replace(T=1.2e-3, latency=((0.0, 0.48e-3),), tap=None, **fields)

@@ -120,9 +120,9 @@ def press(running, *names):
 
 
 def test_the_session_is_the_simulation(none):
-    """Frames at any times show the run up to one rounding error per tick, which the unstable mode amplifies by up to 7.
+    """Frames at any times show the run up to one rounding error per tick.
 
-    A block of ticks sums in another order than single ticks.
+    A block of ticks sums in another order than single ticks, and the unstable mode amplifies rounding up to sevenfold.
     """
     running = session(none)
     for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
@@ -151,7 +151,7 @@ def test_rest_is_where_a_held_position_leads(published):
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
-    # Forces of 10 N are differences of numbers about 1e4 times larger, which rounding changes by about 1e-11 N.
+    # The forces are 4 N; rounding in z and F(1) changed them by 5e-13 N when measured.
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
 
@@ -458,7 +458,7 @@ def test_the_drawn_springs_carry_the_forces(psi, K, B):
 
 
 def test_the_drawn_tip_feels_the_walls_force():
-    """A wall at 5 mm with 3000 N/m and 2 N s/m pushes by max(0, K h + B (h - h_-)/T), one tick late."""
+    """A wall at 5 mm with K = 3000 N/m, B = 2 N s/m pushes by max(0, K h + B (h - h_-)/T) at depth h, one tick late."""
     scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
     h = np.maximum(q[:, 0] - 0.005, 0.0)
     force = np.maximum(3000 * h + 2 * np.diff(h, prepend=0.0) / scenario.T, 0.0) * (h > 0)

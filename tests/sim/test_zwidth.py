@@ -111,7 +111,7 @@ def test_maps_of_the_widest_plane_match_sweeps(scenario):
     ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
 )
 def test_maps_at_walls_match_single_sweeps(theta, least):
-    """K = 2000, B = 2 at a wall of 3000 N/m, 2 N s/m needs `least` [N s/m]; permanent contact needs less if delayed."""
+    """K = 2000 N/m, B = 2 N s/m at a wall of 3000 N/m, 2 N s/m needs `least`; delayed permanent contact needs less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
     K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
@@ -472,7 +472,7 @@ def test_chai3ds_limit_of_an_omega3_is_not_certified(audit):
         assert not mark[condition]["certified"]
         assert mark["stiffest_K_at_this_B"][condition] == pytest.approx(2740, rel=1e-5)
     assert mark["unstable_humans"] > 30
-    # Random humans allow a little more than all passive humans do.
+    # Random humans allow a little more stiffness than all passive humans do.
     assert 2740 < mark["stiffest_K_at_this_B"]["population"] < 3200
 
 
