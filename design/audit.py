@@ -376,9 +376,9 @@ class Audit:
 
     assessment: Assessment
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
-    constant: dict[str, Requirement] = off_table("left out")  # requirements there
     switching: SwitchingFigures | None
     helps: list[Help]  # empty for delays that switch, for which no change is searched
+    constant: dict[str, Requirement] = off_table("left out")  # requirements for which `margins` are
     not_covered: str = CAVEATS
     left_over: LeftOver | None = off_table("if given", None)  # the damping of Theorem A for known devices
 
@@ -423,9 +423,9 @@ def audit(
     return Audit(
         assessment,
         {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
-        {name: needs[name] for name in conditions},
         switching,
         [] if switching else _helps(constant, coupling, conditions[fails]),
+        {name: needs[name] for name in conditions},
         left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )
 
