@@ -241,7 +241,7 @@ def test_the_teensys_forces_are_those_of_python(teensy):
     start = next(k for k in range(first, 500) if not pins[k + 1].any() and not pins[k].any()) - 1
     x = 10e-6 * (np.array(counts) - counts[3])
     candidates = []
-    for begin in range(start - 2, start + 3):  # the board does not report the coupling's first tick
+    for begin in range(start - 2, start + 3):  # the board does not report the coupling's first tick: try five
         f = _sequential(block.system, x[begin:] - x[begin], block.limiter)
         gain = np.minimum(np.cumsum(np.full(len(f), 1.2e-3 / np.float32(0.25))), 1.0)[:, None]
         steps = np.round(np.clip(-gain * f, -8, 8) / 12 * 4095).astype(int)

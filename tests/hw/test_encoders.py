@@ -348,7 +348,7 @@ def test_short_live_sessions_find_what_became_wrong(scenario, rungs, fault):
 
 
 @pytest.mark.parametrize("at", [0.05, 0.3])
-def test_a_stop_before_the_end_test_finishes_nothing(scenario, rungs, at):
+def test_sessions_stopped_at_zero_gain_do_not_finish(scenario, rungs, at):
     """At 0.05 s the encoders are tested and the gain is still 0; at 0.3 s it has risen."""
     session, _ = session_with(scenario, rungs, stop=at, seconds=1.5)
     assert (session.stage == Stage.FINISHED) == (at == 0.3), session.cause
@@ -448,7 +448,7 @@ def test_coarse_counts_hide_a_calm_tremor(count, dead):
 
 
 @pytest.mark.parametrize("cap", [0.3, 0.4])
-def test_free_coarse_handles_at_small_caps_finish(scenario, rungs, cap):
+def test_sessions_of_coarse_free_handles_finish(scenario, rungs, cap):
     """After its test an axis shows no motion in counts of 0.1 mm, although the force has changed by the cap."""
     free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
     session = Session(free, SafetyLimits((cap, cap)), LinkSettings(measure=60, held=False))
@@ -479,7 +479,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
-def test_the_impulse_decides(axis, sign, newton, after):
+def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
     """An impulse of 0.1 N s since the last motion raises SafetyStop: 1 N in 100 ms, 5 N in 20 ms, but 0.95 N never."""
     monitor, applied = EncoderMonitor(SafetyLimits((12.0, 12.0)), T, UNITS, (1, 1)), [0, 0]
     monitor.check((0, 0), applied, 1)
@@ -538,7 +538,7 @@ def test_friction_hides_twice_its_force(friction, stops):
             monitor.check((round(x / 1e-5),), (round(force / STEP),), 1)
 
 
-def test_a_motion_of_two_counts_begins_anew():
+def test_two_counts_of_motion_restart_the_impulse():
     monitor = monitor_of(1e-6)
     for k in range(2000):
         monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N on and off, two counts every 18 ms

@@ -217,7 +217,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "write", "holds"), [(40, 50, True), (500, 500, False)])
-def test_a_force_that_takes_too_long_is_refused(scenario, read, write, holds):
+def test_sessions_with_too_late_forces_are_refused(scenario, read, write, holds):
     session, *_ = held_session(scenario, StandIn(scenario, read, write), seconds=0.05)
     if holds:
         assert session.stage == Stage.FINISHED

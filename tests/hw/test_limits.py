@@ -388,7 +388,7 @@ def test_device_reports_are_checked_on_all_channels(channel, sign):
 
 
 @pytest.mark.parametrize(("T", "watchdog"), [(3e-4, 6000), (1.2e-3, 6000), (3e-3, 15_000), (4e-3, 20_000)])
-def test_the_watchdog_suits_busy_hosts(T, watchdog):
+def test_the_watchdog_lasts_five_ticks_or_6_ms(T, watchdog):
     assert watchdog_for(T) == watchdog
 
 

@@ -363,7 +363,7 @@ def test_a_refusal_is_the_first_line(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
+def test_a_pulled_cable_ends_the_session(scenario, rungs):
     emulator = EmulatorProcess("--fault=unplug@0.05", f"--pace={PACE}")
     session, _ = run(emulator, scenario, lambda ages: rungs)
     assert session.stage in (Stage.LOST, Stage.STOPPED)

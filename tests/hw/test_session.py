@@ -106,7 +106,7 @@ def test_there_are_enough_faults():
     assert len({case.name for case in CASES}) == len(CASES)
 
 
-def test_harmless_faults_leave_forces_alone(scenario, rungs):
+def test_duplicated_frames_change_no_force(scenario, rungs):
     """A frame that comes twice, on either side, changes no force."""
     plain = rehearsal_of(scenario, rungs)
     twice = rehearsal_of(scenario, rungs, "duplicate=0.5@0.3")
@@ -257,7 +257,7 @@ def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
     ("ages", "expected"),
     [([130] * 100, 1), ([1150] * 100, 2), ([130] * 995 + [9000] * 5, 1), ([130] * 900 + [2000] * 100, 2)],
 )
-def test_theta_is_a_guarded_quantile(ages, expected):
+def test_the_link_delay_is_a_guarded_quantile(ages, expected):
     assert Ages(tuple(ages)).link_delay(1200.0, 0.99, 100.0) == expected
 
 

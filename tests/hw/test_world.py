@@ -85,7 +85,7 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
+def test_steps_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
     """Without repetitions, the steps that do not settle are those with a force at the cap."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
@@ -175,7 +175,7 @@ def test_the_host_delays_forces_beyond_the_link():
     assert world.later((9, 100), 1) == (9, 50)
 
 
-def test_ticks_without_an_answer_are_counted():
+def test_ticks_without_answers_count_in_the_energy():
     """The device holds its force in every third tick, which the energy of the shell counts like the others."""
     coupling, unit, T = SpringDamper([800.0, 800.0], [0.4, 0.4]), np.array([4e-4, 4e-4]), 1e-3
     scenario = load("world-ball").replace(T=T)

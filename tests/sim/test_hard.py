@@ -21,7 +21,7 @@ from tests.checks.hard import cases, devices, measure, nominal
 
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
-def test_a_setting_fails_and_the_rule_holds(hard):
+def test_default_substeps_hold_where_another_setting_fails(hard):
     """tests/checks/hard.py defines when a setting holds; with `default_substeps` growth errs by at most 1e-2 1/s."""
     row = measure(hard)
     assert row.holds, row

@@ -246,7 +246,7 @@ def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_population_meets_lost_packets(tmp_path):
+def test_validations_with_lost_packets_are_not_covered(tmp_path):
     code, part = validated(tmp_path, "--pattern", "bursty", "--loss", "0.1", "--humans", "8")
     assert code == 0
     assert not part["covered"]

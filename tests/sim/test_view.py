@@ -767,7 +767,7 @@ def test_live_worlds_feel_as_in_a_run(ball):
     trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")
     frame = running.frame(0.5)
     np.testing.assert_allclose(frame.history, trace.f, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(frame.q[:2], trace.x[-1], rtol=0, atol=1e-4)  # one tick later
+    np.testing.assert_allclose(frame.q[:2], trace.x[-1], rtol=0, atol=1e-4)  # [m] the frame is a tick later
     assert frame.world.ticks == 500
     assert frame.world.given_J == pytest.approx(trace.meta["world"]["given_J"], abs=1e-12)
 

@@ -277,8 +277,8 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
     assert "encoder steps" in simulate(coarse, certified(coarse), engine="exact").meta["guarantee"]
 
 
-def test_ticks_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
-    """If no step may be repeated, the counted ticks are those on which a force is at its limit."""
+def test_steps_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
+    """If no step may be repeated, the counted steps are the ticks on which a force is at its limit."""
     monkeypatch.setattr(world_of, "_MOST_REPETITIONS", 0)
     scenario(tmp_path, TRAY, more=UP)
     text = (tmp_path / "loop.toml").read_text().replace("12.0", "0.5").replace("[1, 2]", "[0, 0]")
