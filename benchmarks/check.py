@@ -2,7 +2,8 @@
 
 YOURS.py defines functions named like columns of figures.csv, such as `reference_this_environment(loop)`. `loop` is a
 TOML file as a dictionary; the result is a number, or None if the tool has no answer. Without YOURS.py the two reference
-functions below are compared. They need only NumPy, sweep frequencies, and share no code with the program of the table.
+functions below are compared. They need only NumPy, sweep frequencies, and share no code with the program that writes
+the table.
 """
 
 import csv

@@ -1,8 +1,8 @@
 """Compare classic passivity layers (PO/PC, energy bounding) with our couplings, in half a minute.
 
-Columns: the rms error of the applied force; the force's rms above 40 Hz and its peak; the share of ticks in which the
-layer changed a force. The last two are about 100 pairs of lossless hands that start at 0.1 m/s: how many exceed this
-speed in the tenth second, and the largest speed in that second.
+Columns: the rms error of the applied force, relative to the ideal one; the force's rms above 40 Hz and its peak; the
+share of ticks in which the layer changed a force. The last two are about 100 pairs of lossless hands that start at
+0.1 m/s: how many exceed this speed in the tenth second, and the largest speed in that second.
 """
 
 from dataclasses import dataclass
@@ -91,7 +91,7 @@ class _Layer:
 
 @dataclass(frozen=True)
 class Classic:
-    """The settings from which `netted` makes a passivity layer."""
+    """The settings from which `netted` makes a passivity layer; with `credited` its law counts the devices' damping."""
 
     kind: type
     credited: bool = True

@@ -14,7 +14,7 @@ FLOOR = -60.0  # [dB] shown in place of lower errors, such as those of loops tha
 
 
 def scaled(factor: float) -> Scenario:
-    """Return the scenario with a multiple of the damping."""
+    """Return the base scenario with `factor` times the damping."""
     return BASE.replace(delta=[factor * d for d in BASE.delta])
 
 

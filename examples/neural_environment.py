@@ -19,7 +19,7 @@ class Network:
     def __init__(self, seed: int = 3) -> None:
         rng = np.random.default_rng(seed)
         self.inward, self.outward = rng.normal(size=(NEURONS, 2)), rng.normal(size=(2, NEURONS))
-        self.weights = 1.5 * rng.normal(size=(NEURONS, NEURONS)) / np.sqrt(NEURONS)  # above 1: never at rest
+        self.weights = 1.5 * rng.normal(size=(NEURONS, NEURONS)) / np.sqrt(NEURONS)  # a factor above 1 prevents rest
         self.activity = np.zeros(NEURONS)
 
     def __call__(self, u: np.ndarray) -> np.ndarray:

@@ -5,10 +5,10 @@
     environment= function        the scene, a separate simulation, behind a certified coupling and an energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. Its motion grows if hand and device
-receive, beyond what the device's damping dissipates, more energy than the 2 mJ of the shell and, with
-environment.world, what gravity and springs of the scene released. The hand shakes if, in the last fifth of the run, a
-force changes by more than a tenth of the limit in a tick.
+A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. The motion of a pair of hands grows if
+hands and devices receive, beyond what the devices' damping dissipates, more energy than the 2 mJ of the shell and,
+with environment.world, what gravity and springs of the scene released. The pair shakes if, in the last fifth of the
+run, a force changes by more than a tenth of the limit in a tick.
 """
 
 import sys
@@ -51,9 +51,9 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], a share of ticks, how many pairs of hands move more and more, and how many shake.
+    """Return the peak force [N], a share of ticks, and how many pairs of hands grow and shake.
 
-    The share counts ticks in which a contact force was clipped, or the shell reduced a force.
+    The share is that of ticks in which a contact force was clipped, or the shell reduced a force.
     """
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
@@ -105,7 +105,7 @@ def scenes(folder):
 
 
 def rows(hands=20, seconds=1.0):
-    """Yield (way, scene, peak force, share of limited ticks, hands that grow, hands that shake)."""
+    """Yield (way, scene, peak force [N], share of limited ticks, pairs that grow, pairs that shake)."""
     with TemporaryDirectory() as folder:
         for scene, scenario in scenes(folder).items():
             coupling = design_coupling(scenario.loop("I"), "moving-average").coupling

@@ -16,7 +16,7 @@ import numpy as np
 from haptic_loop import Scenario, SpringDamper, certify, design_coupling, load
 
 BASE = load(Path(__file__).with_name("wheel.toml"))
-RIGID = SpringDamper([1e6], [0.0])  # so stiff that it acts as no coupling
+RIGID = SpringDamper([1e6], [0.0])  # so stiff that the loop is nearly that without a coupling
 
 
 def theta_of(hertz: float) -> int:

@@ -15,7 +15,7 @@ SECONDS = 2.0
 
 
 def _wall(delay: float | None) -> float:
-    """Return the damping [N s/m] that 1000 N/m need at a rigid wall with this delay [s]; None: one whole sample."""
+    """Return the damping [N s/m] that a wall of 1000 N/m needs with this delay [s]; None is a delay of one sample."""
     theta, latency = ((1,), None) if delay is None else ((0,), ((delay, delay),))
     wall = Loop(1.2e-3, theta, (0,), theta, (MINE["damping"],), RIGID_WALL, latency=latency)
     return certify(wall, SpringDamper([1000.0], [0.0]))["this-environment"].required[0]

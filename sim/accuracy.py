@@ -1,7 +1,7 @@
 """Accuracy of runs: errors of engines and of felt forces, and the choice of an integrator and its substeps.
 
 `measure` returns the cost and the errors of one setting (engine, integrator, substeps). `compare_engines` runs several
-settings on a scene, and `pick` chooses the cheapest one within a given error. `settle` supplies the defaults.
+settings on a scene, and `pick` chooses the cheapest one within a given error. `settle` supplies defaults of settings.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def position_error(
     figures, because growth multiplies any difference. Then `reason` has the error up to the first clipped tick.
     """
     if exact is None:
-        return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
+        return PositionError(reason="the loop has Coulomb friction, which the exact engine does not model")
     limits, m = (simulation.process.force_limit, simulation.process.balls), simulation.process.channels
     n = min(trace.t.size, exact.t.size)
     clipped = exact.clipped(*limits)[:n] | trace.clipped(*limits)[:n]
@@ -504,7 +504,7 @@ def _positions(
     substeps: int | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> tuple[Array, float]:
-    """Return the positions (N, m) of a run from rest, and its CPU time [s]."""
+    """Return the devices' positions (N, m) [m] in a run from rest, and the run's CPU time [s]."""
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.process_time()
     trace = run(simulation, stepped, ticks=ticks, progress=progress)

@@ -7,8 +7,8 @@ the matrix exponential would decide the verdict.
 All conditions but the known-device ones assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact
 it dissipates the integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f,
 |dx|^2 / T is (sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore
-requires too much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). With damping inside this
-gap no search has found an unstable human; with less damping most searches find one.
+requires too much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). If the damping lacks no
+more than this, no search has found an unstable human; if it lacks more, most searches find one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; roundin
 
 
 class _Pass(NamedTuple):
-    """One search. Slow modes of a lossless hand barely decay, and would hide faster modes that are about to grow."""
+    """Settings of a search. Slow modes of lossless hands barely decay, and would hide faster ones that nearly grow."""
 
     links: int  # number of links of each arm; one mass with a spring presents every reactance at one frequency
     min_frequency_hz: float  # modes below it are ignored
@@ -73,7 +73,7 @@ def search(
     first: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """Search for the lossless humans with the largest growth; with `first`, stop at the first ones that destabilise.
+    """Search for the lossless humans with the largest growth; with `first`, stop once humans destabilise the loop.
 
     `progress` is called after every generation.
     """

@@ -132,10 +132,10 @@ def simulate(
         seed: Seed of varying delays, periods and latencies.
         environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
             [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes the
-            function passive up to the energy `energy_budget`. The loop is safe behind a coupling that is certified for
-            any environment, with psi = 0.
+            function passive up to the energy `energy_budget`. If the coupling is certified for any environment, and psi
+            is 0, no passive hand makes the loop unstable.
         energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the shell's (default 0, in a scene START_J).
-            Otherwise it is the energy budget of the devices; None is no budget.
+            Otherwise it is the energy budget of the devices; None means none.
         limiter: False to clip forces. By default a limiter limits them, if the coupling's guarantee covers a limiter
             (`meta["assessment"]["force_limits"]`).
 

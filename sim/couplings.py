@@ -145,7 +145,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 def from_file(
     stored: Stored, loop: Loop, kind: str = "given", own: Condition | None = None, coupling: Coupling | None = None
 ) -> Chosen:
-    """Return the stored coupling with the proofs of its file, and notes on differences between both loops.
+    """Return the stored coupling with the proofs of its file, and notes on how the file's loop differs from `loop`.
 
     Args:
         stored: The content of the file.
@@ -167,7 +167,7 @@ def from_file(
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "varying_delay", "lam")  # The code below compares theta; lam affects no proof.
+    delays = ("theta", "varying_delay", "lam")  # The code below compares theta and varying_delay; lam affects no proof.
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = claim is not None and not reason
     switching = stored.loop.varying_delay if proved and not differ else None
@@ -265,7 +265,7 @@ class EncoderSteps:
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls or known devices, where nothing is proved
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, worlds or known devices: nothing is proved
     covered: bool
     words: str
 
@@ -281,8 +281,8 @@ class EncoderSteps:
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` names what certifies the
-        loop.
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` is the name of the
+        condition that certifies the loop.
         """
         if not any(steps):
             return None

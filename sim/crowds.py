@@ -283,7 +283,7 @@ def _group(
     )
 
 
-#: (positions in a group of the simulated sets, integrator, timing) -> the other engine
+#: (positions of the simulated sets in their group, integrator, timing) -> the other engine
 _Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
 
 

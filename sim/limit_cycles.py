@@ -137,7 +137,7 @@ class HeldDevices:
 
 
 def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
-    """Return the indices of motors and handles in a plant state; a rigid device has one."""
+    """Return the indices of motors and handles in a plant state; a rigid device has one index."""
     return tuple(dict.fromkeys((*range(scene.channels), *scene.handles)))
 
 

@@ -132,7 +132,7 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
         or any(wall.gap < 0 for wall in scenario.environment.walls)  # A wall that is pressed at rest stores energy.
     ):
         return None
-    # The budget counts the devices' damping alone. Only any-environment, which uses nothing else, bounds its energy.
+    # Like the budget, any-environment counts the devices' damping alone. So only it shows that the budget never acts.
     needs = requirements[ANY_ENVIRONMENT.name]
     if not needs.ratio <= 1 - EPS:
         return None

@@ -42,7 +42,7 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take 2 CPU s, of 2000 8 s
-_MOST_CHANNELS = 32  # a run of 32 channels without a coupling takes 12 s of CPU time
+_MOST_CHANNELS = 32  # sim.run with 32 channels and no coupling takes 6 s of CPU time
 _LONGEST_NAME = 200  # characters; tables and pictures have no room for more
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]

@@ -438,8 +438,9 @@ class Balance:
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
         """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None.
 
-        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. For longer
-        parts this bound would be below that of a certificate for a range of latencies (Q in design.facts.Latency).
+        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. With the
+        longest possible parts, this bound would be below that of a certificate for a range of latencies (Q in
+        design.facts.Latency).
         """
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
@@ -476,7 +477,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Return forces [N] of 10 ms or one tick, (ticks, outside): `size` on channel 1, -size/2 on 2, size/3 on 3, .."""
+    """Return forces (ticks, outside) [N] for 10 ms or a longer tick: `size` on channel 1, -size/2 on 2, and so on."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):

@@ -150,8 +150,8 @@ class Trace(ReadOnly):
         """Draw displacements and forces over time.
 
         Args:
-            path: The file of the picture, ending in .png, .pdf or .svg, or None to write none. A .pdf or .svg is as
-                wide as the page of a two-column paper.
+            path: The file of the picture, ending in .png, .pdf or .svg, or None to write none. A .pdf or .svg is at
+                most as wide as the page of a two-column paper.
             title: The title; default: the name of the scenario with the verdict.
 
         Returns:
@@ -183,7 +183,7 @@ class Trace(ReadOnly):
     def save_npz(self, path: Path) -> Path:
         """Write the measured arrays and the metadata (as JSON text), without pickle.
 
-        Compression would take fifty times as long, and make the file only a tenth smaller.
+        Compression would take more than ten times as long, and make the file only a tenth smaller.
         """
 
         def content(file: BinaryIO) -> None:

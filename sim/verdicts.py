@@ -224,7 +224,7 @@ _Met = TypeVar("_Met")  # delays or ticks
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """The number of humans with whom the loop grows while delays or ticks vary; with certificates it must be 0."""
+    """The number of humans with whom the loop grows while delays or ticks vary; it must be 0 if `covered`."""
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # by certificates

@@ -119,7 +119,7 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """For each condition, a multiplier (m,) for all couplings or None, and why the loop is not covered or None."""
+        """For each condition: the multiplier (m,) for all couplings, or None; why the loop is not covered, or None."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
@@ -137,7 +137,10 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), inf if refused or no damping is enough; walls make and break."""
+        """Return required over available damping (n,), for walls that make and break contact.
+
+        The ratio is inf if the condition is refused or if no damping is enough.
+        """
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -173,7 +176,8 @@ class CouplingSweep(_Sweep):
 class EnvironmentSweep(_Sweep):
     """A sweep over K and B of every spring at a contact, for a fixed coupling.
 
-    An optimal coupling is a fixed Q and a model of the environment. In another environment there are two cases:
+    An optimal coupling is a fixed filter R, and its model is that of the cell's environment E: F = Theta R Psi E. A
+    coupling of kind internal-model is a fixed Q and a model of the environment. It is judged in two cases:
 
         this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
@@ -490,7 +494,7 @@ _HALVINGS = 20  # bisections, which give an edge of the population with a relati
 
 @dataclass(frozen=True)
 class Mark:
-    """One point, and the largest safe stiffness at the same B: None if none is safe, inf if the stiffest tried is."""
+    """One point, and the largest safe K at the same B: None if no tried K is safe, inf if the largest tried K is."""
 
     K: float
     B: float

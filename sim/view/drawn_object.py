@@ -1,7 +1,7 @@
 """The virtual object in pictures: its masses, springs and walls, and the positions of its nodes at each tick.
 
-The displacements of the nodes are computed in addition to the loop and do not affect it. The
-equations of a tick, before the delays Theta, give them as further outputs beside the forces.
+The displacements of the nodes are computed in addition to the loop and do not affect it. The equations of a tick,
+before the delays Theta, give them as further outputs beside the forces.
 """
 
 from __future__ import annotations
