@@ -78,7 +78,7 @@ def armed(**changes) -> Rig:
 # ---- before it runs --------------------------------------------------------------------------------------------------
 
 
-def test_an_unconfigured_device_only_answers_info():
+def test_unconfigured_devices_answer_hello_and_config_only():
     rig = Rig(config=None)
     assert [rig.tick() for _ in range(5)] == [[]] * 5
     rig.say(Hello())
@@ -215,7 +215,7 @@ def test_with_theta_zero_a_force_is_latched_once():
         assert rig.device.applied == (3 * k, -3 * k)
 
 
-def test_theta_zero_late_answers_are_held_through():
+def test_with_theta_zero_late_answers_hold_the_force():
     rig = Rig(CONFIG._replace(theta=0, hold=2, ramp=2))
     rig.answer(command=Command.ARM)
     rig.tick()
@@ -235,7 +235,7 @@ def test_theta_zero_late_answers_are_held_through():
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
-def test_theta_zero_idle_ramps_at_once():
+def test_with_theta_zero_idle_ramps_at_once():
     rig = Rig(CONFIG._replace(theta=0, ramp=2))
     rig.answer(command=Command.ARM)
     rig.tick()
@@ -363,7 +363,7 @@ def test_a_stop_before_arming_needs_no_ramp():
 
 
 @pytest.mark.parametrize(("press", "cause"), [("device", Cause.ESTOP_DEVICE), ("host", Cause.ESTOP_HOST)])
-def test_emergency_stops_are_zero_at_once(press, cause):
+def test_emergency_stops_zero_forces_at_once(press, cause):
     rig = armed()
     rig.answer((4000, 0))
     rig.tick()

@@ -544,7 +544,7 @@ def test_two_counts_of_motion_restart_the_impulse():
         monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N on and off, two counts every 18 ms
 
 
-def test_no_still_hold_is_stopped():
+def test_no_session_stops_for_a_still_hold():
     """This test draws 300 hands that hold still; tests/benchmarks/still_holds.py draws 10,000."""
     still_holds = run_path(str(Path(__file__).parent.parent / "benchmarks/still_holds.py"))["still_holds"]
     assert still_holds(300, seed=1)[0] == 0

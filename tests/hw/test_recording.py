@@ -271,7 +271,7 @@ springs = [{ between = ["left", "right"], stiffness = 800.0, damping = 1.0 },
 
 
 @pytest.mark.slow
-def test_sessions_limit_vectors(tmp_path):
+def test_sessions_limit_force_vectors(tmp_path):
     """The proof's limiter acts on force vectors, channels keep their names, and a replay computes the same forces."""
     scenario = parse(PLANAR)
     settings = LinkSettings(measure=60, test_encoders=False)

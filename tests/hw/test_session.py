@@ -89,7 +89,7 @@ def test_every_fault_ends_where_it_must(case, scenario, rungs):
     assert _rehearse_case(case, scenario, rungs)[1].wrong == ()
 
 
-def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
+def test_a_cable_pulled_after_the_end_changes_nothing(scenario, rungs):
     rehearsal = rehearsal_of(scenario, rungs, "motor=-1", "unplug@0.5")
     rehearsal.run_until_armed(0.6)
     assert rehearsal.run(1e-6 * rehearsal.armed_us + 0.6).stage == Stage.STOPPED
@@ -101,7 +101,7 @@ def test_devices_with_free_handles_are_armed(scenario, rungs):
     assert session.stage == Stage.ARMED, session.cause
 
 
-def test_there_are_enough_faults():
+def test_at_least_30_distinct_faults_are_checked():
     assert len(CASES) >= 30
     assert len({case.name for case in CASES}) == len(CASES)
 
@@ -206,7 +206,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     """Both devices over the whole link move as in sim's exact engine with ideal encoders and forces.
 
     Positions agree to one encoder step: rounding is half a step, and rounded forces add less than the other half.
-    Forces agree to K times an encoder step, B times an encoder step per tick, and one force step.
+    Forces agree to the sum of K times an encoder step, B times an encoder step per tick, and one force step.
     """
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
@@ -467,7 +467,7 @@ def test_the_bridges_budget_is_idle_with_certified_couplings(scenario, rungs, tm
 
 
 @pytest.mark.slow
-def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path):
+def test_the_bridges_budget_limits_an_active_controller(scenario, rungs, monkeypatch, tmp_path):
     """The budget limits an active controller over a lossy line, and the replay repeats this bit by bit."""
     for module in ("control", "recording"):
         monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))

@@ -68,7 +68,7 @@ SHORTER = {
     "your_own_device": ("SECONDS = 2.0", "SECONDS = 0.5"),
 }
 
-#: arguments of the examples that are run with some
+#: command-line arguments of two examples
 ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
 

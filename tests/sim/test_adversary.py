@@ -151,7 +151,7 @@ def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
     assert stability["spectral_radius"] == pytest.approx(adversary["spectral_radius"], abs=1e-12)
 
 
-def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
+def test_validation_fails_if_an_adversary_contradicts_a_certificate(tmp_path, monkeypatch):
     """Here the search attacks the uncoupled loop, which contradicts the coupling's certificate: the exit code is 1."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(

@@ -61,7 +61,7 @@ def test_errors_shrink_at_the_order_of_the_integrator(simulation, exact, integra
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
 
 
-def test_the_default_is_exact_to_1e_8(simulation):
+def test_the_default_engine_is_exact_to_1e_8(simulation):
     """Without the tap the relative position error was 2e-14, or 9e-11 with RK4 x 4, when measured."""
     quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8

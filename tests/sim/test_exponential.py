@@ -219,7 +219,7 @@ def test_a_batch_is_a_loop_over_single_engines(simulation):
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_each_simulation_equals_its_own_scene(substeps):
+def test_batched_simulations_equal_those_of_their_scenes(substeps):
     """Each simulation of a batch equals that of its own compiled scene, and that of the exact batch."""
     crowd = hands(5)
     held_by = variants(SCENARIO.device, crowd)
@@ -252,7 +252,7 @@ def test_many_sampled_plants_are_as_exact_as_one():
 # ---- the default integrator and number of substeps
 
 
-def test_the_default_follows_from_the_scene(simulation):
+def test_default_integrator_and_substeps_follow_from_the_scene(simulation):
     rubbing = assemble(RUBBING, PUBLISHED["I"])
     assert (default_integrator(simulation.scene), default_substeps(simulation, EXPONENTIAL)) == (EXPONENTIAL, 1)
     assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
@@ -276,7 +276,7 @@ def test_substeps_are_the_fewest_within_the_limits(mode, rate):
     assert [_PlantSpeed(mode, rate).within(1 / n) for n in range(4, 20)] == [n in fits for n in range(4, 20)]
 
 
-def test_engines_default_to_their_integrator(simulation):
+def test_engines_default_to_the_scenes_integrator_and_substeps(simulation):
     rubbing = assemble(RUBBING, PUBLISHED["I"])
     for loop, integrator, substeps in ((simulation, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
         named = knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 100).s
@@ -300,7 +300,7 @@ def test_refusals_name_the_wrong_setting(simulation, call, message):
         call(simulation)
 
 
-def test_light_handles_need_no_substeps():
+def test_light_handles_need_one_exponential_step():
     """A 1 g handle in an undamped hand needs at least 24 Runge-Kutta steps, but one exponential step."""
     device = CompliantDevice(handle_mass=1e-3)
     human = Human((Link(0.0, 0.0, 300.0),))
@@ -443,7 +443,7 @@ def test_exponentials_match_extended_precision_for_many_sizes():
         np.testing.assert_array_less(np.abs(expm(matrices) - exact).max(axis=(1, 2)), 50 * allowed)
 
 
-def test_an_undamped_oscillator_turns():
+def test_an_undamped_oscillators_exponential_is_a_rotation():
     """exp([[0, w], [-w, 0]]) is a rotation by w, also for an angle w of many turns."""
     w = np.geomspace(1e-3, 1e3, 13)
     turned = expm_each(w[:, None, None] * np.array([[0.0, 1.0], [-1.0, 0.0]]))

@@ -70,7 +70,7 @@ def quiet(loop):
 
 
 def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
-    """Return the share of 60 far starts and the number of `near` starts whose forces clip after 48 s, and a frequency.
+    """Return the share of 60 far starts and the number of `near` starts with clipping after 48 s, and a frequency.
 
     Far starts are random within 0.5 m and 10 m/s; near starts are within a fifth of this. The frequency [Hz] is that of
     the strongest motion.

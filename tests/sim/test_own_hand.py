@@ -106,7 +106,7 @@ def test_a_vanishing_tissue_mass_changes_nothing():
     assert off[0] / off[1] == pytest.approx(2.0, abs=0.1)
 
 
-def test_impedances_are_exact_or_of_second_order():
+def test_with_impedances_only_the_exponential_integrator_is_exact():
     """With hands as state spaces the exponential integrator is exact up to rounding, and RK4 is of second order."""
     simulation = assemble(held_by(Light(), MuscleBySpace()), PUBLISHED["I"])
     exact = run(simulation, "exact")

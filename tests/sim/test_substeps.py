@@ -56,7 +56,7 @@ def test_the_exact_engines_map_is_the_plant(simulation):
 
 # `discrete` has more state than position and velocity, so a map of these two does not describe it.
 @pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {"discrete"}))
-def test_the_map_is_what_a_run_does(simulation, integrator):
+def test_one_period_maps_repeat_a_run(simulation, integrator):
     """The map takes each recorded state and its forces to the next recorded state."""
     record = run(simulation, make_engine(simulation, "mujoco", integrator, 4), ticks=300)
     held = _measured_hold(simulation, "mujoco", integrator, 4)

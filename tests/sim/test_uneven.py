@@ -111,7 +111,7 @@ def test_late_loops_match_their_map():
     assert float(dominant_mode(close(simulation.plant, F)).growth) == pytest.approx(growth, abs=1e-9)
 
 
-def test_draws_lie_in_range_and_are_seeded():
+def test_drawn_tick_times_are_in_range_and_seeded():
     scenario = PAIR.replace(period=DRAWN, latency=LATE)
     one, same, other = (scenario.timing(seed, 4000) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.period, same.period)

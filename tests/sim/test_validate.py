@@ -251,7 +251,7 @@ def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
 
 
 class EveryThirdLossless:
-    """The packaged population; one set of hands in three has no dampers."""
+    """The packaged population; on average, one set of hands in three has no dampers."""
 
     def draw(self, rng, channels):
         hands = SCENARIO.population.draw(rng, channels)
@@ -262,7 +262,7 @@ class EveryThirdLossless:
 
 @pytest.mark.slow
 def test_sampled_traces_are_those_of_all_hands():
-    """MuJoCo traces lossless hands, those nearest to instability and a random sample; the exact engine, the others."""
+    """MuJoCo traces lossless hands, those nearest to instability and random ones; the exact engine traces the rest."""
     people = SCENARIO.replace(population=EveryThirdLossless())
     question = Validation(people, PUBLISHED["I"], 3, 200, 1, "both", 0.3)
     some, every = validate(question), validate(replace(question, all_traces=True))

@@ -168,7 +168,7 @@ def test_contacts_have_the_axes_of_their_devices(tmp_path):
         np.testing.assert_allclose(force[n:], 0.0, atol=1e-9)
 
 
-def test_full_levels_dissipate_by_their_matrices():
+def test_matrix_levels_dissipate_as_computed_by_hand():
     """The energy given is -f'dx - dx' Delta dx/T = -(1 - 2 + 6) mJ - 7.6 mJ, worked out by hand."""
     damping = [[1.5, 0.4, 0.1], [0.4, 0.9, -0.2], [0.1, -0.2, 1.2]]
     loop = load("world-space").replace(device=[{"kind": "rigid", "axes": 3, "damping": damping}] * 2)
