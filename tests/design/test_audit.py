@@ -74,7 +74,7 @@ def strict(text: str) -> dict:
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
-    """Without delay a wall needs K T/2 + B. With one sample a spring needs 3 K T/2, and 2 K T for any environment."""
+    """Without delay a wall needs K T/2 + B. One sample late a spring needs 3 K T/2, and 2 K T for any environment."""
     subject = wall(K, B, theta)
     assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
     assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)

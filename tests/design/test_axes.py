@@ -187,7 +187,7 @@ def window(weights: list[float]) -> np.ndarray:
 
 
 def of_devices(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return a number per device and frequency times Delta_i^-1, (k, 4, 4)."""
+    """Return blockdiag(first Delta_1^-1, second Delta_2^-1), (k, 4, 4), for numbers (k,) at the frequencies of Z."""
     out = np.zeros((Z.size, 4, 4))
     for own, values, level in zip(LOOP.devices, (first, second), LEVELS, strict=True):
         out[:, own, own] = values[:, None, None] * np.linalg.inv(level)
@@ -470,7 +470,7 @@ def test_known_devices_permit_stiffer_moving_averages() -> None:
     assert np.linalg.eigvalsh(softer - stiffer).min() > 0
 
 
-def test_principal_axes_are_orthogonal_and_below_levels() -> None:
+def test_rational_principal_axes_bound_levels_from_below() -> None:
     rng = np.random.default_rng(5)
     for n in (2, 3, 3, 3):
         A = np.round(rng.normal(size=(n, n)), 4)
@@ -504,7 +504,7 @@ def test_full_level_designs_at_walls_are_proved(known: bool, condition: str) -> 
     assert prove(loop, design.coupling, condition).proof == "rational"
 
 
-def test_full_levels_with_ranges_have_spring_dampers_only() -> None:
+def test_full_levels_with_ranges_refuse_optimal_couplings() -> None:
     springs = Spring(("a.x", "ground"), 300.0, 0.5), Spring(("a.y", "ground"), 100.0, 0.5)
     network = Network(("a.x", "a.y"), springs, points={"a": ("a.x", "a.y")})
     ranges = Ranges((UncertainSpring(("a.x", "ground"), stiffness=(200.0, 400.0)),))
@@ -579,7 +579,7 @@ def test_axes_of_a_device_share_one_limit() -> None:
 
 
 def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> np.ndarray:
-    """Return the largest energy of each of `count` lossless hands, relative to its energy at the start, (count,).
+    """Return the largest energy of each of `count` lossless hands in the limited LOOP, over its first energy, (count,).
 
     M x'' + share Delta x' + K x = -f with full random M and K is sampled with held forces by the matrix exponential.
     """

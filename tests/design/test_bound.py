@@ -85,7 +85,7 @@ def test_the_charged_matrix_is_nowhere_negative(name):
     assert found.proved
     assert charge > 0
     assert least + charge > -0.02 * charge
-    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # at most twice what D needs, plus 0.3 % of the value
+    assert charge < 2 * max(-least, 0) + 3e-3 * value / m  # at most twice the need, plus 0.3 % of value/m
 
 
 @pytest.mark.validate

@@ -553,7 +553,7 @@ def test_certificates_of_one_environment_list_no_ranges():
 
 
 def of_own_spring(stiffness: float) -> Loop:
-    """Return a loop around a spring of a class without fields: all such classes have the same name."""
+    """Return a loop around a spring whose class has no fields. Each call defines another class of the same name."""
 
     class Own(Environment):
         contacts = ("tip",)
@@ -567,7 +567,7 @@ def of_own_spring(stiffness: float) -> Loop:
 def test_own_environments_have_their_own_certificates():
     """A spring k alone needs (theta + 1/2) k T: 0.75 N s/m for 500 N/m, 7.5 for 5000, so one proof covers one of them.
 
-    A certificate that this process has made is not proved again.
+    `proves` does not verify a certificate that this process has made, so only the digest tells the two loops apart.
     """
     soft, stiff, same = (of_own_spring(k) for k in (500.0, 5000.0, 500.0))
     certificate = prove(soft, NoCoupling(), THIS_ENVIRONMENT)

@@ -82,8 +82,8 @@ def test_theorem_1_telescopes():
 def test_devices_and_hands_keep_the_sampled_energy_balance():
     """In the default scenario the stored energy rises by no more than the ports supply less the sampled dissipation.
 
-    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, where the forces w move the handles by dh; w = 0 gives
-    (a) of docs/theory.md.
+    E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx. External forces w act on the handles, whose steps are
+    dh; w = 0 gives (a) of docs/theory.md.
     """
     rng = np.random.default_rng(1)
     simulation = assemble(load(), PUBLISHED["I"])

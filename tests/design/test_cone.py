@@ -134,7 +134,7 @@ def test_a_failure_carries_problem_and_attempts(monkeypatch):
 
 
 def bounds(*of):
-    """Return the problem of the least x for which every f(x) >= 0."""
+    """Return the problem of the least x with f(x) >= 0 for every function f of `of`."""
     return ConeProgram(np.array([1.0]), [Inequality.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
 
 

@@ -49,7 +49,7 @@ def test_singular_values_and_impedances_match_the_formulas():
     for k, (E, F, theta) in enumerate(by_hand(HZ)):
         np.testing.assert_allclose(sigma_E[k], np.linalg.svd(E)[1], rtol=ROUNDING)
         np.testing.assert_allclose(lines.sigma_F[k], np.linalg.svd(F)[1], rtol=ROUNDING)
-        sizes = np.linalg.svd(F - theta @ E)[1]  # the smaller one is known to the rounding of the larger
+        sizes = np.linalg.svd(F - theta @ E)[1]  # the smaller one has the rounding of the larger one
         np.testing.assert_allclose(lines.sigma_M[k], sizes, rtol=ROUNDING, atol=1e-13 * sizes[0])
         for part, G in ((lines.perceived, F), (undelayed, E)):
             size = np.abs(G).max()

@@ -295,7 +295,7 @@ def test_a_spring_with_latency_needs_the_closed_form(first, last, longest):
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
 def test_a_limited_spring_needs_the_computed_damping(theta, c):
-    """The damping d adds [1, 1; 1, 1] d/T to the block, so nothing on (1, -1): a Schur complement gives the limit."""
+    """The damping d adds [1, 1; 1, 1] d/T to the block, and 0 on inputs (1, -1): a Schur complement gives the limit."""
     K, rho = 1000.0, 20.0
 
     def needed(w):
@@ -390,7 +390,7 @@ def test_delay_ranges_are_proved_by_their_block():
     asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
     assert limits[1] > 1.01 * limits[0]
-    assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2 needs no more than theta = 1
+    assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2 needs no more than a constant delay 1
     assert_loop_limit(asked, NoCoupling(), "this-environment", limits[1])
 
 

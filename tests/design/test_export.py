@@ -364,7 +364,7 @@ def test_an_export_is_repeatable_byte_for_byte(place):
 
 
 def test_a_file_names_the_loop_that_is_certified(tmp_path, capsys):
-    """Other devices, longer periods and other latencies need other damping, here more than there is."""
+    """Export and `check` name known devices, periods and latencies, because other loops are not certified here."""
     known = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),) * 2
     late = msgspec.structs.replace(PAIR, theta=(0, 0), lam=(0, 0), T_max=1.3e-3, latency=((3e-4, 6e-4),) * 2)
     for name, loop, coupling, condition, words in (

@@ -1,4 +1,4 @@
-"""Optimal couplings improve with damping and basis size; published gains and no coupling have known figures."""
+"""Tests that optimal couplings improve with damping and basis size, and of known figures without optimisation."""
 
 from functools import cache
 

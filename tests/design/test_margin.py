@@ -244,7 +244,7 @@ def test_weights_gain_nothing_in_reciprocal_loops():
         assert (np.linalg.eigvalsh((weighed + np.conj(np.swapaxes(weighed, 1, 2))) / 2)[:, -1] >= need - 1e-9).all()
 
 
-def test_a_map_of_rounding_needs_no_damping():
+def test_a_map_that_cancels_needs_no_damping():
     """Two states cancel, so F = 0. In other coordinates rounding leaves F(1) slightly asymmetric."""
     turn = np.random.default_rng(3).normal(size=(2, 2))
     B, back = np.array([[1e3, 70.0], [-1e3, -70.0]]), np.linalg.inv(turn)

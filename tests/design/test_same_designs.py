@@ -1,4 +1,4 @@
-"""The same request gives the same coupling file, byte for byte, whatever the machine's clock and cores are."""
+"""Tests that a request gives the same coupling file, byte for byte, whatever the machine's clock and cores are."""
 
 import os
 import subprocess

@@ -105,7 +105,7 @@ def stiffest(loop):
 
 
 def stiffest_at(B, theta, delta, T):
-    """Return the largest K that the sweep of any_environment accepts for B, less the reserve of a design."""
+    """Return the largest K that the sweep of any_environment accepts for B and delta less the reserve of a design."""
     usable = (1 - RESERVE) * delta
     return brentq(
         lambda K: any_environment(SpringDamper([K], [B]).compliance(T), [theta], [usable]).ratio - 1, 1.0, 1e5

@@ -139,7 +139,7 @@ def test_vanishing_walls_give_the_plain_condition():
 
 
 def walls_by_hand(loop):
-    """Return stiffness k, damping over T b, gap and the largest slope k + 2 b of the walls, shape (w,) each."""
+    """Return the walls' stiffness k, b = damping/T, gap and largest slope k + 2 b, shape (w,) each."""
     walls = loop.environment.walls
     stiff, gap = (np.array([getattr(w, name) for w in walls]) for name in ("stiffness", "gap"))
     b = np.array([w.damping for w in walls]) / loop.T
