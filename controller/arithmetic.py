@@ -1,4 +1,4 @@
-"""Numbers and matrices as floats or as Fractions, and budgets of counted work."""
+"""Matrices of floats or Fractions for controller and design, budgets of counted work, and one BLAS thread."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Number = float | Fraction
 
 
 class SingularLoop(ValueError):
-    """A feedback interconnection whose algebraic loop has no solution, or a system with a pole at z = 1."""
+    """An algebraic loop without a unique solution, or a system without G(1), because it has a pole at z = 1."""
 
 
 class TooLong(ValueError):
@@ -38,7 +38,8 @@ class TooLong(ValueError):
 # end when a budget is spent. Without a user's time limit they read no clock, so that a busy or slow machine gets the
 # same result as a fast one.
 #
-# One unit is one second of a core at 2.4 GHz, to a factor of two. The factors below were measured on such a core.
+# One unit is one second of a core at 2.4 GHz, within a factor of two. _PRODUCT and _DIFFERENCE were measured on such a
+# core.
 
 
 _PARTS = 10**12
@@ -48,23 +49,23 @@ class _Counter(threading.local):
     """The work of this thread since it began, the total at which the budget is spent, and a user's time limit."""
 
     done = 0  # in 1/_PARTS of a unit; an integer, so that earlier work causes no rounding
-    most: float = math.inf
-    message = ""
-    over: Callable[[], bool] | None = None
+    most: float = math.inf  # in the same parts
+    message = ""  # of TooLong
+    over: Callable[[], bool] | None = None  # returns whether the user's time limit is over
 
 
 _counter = _Counter()
 
 
 def spend(units: float) -> None:
-    """Count work. Raises TooLong if the budget of `within` is spent, or its time limit is over."""
+    """Count work of `units`. Raises TooLong if the budget of `within` is spent, or the user's time limit is over."""
     _counter.done += round(_PARTS * units)
     if _counter.done > _counter.most or (_counter.over is not None and _counter.over()):
         raise TooLong(_counter.message)
 
 
 def spent() -> int:
-    """Return the work that this thread has counted so far, in parts of a unit."""
+    """Return the work that this thread has counted so far, in 1/_PARTS of a unit."""
     return _counter.done
 
 
@@ -87,7 +88,8 @@ def within(
 ) -> Iterator[None]:
     """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
 
-    Work beyond this limit raises TooLong, as does any work once `clock` returns True: the user's time limit is over.
+    Work beyond this limit raises TooLong, whose message contains `what` and `why`. Any work raises TooLong once `clock`
+    returns True, which says that the user's time limit is over.
     """
     before = _counter.most, _counter.message, _counter.over
     if units < math.inf and spent_after(units) < _counter.most:
@@ -100,17 +102,17 @@ def within(
         _counter.most, _counter.message, _counter.over = before
 
 
-_PRODUCT = 5e-8  # [units] a product and a sum of short integers; the growth with length was measured to 5000 bits
-_DIFFERENCE = 2e-6  # [units] a product and a difference of fractions
+_PRODUCT = 5e-8  # [units] a product and a sum of short integers; the growth with length was measured up to 5000 bits
+_DIFFERENCE = 2e-6  # [units] a product and a difference of short fractions
 
 
 def _spend_on_products(count: int, bits: int) -> None:
-    """Count products of integers whose lengths add up to `bits`."""
+    """Count the work of `count` products of two integers whose lengths add up to `bits`."""
     spend(_PRODUCT * count * (1 + bits / 64))
 
 
 def _spend_on_differences(count: int, factor: Fraction) -> None:
-    """Count differences of fractions with about as many digits as `factor`."""
+    """Count the work of `count` differences of fractions that have about as many digits as `factor`."""
     spend(_DIFFERENCE * count * (1 + factor.denominator.bit_length() / 80))
 
 
@@ -121,8 +123,8 @@ _Result = TypeVar("_Result")
 def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
     """Let a function compute with one BLAS thread.
 
-    More threads change the last digits. They also wait for each other: on a busy machine they made the design of an
-    optimal coupling for four devices take three to six times the CPU time.
+    More threads change the last digits. They also wait for each other: on a busy machine the design of an optimal
+    coupling for four devices took three to six times the CPU time of one thread.
     """
 
     @wraps(function)
@@ -187,7 +189,7 @@ def numbers(values: ArrayLike, T: Number) -> Any:
 
 
 def fractions(value: Any) -> Any:
-    """Return `value` as a read-only array of Fractions, without a copy if it is one already."""
+    """Return `value` as a read-only array of Fractions; if `value` is such an array, return it without a copy."""
     array = np.asarray(value, dtype=object)
     known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
     if known and all(type(v) is Fraction for v in value.ravel()):

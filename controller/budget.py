@@ -9,9 +9,9 @@ dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta (on vectors, ' is the trans
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
-By completing a square, a tick adds at least -r(a) for every dx, with r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the
-sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until they
-have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
+By completing a square, a tick changes W by at least -r(a) for every dx, with r(a) = sum_i T a_i^2/(4 delta'_i). Let R
+be the sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
+they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
 exists at every tick: a tick with force a lowers R by r(a), and W by at most r(a), so that s = 0 is allowed. So
 W >= 0 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the
 energy that the devices dissipate, devices and hands receive at most W0, and
@@ -22,12 +22,12 @@ device must set its force to zero. The largest loss of tick t is the largest r o
 R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
 it, and a tick without a report counts with its largest loss.
 
-*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. By summation by parts, the sum of a de until a
-tick with force a[n] is at most q/2 (|a[n]| + sum |a - a_-|) per channel, and |a[n]| = sum (|a| - |a_-|). |dx| is at
-least the measured |dx| minus q. So a tick with the measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-|
-+ |a| - |a_-|) per channel, where a_- is the force of the previous tick. The largest loss of the tick is r(a) + 2 q |a|.
-The argument above holds with this increment and this loss. While the force is constant, an encoder that dithers costs
-no energy.
+*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. Let de be the change of e in a tick, and a_-
+the force of the previous tick. By summation by parts, the sum of a de until a tick with force a[n] is at most
+q/2 (|a[n]| + sum |a - a_-|) per channel, and |a[n]| = sum (|a| - |a_-|). |dx| is at least the measured |dx| minus q. So
+a tick with the measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel to W.
+The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss. While the
+force is constant, an encoder that dithers costs no energy.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
 that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
@@ -54,11 +54,11 @@ _SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 @dataclass(frozen=True, kw_only=True)
 class NetFigures:
-    """Counts of the ticks in which a passivity layer changed the force."""
+    """Counts of the ticks of a run, and of those in which a passivity layer changed the force."""
 
     guarantee: str | None  # the guarantee in one line
-    ticks: int
-    limited_ticks: int
+    ticks: int  # of the run
+    limited_ticks: int  # ticks in which the layer changed the force
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +99,7 @@ class _Acting:
 
 
 class _Net(_Acting):
-    """Common part of budgets: the energy W of every simulation, its cap, and the smallest scale of a force."""
+    """Common part of `EnergyBudget` and `Shell`: W of every simulation, its cap, and the smallest scale of a force."""
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
         super().__init__(nsim)
@@ -207,7 +207,7 @@ class EnergyBudget(_Net):
         #: (depth, m, nsim) largest loss [J] of this tick and of the next ones, for the packets sent so far
         self._reserve = np.zeros((int(oldest.max()) + 1, delta.size, nsim))
         ahead = np.arange(len(self._reserve))[:, None]
-        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) ticks that a packet sent now may reach
+        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) whether a packet sent now may act then
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
         self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
@@ -277,7 +277,7 @@ class EnergyBudget(_Net):
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
         before = (
             self._last[1] if self._last[0] == tick - 1 else -acted
-        )  # An unknown force counts as -acted, which costs most.
+        )  # If the previous force is unknown, assume -acted, which costs most.
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:
@@ -289,11 +289,11 @@ class EnergyBudget(_Net):
         return square + 2 * self._step * np.abs(force) if self._coarse else square
 
     def _scale(self, wanted: Array) -> Array:
-        """Return the largest s (nsim,) for which the energy is at least the reserve including the packet s f.
+        """Return the largest s (nsim,) for which W is at least the reserve including the packet s f, f = `wanted`.
 
-        Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is its present reserve,
-        r = T f^2/(4 delta'), and b = 2 q |f|. Let room be the energy that is not reserved yet. The reserves are within
-        the energy if and only if every set of pairs has sum (s^2 r + s b) <= room + sum M, both sums over the set. It
+        Each pair (tick, channel) that the packet reaches then reserves max(M, s^2 r + s b). M is the pair's present
+        reserve, r = T f^2/(4 delta'), and b = 2 q |f|. Let room be the part of W that is not reserved yet. The reserves
+        are within W if and only if every set of pairs has sum (s^2 r + s b) <= room + sum M, both sums over the set. It
         is enough to check the first n pairs, for every n, in the order of the s at which s^2 r + s b exceeds M.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
@@ -382,7 +382,7 @@ class Shell(_Net):
         short = W + linear - square < 0
         W, b, c = W[short], linear[short], square[short]
         root = np.sqrt(b**2 + 4 * c * W)
-        gains = b > 0  # `gains` selects the form of the upper root without cancellation; b > 0 implies c > 0
+        gains = b > 0  # `gains` selects the form of the upper root without cancellation; here b > 0 implies c > b
         upper = np.divide(np.where(gains, b + root, 2 * W), np.where(gains, 2 * c, root - b), out=0 * W, where=root > 0)
         scale[short] = np.minimum(upper, 1.0) * _SHAVE
         return scale

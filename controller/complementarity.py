@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 
-_LEAST_MINOR = 1e-12  # a smaller principal minor of a matrix with unit diagonal counts as zero
+_LEAST_MINOR = 1e-12  # a principal minor of at most this size, of a matrix with unit diagonal, counts as zero
 _MOST_CANDIDATES = 27  # largest number of active sets to enumerate (three channels, or two with a wall)
 GROUNDED = 1e-10  # regularisation of a singular matrix, and of a block of force vectors, relative to its diagonal
 PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of its difference
@@ -50,7 +50,7 @@ class Complementarity(_Problem):
         _ = self._candidates
 
     def solve(self, q: Array) -> Array:
-        """Return p (w, nsim) for every column of q (w, nsim)."""
+        """Return p (w, nsim) for q (w, nsim), with w walls in nsim simulations."""
         diagonal = self._diagonal
         if self._separate:
             return np.maximum(q, 0.0) / diagonal
@@ -173,6 +173,7 @@ class BoxProblem(_Problem):
     def _pivoted(self, q: Array) -> Array:
         """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
 
+        The sign of a force is 1 at its upper limit, -1 at its lower limit, and 0 between them.
         Changing only the first wrong sign terminates for every P-matrix M: index n changes only when all others are
         right for its present sign, so that, by uniqueness, it has each of its three signs at most once. Between two of
         its changes the same holds for index n - 1, and so on.
@@ -224,13 +225,14 @@ def _within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BallProblem(_Problem):
-    """Forces f limited as vectors: f = q - M v with f in a product of balls, v an outward normal on a sphere, else 0.
+    """Forces f limited as vectors: f = q - M v is in a product of balls, with v an outward normal on a sphere, else 0.
 
     The solution is unique if M is block triangular over the vectors, in some order, and the symmetric parts of its
     diagonal blocks are positive definite. The blocks are solved one after the other by a semismooth Newton iteration in
-    u = f + tau v, where tau is the mean of a vector's diagonal entries in M. It starts from the radial scaling of q. If
-    this iteration fails, a block of one vector is solved by bisection, and a block of several vectors by the
-    Douglas-Rachford iteration. If the residual is still too large, f is set to 0, and the failure is counted.
+    u = f + tau v, where tau is the mean of a vector's diagonal entries in M. The iteration starts from u = q, for which
+    f is q scaled to the balls. If it fails, a block of one vector is solved by bisection, and a block of several
+    vectors by the Douglas-Rachford iteration. If the residual is still too large, f is set to 0, and the failure is
+    counted.
 
     Raises:
         SingularLoop: A block's symmetric part has a negative eigenvalue.
@@ -274,7 +276,7 @@ class BallProblem(_Problem):
 
 
 _RESIDUAL = 1e-12  # allowed residual, relative to the limit
-_NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # largest numbers of iterations
+_NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # largest numbers of Newton, Douglas-Rachford and bisection steps
 _FULL = 10  # number of full Newton steps before shorter ones are tried
 _SHARES = (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # lengths of later Newton steps, of which the best one is taken
 _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its terms
@@ -293,13 +295,13 @@ class _BallBlock:
         if least < -GROUNDED:
             rows = (at + 1).tolist()
             raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
-        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # now v is unique; f always is
+        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # makes v unique, too
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
         self._by_tau, self.tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)
 
     def _missing(self, v: Array, f: Array, q: Array) -> Any:
-        """Return in which columns (nsim,) f + M v - q exceeds its tolerance."""
+        """Return for each column (nsim,) whether f + M v - q exceeds its tolerance."""
         terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
         finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
         allowed = np.maximum(_RESIDUAL * finite, _ROUNDED * terms.max(axis=0))

@@ -1,9 +1,10 @@
 """Virtual couplings, the controllers between the devices and the environment.
 
-A coupling has a compliance V(z) from force to displacement; only a `ForceFilter` filters forces instead. In negative
-feedback around the delayed environment Psi E, the displacements x of the devices become u = x - V f, and f = Psi E u.
-`around` returns this loop, G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems,
-Fractions, or sampled responses (controller.lti). A coupling is stored in a file as a `Form`.
+A coupling has a compliance V(z) from force to displacement. In negative feedback around the delayed environment Psi E,
+the displacements x of the devices become u = x - V f, and f = Psi E u. `around` returns this loop,
+G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack of systems, Fractions, or sampled responses
+(controller.lti). The V of an `_InternalModel` depends on Psi E, and a `ForceFilter` filters forces instead. A coupling
+is stored in a file as a `Form`.
 """
 
 from __future__ import annotations
@@ -424,7 +425,7 @@ class ForceFilter(ReadOnly, Coupling):
     """A filter R(z) of the environment's forces: F = Theta R Psi E.
 
     There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
-    coupling `_InternalModel`. R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
+    loop of `_InternalModel`. R(z) = sum_k R_k b_k(z), with the functions b_k of `basis`. These are 1 at z = 1, and the
     coefficients, taken as decimals, sum to R(1) = g I exactly, so that F(1) = g E(1) is symmetric if E(1) is.
     R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 

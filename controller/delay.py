@@ -227,7 +227,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 # Periods may vary, and forces may latch late. Tick k measures x[k] at its beginning and lasts T_k. The force f_i[k]
 # acts from the latch time late[k, i] after this beginning. Until then f_i[k-1] acts.
 
-_PERIODS, _LATENCIES = 9, 3  # few distinct values of a range, so that matrix exponentials can be cached
+_PERIODS, _LATENCIES = 9, 3  # numbers of values drawn from a range, small so that matrix exponentials can be cached
 
 
 class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -177,7 +177,8 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-#: size of a correcting spring at which the search ends, and the largest size, relative to the mean gain
+#: stiffness of a correcting spring up to which `_correction` stops its search, and the largest stiffness that it
+#: accepts, both relative to the mean gain
 _ENOUGH, _MOST_LIFT = 1e-8, 1e-6
 
 
@@ -218,7 +219,7 @@ def _correction(block: Block) -> Any:
     if not 2 * floor >= -most:
         hertz = f"{w / (2 * np.pi * block.T):.6g} Hz"
         if 2 * least < -most:
-            raise ValueError(f"block: not passive, its force feeds power in at {hertz}")
+            raise ValueError(f"block: not passive, it generates energy at {hertz}")
         raise ValueError(f"block: its passivity cannot be decided, the margin is too small near {hertz}; add damping")
     lift = max(-2 * floor, 1e-14 * np.abs(values).max() - negative, 0.0)
     return even - static + rational(float(lift)) * np.eye(m, dtype=int)
@@ -534,9 +535,9 @@ def environment(network: Network, T: Number) -> Lti:
 
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
-    previous tick. Every tick solves this equation for v. The states are q- and v-, and past values for the contact
-    dampers and masses. The network's block is added to E(z). The arithmetic is that of T. Raises ValueError if an
-    internal node has no mass and nothing holds it, or if the rounding of directions alone holds it.
+    previous tick. Every tick solves this equation for v. The states are q- and v-, and the previous displacements and
+    velocities of contacts with dampers or masses. The network's block is added to E(z). The arithmetic is that of T.
+    Raises ValueError if an internal node has no mass and nothing holds it, or only the rounding of directions does.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
     key = parts, type(T), T  # the type of T decides the arithmetic
@@ -619,7 +620,7 @@ _SLACK = 1e-9  # smaller eigenvalues, relative to the largest one, come from the
 
 
 def _check_directions(lengths: Sequence[Sequence[tuple[str, float]]], inner: dict[str, int], free: int) -> None:
-    """Raise ValueError if more directions than `free` are free within rounding."""
+    """Raise ValueError if more than `free` directions (a number) are free within rounding."""
     rows = np.zeros((len(lengths), len(inner)))
     for row, ends in zip(rows, lengths, strict=True):
         for node, sign in ends:
@@ -657,7 +658,7 @@ def _realise(
     """Return A, B, C, D of E(z) for the network (M, D, K) whose first `c` nodes are contacts.
 
     With `across` (w, nodes) E has w more inputs, the forces against the displacements `across q`, and w more outputs,
-    these displacements. In each direction of `free` (node, displacements) positions are relative to the node's.
+    these displacements. In each direction of `free` (node, displacements) positions are relative to that of the node.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (

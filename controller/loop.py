@@ -291,7 +291,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
-        """Return the environment and the vertices of its ranges, or 128 of them (controller.ranges)."""
+        """Return the environment, and the vertices of its ranges or 128 of these vertices (controller.ranges)."""
         if self.ranges:
             return members(self.network, self.ranges)
         return (Member("the nominal environment", self.environment),)

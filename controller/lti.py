@@ -112,7 +112,7 @@ class Lti(ReadOnly):
             matrix = own[name]
             if matrix.shape[-2:] != shape:
                 raise ValueError(f"{name} has shape {matrix.shape}, expected {shape}")
-            # If the sum of squares is finite, so are all entries. This test takes a tenth of the time.
+            # If the sum of squares is finite, so are all entries. Testing the sum takes a tenth of np.isfinite's time.
             if not exact and not isfinite(np.vdot(matrix, matrix)) and not np.isfinite(matrix).all():
                 raise ValueError(f"{name} has entries that are not finite")
         if not 0 < self.T < np.inf:

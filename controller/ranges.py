@@ -275,7 +275,7 @@ def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:
 def _require_inside(field: str, limits: _Range, own: float, unit: str) -> None:
     if not limits[0] <= own <= limits[1]:
         raise ValueError(
-            f"{field} is {limits[0]:g} to {limits[1]:g} {unit}, which leaves out the environment's own {own:g}"
+            f"{field} is {limits[0]:g} to {limits[1]:g} {unit}, expected a range with the environment's value {own:g}"
         )
 
 

@@ -38,7 +38,7 @@ _CALM = 1 - 1e-9  # forces above this multiple of their limit may need the limit
 
 
 class Net(Protocol):
-    """A nonlinear step with memory between the forces of F and the devices. Every `StepBuffer` has its own net.
+    """A passivity layer: a nonlinear step with memory between the law's forces and the devices, one per `StepBuffer`.
 
     At every tick `send` changes forces (m, nsim) [N] in place before the delays, and `apply` after them.
     """
@@ -58,7 +58,7 @@ class Net(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Process(ReadOnly):
-    """A law with force limits, encoder steps, varying delays and a net."""
+    """A law with force limits, encoder steps, varying delays and a passivity layer."""
 
     law: Law  # with the constant delays of the loop
     force_limit: Array  # (m,) [N], inf without a limit
@@ -265,8 +265,8 @@ class StepBuffer:
 class FusedTicks:
     """Compute the plant's step and the law of the next tick as one matrix product with the result [f; z+; s].
 
-    A row of the memory contains [w, f, z+, s, a] of one tick. The engine sets the entries a, and the next s is
-    A s + B [w; f] + G a. Without B the product uses only [z+, s, a].
+    A row of the memory contains [w, f, z+, s, a] of one tick. The engine (sim.engines) sets the accelerations a, and
+    the next s is A s + B [w; f] + G a. Without B the product uses only [z+, s, a].
     """
 
     def __init__(self, buffer: StepBuffer, A: Array, B: Array | None = None, G: Array | None = None) -> None:

@@ -27,7 +27,7 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m] largest damping of a device
-_LEAST_EIGENVALUE = 1e-9  # [N s/m] of a damping matrix: far below the damping of any device, above rounding errors
+_LEAST_EIGENVALUE = 1e-9  # [N s/m] allowed in a damping matrix: far below any device's damping, above rounding errors
 AXES = ("x", "y", "z")
 
 #: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
@@ -141,7 +141,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     delta: _Levels | None = None  # [N s/m] guaranteed damping, such as a bound from an identification; None: `damping`
     credible_force: float | None = None  # [N] largest transmission force for which the linear model is trusted
     credible_speed: float = 2.0  # [m/s] largest speed for which the model is trusted, assumed: about 3 x 0.7 m/s
-    # 0.7 m/s is from a study's abstract: teleoperation masters were faster in a fifth of a tapping task's fast part.
+    # From a study's abstract: teleoperation masters exceeded 0.7 m/s in a fifth of the fast part of a tapping task.
     guaranteed: DeviceBounds | None = None  # bounds that the known-device conditions use
     axes: int = 1  # 1 to 3: x, y, z
     clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels

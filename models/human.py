@@ -102,9 +102,9 @@ class Port:
     """The passive mechanics of a human at the handles: masses, spring-dampers, and optionally an impedance.
 
     The points are the handles (several if a person holds several devices), followed by the human's own masses. The
-    base is ground, or the body of the person to whom this arm belongs. Row i of `across` holds the derivatives of the
-    length of spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers for a
-    lever. With several axes every point and the base have `axes` neighbouring columns of `across`.
+    base is ground, or a person's body if the port is an arm of this person. Row i of `across` holds the derivatives of
+    the length of spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers
+    for a lever. With several axes every point and the base have `axes` neighbouring columns of `across`.
     The port is passive because no parameter is negative and the impedance is passive. Arrays with a leading axis hold
     many humans of the same structure.
 
@@ -132,7 +132,7 @@ class Port:
                 raise ValueError(f"port: {name} has the shape {getattr(self, name).shape}, expected {shape}")
         for name in ("mass", "damping", "stiffness"):
             if not (getattr(self, name) >= 0).all() or not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"port: {name} has a negative or infinite entry: such a human is not passive")
+                raise ValueError(f"port: {name} has a negative or infinite entry, expected finite numbers >= 0")
         if not 1 <= self.handles <= points or not (self.mass[..., self.handles :] > 0).all():
             raise ValueError("port: expected one or more handles, and a positive mass at every other point")
         groups = len(self.across) // self.axes
@@ -165,7 +165,7 @@ class Port:
         """Return this port on a device with `axes` axes. A port of one axis is repeated on each of them.
 
         Raises:
-            ValueError: The port has several axes, but not `axes` of them.
+            ValueError: The port has several axes, but their number is not `axes`.
         """
         if self.axes == axes:
             return self
@@ -355,7 +355,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_om
         require("ease", self.ease, 0.0, 1e4, "s")
 
     def force(self, t: _Array, stiffness: float, damping: float) -> _Array:
-        """Return k x + b x' [N] at the times t [s]: the force of a spring-damper whose end moves."""
+        """Return `stiffness` x + `damping` x' [N] at the times t [s], for the motion x of the equilibrium."""
         w, rate = 2 * np.pi * self.frequency, np.pi / self.ease if self.ease else 0.0
         pull, ahead = self.amplitude * math.hypot(stiffness, damping * w), math.atan2(damping * w, stiffness)
         force = pull * np.sin(w * t + (self.phase + ahead))
@@ -417,7 +417,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         return Port.chain_in_space(np.array(rows), axes)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Return the force k x_eq + b x_eq' [N] on the last mass at the times t [s]."""
+        """Return the force of the last link on the last mass [N] at the times t [s], from the equilibrium's motion."""
         if self.voluntary is None:
             return np.zeros_like(t)
         last, along = self.links[-1], self.voluntary.along

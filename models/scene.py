@@ -265,7 +265,7 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def _tendon_jacobian(model: mujoco.MjModel) -> _Array:
-    """Return the derivative of each tendon's length by the joint positions, shape (tendons, n)."""
+    """Return the derivatives of the tendons' lengths with respect to the joint positions, shape (tendons, n)."""
     import mujoco
 
     rows = np.zeros((model.ntendon, model.nv))
@@ -601,7 +601,7 @@ def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any],
 
 
 def _add_spring(spec: mujoco.MjSpec, name: str, ends: Mapping[str, float], stiffness: float, damping: float) -> None:
-    """Add a fixed tendon with a spring and a damper; `ends` are the derivatives of its length by the joints."""
+    """Add a fixed tendon with a spring and a damper. `ends` maps joints to derivatives of the tendon's length."""
     tendon = spec.add_tendon(name=name)
     # Entry 0 is the linear coefficient; MuJoCo has two nonlinear ones as well.
     tendon.stiffness[0], tendon.damping[0] = stiffness, damping
@@ -649,7 +649,7 @@ class Crowd:
         if links.ndim != 4 or links.shape[-1] != count or 0 in links.shape[1:]:
             raise ValueError(f"links has the shape {links.shape}, expected (sets, devices, links, {count})")
         if not ((links >= 0) & (links < np.inf)).all():
-            raise ValueError("links has a negative or infinite entry: such a human is not passive")
+            raise ValueError("links has a negative or infinite entry, expected finite numbers >= 0")
         bodies = np.array(self.bodies, dtype=float) if self.holds else np.zeros((len(links), 0, 5))
         if bodies.shape != (len(links), len(self.holds), 5):
             raise ValueError(f"bodies has the shape {bodies.shape}, expected {(len(links), len(self.holds), 5)}")
@@ -838,7 +838,7 @@ class Variants:
 
 
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
-    """Return the models of the devices with every set of humans. Raises ValueError unless each has one per device."""
+    """Return the models of the devices with every set of humans. Raises ValueError as `build` does."""
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)
     scene = _compiled(devices, first, drawn=False)

@@ -371,7 +371,7 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
 def _principal(G: Array, contact: Contact) -> tuple[Array, Array]:
     """Return stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag(stiffnesses) Q'.
 
-    Raises ValueError.
+    Raises ValueError unless G is (axes, axes), symmetric and positive definite.
     """
     axes = len(contact.along)
     if G.shape != (axes, axes):
@@ -394,7 +394,7 @@ def _name(contact: Contact, axis: int) -> str:
 def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
     """Add slides and springs to a contact, give it a mass if the scene states none, and compensate its weight.
 
-    All settings are explicit, so that the scene's defaults do not apply.
+    `turn` is the body's quaternion. All settings are explicit, so that the scene's defaults do not apply.
     """
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))
@@ -607,7 +607,7 @@ class WorldPort:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return an upper bound [J] on the energy that constraints created in the last step: all positive excesses."""
+        """Return the sum of the positive excesses [J], an upper bound on the energy created in the last step."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 

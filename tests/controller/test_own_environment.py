@@ -89,7 +89,7 @@ def test_a_block_equals_the_network_of_its_numbers():
     ("E", "message"),
     [
         (Lti.constant([[-1.0]], T), "not passive"),
-        (Lti([[0.0]], [[1.0]], [[300.0]], [[0.0]], T), "not passive, its force feeds power in at"),  # a delayed spring
+        (Lti([[0.0]], [[1.0]], [[300.0]], [[0.0]], T), "not passive, it generates energy at"),  # a delayed spring
         (Lti.constant([[0.0, 1.0], [-1.0, 0.0]], T), "not passive"),
         (Lti([[1.0]], [[1.0]], [[1.0]], [[1.0]], T), "an eigenvalue on or outside the unit circle"),
         (Lti.constant([[1.0, 0.0]], T), r"D is \[\[1.0, 0.0\]\], expected 1 rows of 1 numbers"),
@@ -125,7 +125,7 @@ def test_no_narrow_resonance_hides_from_passivity(width):
         if passive:
             Block.of(resonance(width, angle, size))
         else:
-            with pytest.raises(ValueError, match=r"not passive, its force feeds power in at 19[01]"):
+            with pytest.raises(ValueError, match=r"not passive, it generates energy at 19[01]"):
                 Block.of(resonance(width, angle, size))
     assert seen == {True, False}
 

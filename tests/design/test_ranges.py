@@ -188,7 +188,7 @@ def test_the_number_of_parameters_is_limited():
         ("[ranges]\nmasses = { mas = [0.5, 2.0] }", "ranges.masses lists 'mas', which no spring or wall reaches"),
         (
             "[ranges]\nmasses = { mass = [2.0, 3.0] }",
-            "ranges.masses.mass is 2 to 3 kg, which leaves out the environment's own 1",
+            "ranges.masses.mass is 2 to 3 kg, expected a range with the environment's value 1",
         ),
         ("[ranges]\nmasses = { mass = [2.0, 0.5] }", "expected \\[least, most\\] in kg"),
         ("[ranges]\nmasses = { mass = [1.0, 1.0] }", "nothing is uncertain"),
@@ -196,7 +196,7 @@ def test_the_number_of_parameters_is_limited():
         ("[ranges]\nsprings = [{ between = ['contact 1', 'mass'] }]", "nothing is uncertain"),
         (
             "[ranges]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [900, 950] }]",
-            "the environment's own 800",
+            "the environment's value 800",
         ),
         ("[ranges]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [-1, 950] }]", "0 <= least"),
         ("[ranges]\nsprings = [{ between = ['contact 1', 'wall'], absent = true }]", "there is no node 'wall'"),
