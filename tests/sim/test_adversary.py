@@ -1,4 +1,4 @@
-"""The search for the worst passive human destabilises loops that fail this-environment, and no loop that meets it."""
+"""The search for the worst passive human destabilises loops that fail this-environment, and none that meets it."""
 
 import json
 from dataclasses import replace

@@ -31,7 +31,7 @@ def hands(lossless: bool) -> Crowd:
     links = np.stack([draw(population, 2, 11, i, 2) for i in range(HUMANS)])
     if lossless:
         links[..., 1] = 0.0
-        # Modes are below 2000 rad/s: above that, MuJoCo's step would decide the verdict, not the hand.
+        # Modes are below 800 rad/s: far above that, MuJoCo's step would decide the verdict, not the hand.
         rng = np.random.default_rng(12)
         links[..., 0] = np.exp(rng.uniform(np.log(0.01), np.log(3.0), links.shape[:-1]))
         links[..., 2] = np.exp(rng.uniform(np.log(0.1), np.log(1e4), links.shape[:-1]))

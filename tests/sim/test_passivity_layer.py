@@ -29,7 +29,7 @@ def stiffer(scenario, factor):
 
 
 def given(simulation, trace):
-    """Return the largest energy [J] given to hands: work of the forces less the devices' least dissipation."""
+    """Return the largest energy [J] given to hands up to any tick: forces' work less the devices' least dissipation."""
     s, dx = trace.s[:, : simulation.process.channels], np.diff(trace.s[:, : simulation.process.channels], axis=0)
     assert len(s) == len(trace.f)
     lost = (dx**2 * np.array(simulation.scenario.delta)).sum(axis=1) / simulation.scenario.T

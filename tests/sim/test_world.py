@@ -1,4 +1,4 @@
-"""MuJoCo worlds in a loop keep the energy account; scenarios and couplings that do not fit are refused."""
+"""MuJoCo worlds give hands no more than W0 and the released energy; unfit scenarios and couplings are refused."""
 
 import json
 from dataclasses import replace as replace_fields
@@ -326,7 +326,7 @@ def command(capsys, *words: str) -> tuple[int, str]:
     return code, capsys.readouterr().out
 
 
-def test_a_run_reports_the_account(tmp_path, capsys):
+def test_a_run_reports_the_energy_account(tmp_path, capsys):
     (tmp_path / "figure.png").touch()  # the picture of an earlier run
     code, shown = command(
         capsys, "run", "--scenario", "world-ball", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)
@@ -472,7 +472,7 @@ def test_default_couplings_of_slow_worlds_do_not_ring(every):
     assert np.sqrt((alternating**2).mean(axis=0)).max() < 0.1
 
 
-def test_a_slow_world_keeps_the_account(tmp_path):
+def test_worlds_with_slow_steps_keep_the_account(tmp_path):
     for every in (2, 4):
         loop = scenario(tmp_path, TRAY, more=f"{UP}\nevery = {every}")
         hands = Hands(np.random.default_rng(1), 1, True, 0.1, T=T, delta=loop.delta)

@@ -148,7 +148,7 @@ def test_the_stiffest_certified_spring_dampers_are_known():
         for axis in np.meshgrid([*np.arange(1050.0, 1060), *np.arange(1130.0, 1140)], np.linspace(0.32, 0.4, 41))
     )
     for needed, stiffest in zip(wall(1, K, B), (1135, np.floor(878.86 * 1.2)), strict=True):
-        # the figures are rounded, and the grid's step is 1 N/m
+        # The figures are rounded, and the grid's step is 1 N/m.
         assert K[needed < DELTA].max() == pytest.approx(stiffest, abs=1)
     assert wall(0, [2739.9, 2740.1], [0.0, 0.0])[1] == pytest.approx(DELTA, rel=1e-4)
 
@@ -346,7 +346,7 @@ def test_batched_processes_equal_single_ones(walls):
 
 
 def test_coulomb_friction_stops_a_device_where_coulomb_says():
-    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo, 1.5e-6 m off when measured, may be 3e-6 m off."""
+    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo, 1.4e-6 m off when measured, may be 3e-6 m off."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
     model = _discretised(scene, T, "RK4", 4)
