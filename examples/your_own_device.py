@@ -31,7 +31,10 @@ def main() -> None:
     delay, late = 1e6 * (session.delay or 0.0), [1e6 * tau for tau in session.latency or ()]
     print(f"measured: {delay:.0f} us from sample to force; spring-damper for {late[0]:.0f} to {late[1]:.0f} us")
     print(f"needs {max(found.required):.4f} of {min(found.available):.2f} N s/m: certified = {found.certified}")
-    print(f"a wall of 1000 N/m at 1.2 ms needs {_wall(session.delay):.4f} N s/m, a whole sample late {_wall(None):.4f}")
+    print(
+        f"a wall of 1000 N/m at 1.2 ms needs {_wall(session.delay):.4f} N s/m, "
+        f"and {_wall(None):.4f} N s/m with a delay of one sample"
+    )
     moved = np.abs(session.result.x).max()
     print(f"{len(session.result.t)} ticks, ended {session.stage}; handles moved up to {1e3 * moved:.1f} mm")
     print(f"zero force {1e3 * session.zero_after:.1f} ms after the stop request")

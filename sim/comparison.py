@@ -45,7 +45,7 @@ _QUICK = 2  # largest number of channels with an optimal coupling
 class Alternative:
     """One coupling in the loop, or the reason why there is none."""
 
-    coupling: str  # kind
+    coupling: str  # kind of the coupling
     condition: str | None
     guarantee: str | None = off_table(default=None)
     dc_ratio: float | None = None  # share of the static stiffness that is felt
@@ -211,7 +211,7 @@ class Comparison:
     lam: tuple[int, ...]
     available_damping: tuple[float, ...]
     frequency_hz: Array
-    sigma_E: Array
+    sigma_E: Array  # (k, m) singular values of E [N/m]
     ideal: compare.Perceived
     couplings: list[ComparedCoupling]
     notes: list[str]

@@ -1,4 +1,4 @@
-"""Validate a loop with many random passive humans, by both engines, in batches over processes.
+"""Validate a loop with many random passive humans, by two engines, in batches over processes.
 
 Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
 the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4

@@ -196,7 +196,7 @@ def worst_mode(simulation: Simulation) -> Mode:
 
 @dataclass(frozen=True)
 class Ringing:
-    """Decay of a knock in the exact loop with the scenario's own hands, at constant delays and without friction.
+    """Decay after an impulse in the exact loop with the scenario's own hands, at constant delays and without friction.
 
     A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 for a decay without oscillation.
 
@@ -228,7 +228,7 @@ _FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return the decay of a knock over all sets of touching walls; None in a world, which has no eigenvalues."""
+    """Return the decay after an impulse over all sets of touching walls; None in a world, which has no eigenvalues."""
     if simulation.scenario.environment.world:
         return None
     loops = [close(simulation.plant, F) for F in simulation.process.law.frozen().values()]

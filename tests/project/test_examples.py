@@ -49,7 +49,7 @@ SAYS = {
     ],
     "your_own_device": [
         "certified = True",
-        "wall of 1000 N/m .* needs 0.7749 N s/m, .* late 1.8000",
+        "wall of 1000 N/m .* needs 0.7749 N s/m, and 1.8000 N s/m",
         "ended finished",
         r"zero force 3[67]\d.. ms after the stop",
     ],
