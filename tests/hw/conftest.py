@@ -1,4 +1,4 @@
-"""Provide the scenario of the sessions and certified couplings for its links, made once per test run."""
+"""Provide, once per test run, the scenario of the sessions and couplings that are certified for its links."""
 
 import pytest
 

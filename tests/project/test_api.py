@@ -132,7 +132,7 @@ def test_a_rehearsal_at_its_force_limit_is_stopped():
     assert re.search(r"requested, but \d+ % of the forces were cut in a second", session.cause)
 
 
-def test_simulate_is_the_commands_run(tmp_path):
+def test_simulate_equals_the_commands_run(tmp_path):
     result = simulate(SHORT)
     assert isinstance(result, Trace)
     assert isinstance(SHORT, Scenario)
@@ -152,7 +152,7 @@ def test_engines_agree_on_a_run():
     assert difference <= 1e-10 * np.abs(exact.x).max()
 
 
-def test_validate_is_the_commands_verdict(tmp_path):
+def test_validate_equals_the_commands_verdict(tmp_path):
     findings = validate(load(), humans=20, engine="exact", duration=0, seed=3)
     options = ["--case", "none", "--humans", "20", "--engine", "exact", "--duration", "0", "--seed", "3", "--no-plot"]
     assert validate_command([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 0

@@ -12,7 +12,7 @@ from haptic_loop.sim.run import assemble, run
 T = 1e-3
 
 
-def test_energy_bounding_is_the_published_interval():
+def test_energy_bounding_clips_to_the_published_interval():
     rng = np.random.default_rng(15)
     bounding, c1, before = EnergyBounding(1, T, 1.2), 2 * 1.2 / T, 0.0
     for k in range(500):

@@ -104,7 +104,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 
 @pytest.mark.slow
-def test_designs_named_in_sentences_exist(place):
+def test_designs_named_in_sentences_succeed(place):
     """IN_TEXT may be empty, since no page needs to name a design in a sentence."""
     for command in IN_TEXT:
         done = run(command, place)
@@ -171,7 +171,7 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_page_blocks_do_not_overlap(page):
+def test_page_blocks_end_and_follow_their_comments(page):
     fences = re.findall(r"^.*```.*$", TEXTS[page], re.MULTILINE)
     assert len(fences) % 2 == 0
     assert set(fences[1::2]) <= {"```"}, "a code block has no end"
@@ -186,7 +186,7 @@ def test_links_and_pictures_exist(page):
         assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name} names {target}"
 
 
-def test_make_targets_exist():
+def test_make_targets_that_pages_name_exist():
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
     blocks = re.findall(r"```(?:sh|console)\n(.*?)```", "".join(TEXTS.values()), flags=re.DOTALL)
     named = [line.split()[1] for block in blocks for line in block.splitlines() if line.startswith("make ")]

@@ -297,7 +297,7 @@ def test_steps_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypa
     assert f"did not settle in {limited} steps of the scene" in " ".join(shown.split())
 
 
-def test_this_environment_says_nothing_of_a_world():
+def test_this_environment_certifies_no_world():
     loop = load("world-ball").loop("I")
     needs = THIS_ENVIRONMENT.judge(loop, certified(load("world-ball")).coupling)
     assert not needs.certified
@@ -366,7 +366,7 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
     assert "no passive hand is given more than 0.002 J" in " ".join(shown.split())
 
 
-def test_a_design_that_needs_a_model_names_another(tmp_path):
+def test_refused_designs_for_worlds_name_another(tmp_path):
     words = ["--scenario", "world-door", "--coupling", "spring-damper", "--out", str(tmp_path / "no.json")]
     with pytest.raises(InputError, match=r"no linear model E\(z\): take moving-average"):
         import_module("haptic_loop.cli.design").main([*words, "--condition", "any-environment"])
@@ -411,7 +411,7 @@ def test_a_world_is_read_strictly(tmp_path, change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_the_digest_is_of_contents_not_of_places(tmp_path):
+def test_digests_depend_on_contents_not_on_places(tmp_path):
     first = scenario(tmp_path, TRAY)
     moved = tmp_path / "elsewhere"
     moved.mkdir()

@@ -132,7 +132,7 @@ def test_undelayed_walls_match_colgates_condition():
         np.testing.assert_allclose(needed, K * T / 2 + B, rtol=1e-10)
 
 
-def test_a_late_spring_needs_the_closed_form():
+def test_late_springs_require_the_closed_form_damping():
     K = np.geomspace(10, 5000, 9)
     # The supremum is at w -> 0; the map begins at 1e-6 rad/sample.
     for needed, share in zip(wall(1, K, 0 * K), (1.5, 2), strict=True):
