@@ -110,7 +110,7 @@ def test_dry_friction_is_told_from_viscous():
 
 @pytest.mark.slow
 def test_a_knob_is_identified_in_radians():
-    """A knob of 100 g cm2 has viscous friction of 0.2 mN m s/rad and dry friction of 0.1 mN m; its lever is 20 mm."""
+    """A knob of 100 g cm2, 0.2 mN m s/rad and 0.1 mN m of dry friction, with a lever of 20 mm, is identified to 2 %."""
     T, lever, count = 1.2e-3, 0.02, 1e-4
     force = chirp(1, T, 1, 0.2 * lever, (3.0, 60.0), 1.5).signal[:, 0]
     at_hand = played(force / lever, T, 1e-5 / lever**2, 2e-4 / lever**2, 1e-4 / lever, substeps=16)
