@@ -3,9 +3,10 @@
     EnergyBudget        scales forces before the delays, at the port of the devices
     Shell               scales forces at the port of the environment, behind a coupling certified for any environment
 
-*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the
-energy stored at the start. Here a[k] is the force that acts in [kT, (k+1)T), the device feels -a[k], and
-dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta (on vectors, ' is the transpose) the budget computes
+*The guarantee of the budget.* A device of guaranteed damping Delta with its passive hand has
+sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the energy stored at the start. Here a[k] is the force that acts in
+[kT, (k+1)T), the device feels -a[k], and dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta, whose diagonal is
+delta' (on vectors, ' is the transpose), the budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 

@@ -24,7 +24,7 @@ from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sam
 _LARGEST_COEFFICIENT = 1e12  # largest gain or coefficient, SI units; larger ones would overflow in a sweep
 _MOST_TERMS = 2000  # most terms of a moving average; each term after the first has a state
 _ROUNDING = 1e-12  # a damping matrix may have eigenvalues down to -1e-12 of its largest entry
-_LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in a sweep
+_LARGEST_WEIGHT = 1e9  # largest entry of a force filter's coefficients; larger ones would overflow in a sweep
 _Rows = tuple[tuple[float, ...], ...]
 
 
@@ -36,7 +36,7 @@ class Coupling:
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear model, which cannot have walls
+    holds_model: ClassVar[bool] = False  # whether it contains a linear model of the environment (without walls)
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:

@@ -666,7 +666,7 @@ def _realise(
     )
     solve = inverse(Mii / T + Dii + T * Kii)
 
-    # every signal is a row of coefficients over [x; p; q-; v-; x-; vx-]
+    # Every signal is a row of coefficients over [x; p; q-; v-; x-; vx-], with the contacts' velocities vx.
     M = matrices[0]
     n, w = M.shape[-1] - c, 0 if across is None else len(across)
     signals = np.eye(3 * c + w + 2 * n, dtype=M.dtype)

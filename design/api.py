@@ -61,8 +61,8 @@ def design_coupling(
     Args:
         loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions). With your own one the coupling is
-            designed by the kind's usual condition and judged by yours. None selects the usual condition
+        condition: The name of a condition, or your own Condition (design.conditions). The coupling is then designed by
+            the kind's usual condition and judged by your Condition. None selects the usual condition
             (design.designs.usual_condition), as the commands do.
         options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
@@ -202,14 +202,14 @@ class Filed:
     file: Path
     proof: str | None
     reason: str | None
-    switching: _SwitchingFiled | None
-    limited_forces: bool
+    switching: _SwitchingFiled | None  # None for constant delays
+    limited_forces: bool  # whether the certificate covers limited forces
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with a certificate where one can be proved.
+    """Return the design with its certificate if exact arithmetic proves its condition.
 
-    With ranges, with varying delays, and where no proof is found, the design is returned as it is.
+    With ranges or varying delays, or if no proof is found, return the design unchanged.
     """
     if design.certificate or loop.ranges or loop.varying_delay:
         return design

@@ -154,8 +154,8 @@ class SearchFigures:
     environments: int  # number of environments that were tried
     worst_ratio: float  # required over available damping in the worst environment
     worst: str  # name of the worst environment
-    violated: bool  # whether the condition is violated there
-    ended_early: bool
+    violated: bool  # whether the worst environment violates the condition
+    ended_early: bool  # whether a limit of time or work ended the search
     ended_by_clock: bool  # whether the user's time limit (--seconds) ended the search
     how: str = SEARCH
 
@@ -461,7 +461,7 @@ class Assessment:
         certificate: The exact proof that the caller supplied and that holds, or that for the ranges, or None.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold for `holds`; another one may give the guarantee.
+        condition: The name of the condition that must hold for `holds`; another condition may give the guarantee.
     """
 
     loop: Loop
@@ -491,7 +491,7 @@ class Assessment:
 
     @property
     def holds(self) -> bool:
-        """Whether the required condition is certified, with a guarantee that covers all properties of the loop."""
+        """Whether the required condition is certified, with a guarantee that covers the loop's ranges, if any."""
         if self.guarantee is None or not self.decisive.certified:
             return False
         return self.loop.ranges is None or self.guarantee.environments in (ANY, RANGES)
@@ -699,7 +699,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     own = requirements[assessment.condition]
     plugged = shelled(assessment.environment)
     if loop.latency and (plugged or limits.energy_budget is not None):
-        return None, "latency: an energy account counts forces that latch at ticks; add a sample to theta instead"
+        return None, "latency: an energy account assumes forces that latch at ticks; add a sample to theta instead"
     if plugged:
         return _shell(assessment)
     if limits.energy_budget is not None:

@@ -232,7 +232,7 @@ def _coefficients(value: Any) -> Iterator[float]:
             yield from _coefficients(part)
 
 
-_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the largest response or Delta_D/T
+_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the scale in `_another_system`
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
@@ -261,8 +261,8 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     if lost <= _MOST_LOST * scale:
         return None
     return (
-        f"rounding may change the forces by {lost / scale:.1e} of the largest one, allowed is {_MOST_LOST:g}: "
-        "the running loop would differ from the proved one"
+        f"rounding may change the forces by {lost / scale:.1e} (relative), allowed is {_MOST_LOST:g}: "
+        "the running loop would differ from the proved loop"
     )
 
 
@@ -420,9 +420,9 @@ def _margin(requirement: Requirement) -> float:
 
 
 def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
-    """Return the condition's multipliers in one sequence, or None if it has none.
+    """Return the `stored` multipliers in one sequence, or None if the condition has none.
 
-    Raises NotProved if names or lengths differ from those of the condition.
+    Raises NotProved if their names or lengths differ from those of the condition.
     """
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
@@ -454,7 +454,7 @@ def named(condition: str | Condition) -> Condition:
         return condition
     if condition not in _NAMED:
         raise ValueError(
-            f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or one of your own (FILE.py:NAME)"
+            f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or FILE.py:NAME for your own condition"
         )
     return _NAMED[condition]
 
@@ -486,10 +486,7 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: An
 
 
 def _block(demand: Demand[Lti]) -> Lti:
-    """Return the block of a demand at the available damping, after exact tests of the static matrices.
-
-    Raises NotProved.
-    """
+    """Return the block of a demand at the available damping. Raises NotProved if a static matrix fails its test."""
     for name, value in demand.static.items():
         if not (value == value.T).all():
             raise NotProved(f"{name} is not exactly symmetric")

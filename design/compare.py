@@ -26,7 +26,7 @@ from haptic_loop.design.result import Requirement
 # A coupling over frequency: singular values, required damping, and what a hand perceives.
 
 
-_LOWEST_HZ = 0.1
+_LOWEST_HZ = 0.1  # lowest frequency of a picture
 FEEL_HZ = (1.0, 10.0)  # frequencies of the table of perceived stiffness and damping
 
 

@@ -136,7 +136,7 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Dema
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
     """Return the largest shortage of passivity of E-hat + Phi [N s/m] by a sweep, and its frequency w [rad/sample].
 
-    The shortage is positive where phi (m,) is too small.
+    The shortage is positive if phi (m,) is too small.
     """
     demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
     block = demand.free + demand.gain
@@ -410,7 +410,7 @@ def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], de
 
 
 def unsound(system: Lti, delta: Sequence[float]) -> str | None:
-    """Return the reason why a block with the poles of this system cannot be swept, or None."""
+    """Return the reason why no sweep of a block with the poles of this system can certify a loop, or None."""
     if min(delta) == 0:
         return "a device guarantees no damping, so no coupling is safe for every passive human"
     if reason := too_long(system):
@@ -494,7 +494,7 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
 def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
     """Return the damping that any-environment requires for the coupling V with any passive environment.
 
-    With phi (m,) [N s/m] (see `any_environment_demand`) the environment is the loop's own, with its delay psi.
+    With phi (m,) [N s/m] (see `any_environment_demand`) the environment is that of the loop, with its delay psi.
     """
     available = _dampings(loop.delta, V.inputs)
 
@@ -569,7 +569,7 @@ def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 #
 # Encoder errors n with |n_j| <= q_j/2 change the force F x to F (x + n) = F x + w. Here |w_i| <= W_i = sum_j |F_ij|_1
 # q_j/2, where |F_ij|_1 is the sum of the absolute values of the impulse response. In a tick w does the work w'dx <=
-# sum_i W_i (integral of |v_i|), which Coulomb friction of at least W_i at the encoder's coordinate dissipates.
+# sum_i W_i (integral of |v_i|), with the encoder's speed v_i. Coulomb friction of at least W_i there dissipates it.
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends
@@ -613,7 +613,7 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m].
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
-    a limiter or walls, nor for known devices, where the errors also multiply beta (v+ - v). Friction of a device with
+    a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). Friction of a device with
     several `axes` opposes its velocity in space. It must be at least |W|_2 of these axes, because the power of the
     errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for a wrong number of steps or a negative one.
     """

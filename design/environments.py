@@ -89,7 +89,7 @@ from haptic_loop.design.result import (
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers, with a search for these. A subclass adds `map`, `block`."""
+    """A condition whose block is affine in its multipliers, and their search. A subclass adds `map` and `block`."""
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""
@@ -217,7 +217,7 @@ class _Search:
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last arguments and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.zeros(system.outputs) if demand.spare is None else demand.spare)
-        self._plain: list[Demand[Lti]] = []  # the block for zero multipliers, then for each unknown alone
+        self._plain: list[Demand[Lti]] = []  # the block with all unknowns 0, then with one of them at its unit
         self._root = np.ones(system.outputs)  # scales the rows of an inequality to about one
         self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0  # whether to search at all
 
@@ -759,7 +759,7 @@ class _AnyEnvironment(Multiplied):
         """Return the reason why a coupling without V(z) is refused."""
         if coupling.holds_model:
             return "the coupling contains a model of the environment; Theorem 4 covers only couplings without one"
-        return "Theorem 4 needs a coupling, and the loop has none"
+        return "Theorem 4 needs a coupling with a compliance V(z), and the loop has none"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the requirement with `multiplier`; for None, with `least_phi` if psi >= 1, else the best found."""

@@ -20,7 +20,7 @@ from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supr
 # Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.
 #
 # A stored floating-point number stands for its shortest decimal, the one that a person wrote in the file: 0.0012 is
-# 12/10000 here, not the nearest binary fraction. Everything after that is exact.
+# 12/10000 here, not the nearest binary fraction. A matrix is accepted only by exact computations with these numbers.
 
 
 _Integers = NDArray[np.object_]
@@ -299,7 +299,7 @@ def _whitening(W: Array) -> _Integers | None:
 # inequalities is a proof. The errors of all other rounding are bounded and subtracted.
 
 
-_MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; our own files have a few hundred
+_MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; the package stores a few hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
 _LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative to the largest, are raised to this
@@ -509,7 +509,7 @@ def _states(G: Lti) -> NDArray[np.complex128]:
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
-    # `supremum` refines peaks within a fifth of the largest. Every small lambda gives such a peak of 1 - lambda.
+    # `supremum` refines peaks within a fifth of the largest. A small eigenvalue lambda is such a peak of 1 - lambda.
     value, w = supremum(
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )

@@ -2,9 +2,9 @@
 
 Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
 them. The **hands' side** is a lower bound of the energy that every passive hand and the devices dissipate, whatever
-forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches; for a known
-motor (Theorem B) also its speed v. A **fact** of the environment's side describes the forces; it adds inputs, one row
-for each, and multipliers. The quadratic form is
+forces act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. For a known
+motor (Theorem B) the motor's speed v is an input, too. A **fact** of the environment's side describes the forces; it
+adds inputs, a row of the block for each, and multipliers. The quadratic form is
 
     sum over ticks of f'(displacement that f multiplies) + energy of the damping + terms of the multipliers,
 
@@ -128,8 +128,8 @@ class Collected(Generic[Block]):
         self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
         self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) of steps added to the response
         self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
-        self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of df_e, scale)
-        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight of dy, whether it is summed)
+        self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of the steps of f_e, scale)
+        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, y itself instead of its steps)
         self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
         self._gain: list[tuple[int, int, Any]] = []  # (row, input, weight) of terms that scale with the damping
@@ -262,7 +262,10 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return (block from inputs to [dx; dp; added force steps; delayed inputs], numbers of the delayed inputs)."""
+        """Return (block from inputs to [dx; dp; steps added to f_e; delayed inputs], numbers of the delayed inputs).
+
+        dp are the steps of the walls' forces.
+        """
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]

@@ -98,7 +98,7 @@ class _FixedOrder:
     def start(self, gains: SpringDamper) -> Array:
         """Return p of a spring-damper. Each further state is driven by the one before, and no output reads it.
 
-        With B > 0 all states are reachable, and the storage of the weighted loop is well conditioned. A state that is
+        With dampers all states are reachable, and the storage of the weighted loop is well conditioned. A state that is
         read but not driven would make the storage singular, and rounding would decide whether the first step succeeds.
         """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable

@@ -323,7 +323,7 @@ def _shared(loop: Loop) -> tuple[list[int], Array]:
 class SwitchingLoop(SampledLoop):
     """The loop under any switching of delays: x = (log K, B/delta, log(alpha T/delta) of `active`).
 
-    `judged` ignores the alpha in x and searches the best one with `SWITCHING`.
+    `judged` ignores the alpha in x and searches for the best alpha with `SWITCHING`.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))

@@ -660,7 +660,7 @@ class KnownDevice(Condition):
 
     The multiplier consists of beta, lower bounds of q and upper bounds of q, with one number each per channel, and of
     the facts' multipliers. The first three are 0 if the condition `plain`, which ignores the device bounds, requires
-    less damping. The bounds of q are also 0 where the damping does not suffice, because then no proof needs them.
+    less damping. The bounds of q are also 0 if the damping does not suffice, because then no proof needs them.
     """
 
     name, source = "known-device", "Theorem B, docs/theory.md"
@@ -896,6 +896,7 @@ class _KnownDeviceAny(KnownDevice):
 
 _LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # range of the shares of the damping that `ratios` tries
 _DRAWN_STEPS = 10  # halvings of the logarithm of this range, to 0.6 %
+#: tried betas, relative to the largest beta of each channel
 _DRAWN = np.concatenate([np.geomspace(0.003, 0.5, 18), [0.62, 0.74, 0.85, 0.93, 0.98, 0.9995]])
 _DRAWN_POINTS = 240  # number of frequencies, half of them evenly and half logarithmically spaced
 

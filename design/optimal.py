@@ -32,7 +32,7 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-_SETTLED_DB = 0.05  # [dB] A smaller gain ends the search; in `design` only from _FEWEST_TAPS taps on.
+_SETTLED_DB = 0.05  # [dB] A smaller `_Search.gained` ends the search; in `design` only from _FEWEST_TAPS taps on.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 #: The search ends before a basis of more than 26 taps if the last basis was certified and gained less than 0.1 dB.
 _LARGE, _PROMISING_DB = 26, 0.1
@@ -77,7 +77,7 @@ class Optimal(Design):
     """Best coupling, with its certificate if it is proved, and the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
-    g: float = field(kw_only=True)  # F(1) = g E(1); if the coupling is not a force filter, the ratio of their norms
+    g: float = field(kw_only=True)  # F(1) = g E(1); for couplings other than force filters, norm(F(1))/norm(E(1))
     states: int = field(kw_only=True)  # order of the loop
     certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
     bases: tuple[_BasisResult, ...] = field(kw_only=True, default=())

@@ -631,6 +631,7 @@ def _evened(E: Complex, size: Array) -> Complex:
 
 
 def static_weight(loop: Loop) -> float:
+    """Return the weight of the lost static stiffness, g - 1, beside the mismatch."""
     return _STATIC if loop.channels <= _RICH else _STATIC_OF_MANY
 
 

@@ -256,7 +256,7 @@ def design(
         return _for_this_environment(loop, starts, limiter, band_hz)
     if loop.varying_delay:
         raise ValueError(
-            "delays that vary: this function designs for this-environment only, design_coupling for others, too"
+            "delays that vary: this function covers this-environment only; use design_coupling for other conditions"
         )
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
@@ -551,7 +551,7 @@ def _stiffest_linear(loop: Loop) -> Design:
 
 _TAP_DIGITS = 12  # digits of a coefficient; the rounding error is far below _SLACK
 _STIFF_RESERVE = 1e-3  # unused share of the damping, for rounded gains and frequencies between the imposed ones
-_STIFF_DIGITS = 6
+_STIFF_DIGITS = 6  # digits of a gain
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
@@ -560,7 +560,7 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     d is the usable damping [N s/m]. For psi = 0 the stiffness is half the largest one for any environment.
 
     With delay in the environment, the loop of coupling and environment is stable if the coupling is stiffer than the
-    environment at every frequency. A further start is therefore stiffer than it at half the sampling rate.
+    environment at every frequency. So a further start is stiffer than the environment at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))

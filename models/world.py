@@ -3,8 +3,8 @@
 A device touches a contact: a body of the scene that is a child of the world body and has no joint. A coupling with
 the direct part D_V responds within the tick, u = u0 - D_V f, where u0 is the contact's position without force. Device,
 delays and coupling therefore act on the scene like one spring G = D_V^-1 from the contact to the point u0. The program
-adds this spring and slides along the contact's directions. While no force is limited, MuJoCo's `discrete` integrator
-then solves in each step
+adds this spring, and slide joints along the contact's directions. While no force is limited, MuJoCo's `discrete`
+integrator then solves in each step of length h
 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
 
