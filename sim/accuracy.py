@@ -79,7 +79,7 @@ _SETTINGS = (
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
 _REPEATS = 3  # number of runs; the shortest wall time is the cost
-_TAIL = 4000  # ticks at the end of a run, in which a limit cycle is measured
+_TAIL = 4000  # number of ticks at the end of a run in which a limit cycle is measured
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Row:
     growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
-    cycle_frequency_hz: float | None  # frequency of this force
+    cycle_frequency_hz: float | None  # frequency of the same force in the limit cycle
     cycle_deviation_error: float | None  # relative error of `cycle_deviation_n`
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
@@ -322,7 +322,7 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
 
 def response(G: Lti, x: Array) -> Array:
     """Return y = G x (N, outputs) from rest for x (N, inputs)."""
-    rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # [state, x] of every tick
+    rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # a row per tick: [state, x]
     rows[:-1, G.order :] = x
     step = np.hstack([G.A, G.B]).dot
     with np.errstate(over="ignore", invalid="ignore"):  # An unstable run may overflow.
@@ -347,7 +347,7 @@ def _rms(values: Array) -> float:
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
 _EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics per step; other integrators need one
-_MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
+_MOST_EVALUATIONS = 6e7  # largest number in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
 _FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three

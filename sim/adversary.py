@@ -31,7 +31,7 @@ from haptic_loop.sim.stability import ClosedLoop, dominant_mode, exact_loops
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-_MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
+_MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # ranges of the searched masses [kg] and stiffnesses [N/m]
 _WITHIN = 4  # number of parameters that place a device within its guaranteed bounds (models.device.Mechanics)
 _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
@@ -57,7 +57,7 @@ class Worst:
     spectral_radius: float
     growth: float  # [1/s]
     frequency_hz: float
-    evaluated: int  # number of sets of humans
+    evaluated: int  # number of sets of humans that were tried
     mechanics: Sequence[Mechanics] = ()  # mechanics of the devices, if all have bounds; () from search_population
 
     @property

@@ -53,7 +53,7 @@ class ScenarioRun:
     ran: Simulation  # the loop with its net, if it has one, as it ran
     period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
-    settings: EngineSettings  # with defaults filled in
+    settings: EngineSettings  # engine, integrator and steps, with defaults filled in
     remarks: list[str]  # remarks on integrator and substeps
     trace: Trace
     wall_s: float

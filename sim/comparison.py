@@ -50,12 +50,12 @@ class Alternative:
     guarantee: str | None = off_table(default=None)
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
-    growth_rate_per_s: float | None = None  # of the exact loop
+    growth_rate_per_s: float | None = None  # growth of the exact loop
     force_error_percent: float | None = None  # None if the loop is unstable, or has walls or friction
     required_damping: dict[str, tuple[float, ...]] = field(default_factory=dict)  # [N s/m], by condition
     reason: str | None = off_table("if given", None)  # why there is no such coupling
     requirements: dict[str, Requirement] | None = off_table("left out", None)
-    trace: Trace | None = off_table("left out", None)  # of the exact engine
+    trace: Trace | None = off_table("left out", None)  # the exact engine's run
     ideal: Array | None = off_table("left out", None)  # (N, m) forces [N] of Lambda E for the motion of `trace`
     until_s: float | None = off_table("left out", None)  # time from which the devices' linear model is not credible
 

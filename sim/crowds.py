@@ -85,9 +85,9 @@ class Validation:
     humans: int
     links: int
     engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
-    duration: float  # [s] of the traces; 0 for none
-    threads: int = 0  # of MuJoCo; 0 for all
-    environments: tuple[Member, ...] = ()  # humans meet these in turn; if empty, all meet the scenario's environment
+    duration: float  # [s] length of the traces; 0 for no traces
+    threads: int = 0  # number of MuJoCo's threads; 0: one, or one per core for large batches
+    environments: tuple[Member, ...] = ()  # environments that humans meet in turn; if empty, the scenario's alone
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 

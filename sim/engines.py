@@ -579,8 +579,8 @@ def _profiler_clock() -> ctypes.c_void_p | None:
 class _PlantSpeed:
     """The fastest motions of a plant, which bound the step of an integrator."""
 
-    mode: float  # [rad/s] of the fastest weakly damped mode, 0 without any
-    rate: float  # [1/s] of the strongest damping
+    mode: float  # [rad/s] frequency of the fastest weakly damped mode; 0 if there is none
+    rate: float  # [1/s] decay rate of the mode that decays fastest
 
     def within(self, h: float) -> bool:
         """Return whether RK4 steps of h seconds resolve these motions."""

@@ -44,7 +44,7 @@ class HeldDevices:
     T: float  # [s]
     #: (indices of the humans, humans, their plants, indices of motors and handles in a plant state)
     groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
-    late: tuple[float, ...] | None = None  # (m,) [s] from the tick to the latch of the forces; None: latch at ticks
+    late: tuple[float, ...] | None = None  # (m,) [s] time from a tick to the latch of its force; None: at ticks
 
     @classmethod
     def drawn(
@@ -150,7 +150,7 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
-_EASE = 0.5  # [s] in which the hand's force grows to its constant value
+_EASE = 0.5  # [s] time in which the hand's force grows to its constant value
 _START = 1e-3  # [m] initial displacement of the motor or handle that moves most
 _BLOCK = 64  # ticks between two calls of `progress`
 DECIDED = 0.2  # [1/s] a linear growth rate closer to zero than this cannot be seen within a trace
@@ -183,9 +183,9 @@ class Points:
 
     cell: Cells  # flat index in the grid
     oscillates: NDArray[np.bool_]  # whether an oscillation lasts to the end of the trace
-    amplitude: Array  # [m] of the oscillation; inf: diverged
-    frequency_hz: Array  # [Hz] of the oscillation; nan: diverged
-    growth: Array  # [1/s] of the exact loop's fastest growing mode that oscillates visibly or runs away
+    amplitude: Array  # [m] amplitude of the oscillation; inf if the trace diverged
+    frequency_hz: Array  # [Hz] frequency of the oscillation; nan if the trace diverged
+    growth: Array  # [1/s] growth of the dominant mode that oscillates visibly or runs away, in the exact loop
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
@@ -245,7 +245,7 @@ class _Trial:
     """One simulation: the computer's process, the human that holds the devices, and the initial state."""
 
     process: Process
-    links: Array  # (m, links, 3) as in Crowd
+    links: Array  # (m, links, 3) links of each hand, as in Crowd
     start: Array  # (states + order,) plant state, then the state of the linear process
 
 

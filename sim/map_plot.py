@@ -31,7 +31,7 @@ _LINES: dict[str, dict[str, Any]] = {
     "known-device-any": plots.STYLES[4] | {"linestyle": "--", "linewidth": 1.8},
     MODEL_KEPT: plots.STYLES[3] | {"linewidth": 1.8},
 }
-_OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # for a user's own condition
+_OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # line of a user's own condition
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:

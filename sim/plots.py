@@ -453,7 +453,7 @@ class Panel:
     title: str
     trace: Run
     ideal: Array  # (N, m) forces of the ideal environment [N]
-    until: float | None = None  # [s] at which the run stops being credible; None if it never does
+    until: float | None = None  # [s] time at which the run stops being credible; None if it never does
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:

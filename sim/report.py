@@ -44,7 +44,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The paper's numbers compared with ours.
+# The paper's numbers compared with those computed here.
 
 
 #: The transparency indices (25) [dB] that the paper prints; none of our readings of Figure 4 reproduces them.
@@ -62,7 +62,7 @@ class PaperRow:
 
 
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Return the paper's numbers with ours; empty for any loop but the paper's."""
+    """Return the paper's numbers with those computed here; () for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
@@ -149,7 +149,7 @@ class _DelaysMet:
     """The delays that occurred in a run, and the growth of its linear loop under them."""
 
     age: _Age | None  # None if some channel receives no force
-    lost_packets: list[int]  # (m,)
+    lost_packets: list[int]  # (m,) number of lost packets
     held_ticks: list[int]  # (m,) ticks in which no newer force arrived
     growth_rate_per_s: float
     verdict: str | None  # None if the rate is too small for the trace's duration

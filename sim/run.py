@@ -81,7 +81,7 @@ class Simulation:
     coupling: Coupling
     process: Process
     scene: Scene
-    plant: HeldPlant  # for periods T, with forces that latch in the middle of the range of latencies
+    plant: HeldPlant  # the plant over periods T, with forces that latch in the middle of the range of latencies
     timing: Timing | None = None  # begin and latch times of ticks; None without `period` and `latency` in the scenario
 
     @cached_property

@@ -73,7 +73,7 @@ class RunReport:
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
     robustness: Robustness | None = off_table(default=None)
-    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the paper's numbers with ours
+    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the paper's numbers, and those computed here
     remarks: tuple[str, ...]
 
     @property

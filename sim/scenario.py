@@ -79,8 +79,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     name: str
-    unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
-    radius: float | None = None  # [m] from the axis of rotary devices to the hand, for the limits of a session
+    unit: PositionUnit = "m"  # unit of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
+    radius: float | None = None  # [m] distance of the hand from a rotary device's axis, for a session's limits
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples], the paper's equation 4
     psi: _Delays = _UNSAID  # environment delays [samples], equation 5; default: 0
@@ -91,7 +91,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     lam: _Delays | None = None  # reference delays [samples], equation 7; None: `reference_delays` of the case
     person: tuple[Person, ...] = ()  # people who hold several devices
     tap: _Tap | None = None
-    duration: float = 15.0  # [s]
+    duration: float = 15.0  # simulated time [s]
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
@@ -919,7 +919,7 @@ def _lists(value: Any) -> Any:
 
 
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))  # stands for a human of a user's own class while other fields are checked
-_TIMES = np.array([0.0, 0.1])  # [s] at which the voluntary force of a user's own hand is tested
+_TIMES = np.array([0.0, 0.1])  # [s] times at which a user's own voluntary force is tested
 
 
 def _is_own(name: str, value: Any) -> bool:

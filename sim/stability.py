@@ -27,7 +27,7 @@ from haptic_loop.sim.trace import Trace
 
 #: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
-_CLEAR = 1e-3  # [1/s] below this growth rate the errors of engines may change its sign
+_CLEAR = 1e-3  # [1/s] errors of engines may change the sign of a smaller growth rate
 _JUDGED = 4.0, 20.0, 100.0  # [s] durations, tried in turn until the sign of a varying loop's growth is certain
 _SHIFT, _INVERSE_STEPS = 1e-11, 4  # distance from the eigenvalue and number of steps of inverse iteration
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
@@ -323,9 +323,9 @@ class _Contact:
 class Stability(Eigenvalues):
     """The verdicts of the trace and of the exact loop's eigenvalues (with walls, of the worst contact state)."""
 
-    verdict: str | None  # of the run; None if nothing decides it
+    verdict: str | None  # verdict on the run; None if nothing decides it
     clipped_ticks: int
-    growth_rate_per_s: float | None  # if None, `reason` says why
+    growth_rate_per_s: float | None  # growth rate of the trace; if it is None, `reason` says why
     frequency_hz: float | None  # strongest frequency of the forces at the end of the trace
     contact: _Contact | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)
@@ -417,7 +417,7 @@ _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the eng
 class ImpulseTest:
     """The results of an impulse test, with one entry per simulation."""
 
-    growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode before a force clips; nan if it cannot be fitted
+    growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan without fit
     error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
     clipped: NDArray[np.int64]  # (nsim,) ticks in which a force is at its limit or, with a limiter, the limiter acts
     least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick

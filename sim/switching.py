@@ -49,10 +49,10 @@ _STREAM = 5  # random stream of the delays, independent of the humans' stream wi
 class Period:
     """Periodic switching with the exact growth of the loop."""
 
-    ages: Ticks  # (period, m)
-    delays: Ticks  # (period, m) of packets that produce these ages
-    growth: float  # [1/s]
-    spectral_radius: float  # of the product over one period
+    ages: Ticks  # (period, m) ages of the forces in use [samples]
+    delays: Ticks  # (period, m) delays of packets that produce these ages
+    growth: float  # [1/s] growth over one period
+    spectral_radius: float  # spectral radius of the product over one period
 
 
 # ---- one run

@@ -236,9 +236,9 @@ RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 class Oscillation:
     """The strongest oscillation of positions, with one entry per simulation."""
 
-    sustained: NDArray[np.bool_]  # (nsim,) whether it lasts
-    amplitude: Array  # (nsim,) [m] of the strongest lasting octave, or of the strongest if none lasts; inf: diverged
-    frequency_hz: Array  # (nsim,) [Hz] the strongest line in that octave; nan: diverged
+    sustained: NDArray[np.bool_]  # (nsim,) whether the oscillation lasts
+    amplitude: Array  # (nsim,) [m] amplitude of the strongest lasting octave, else of the strongest; inf: diverged
+    frequency_hz: Array  # (nsim,) [Hz] frequency of the strongest line in the same octave; nan: diverged
 
 
 def slowest_seen(duration: float) -> float:
@@ -302,7 +302,7 @@ _SHORTEST = 200  # ticks that a growth rate needs
 _FLOOR = 3.0  # an oscillation must exceed this multiple of the encoders' rounding in its octave
 _CLEAR = 4.0  # standard errors by which a slope must differ from zero, because a line may have only four points
 _FARTHEST = 1e100  # [m] the square of a larger number may overflow
-_EVEN = 1e-3  # periods may differ by this share; rounding of long times is smaller
+_EVEN = 1e-3  # largest relative difference of a trace's periods; rounding of long times is smaller
 _FINEST = 1e-9  # [m] step assumed for an ideal encoder, above floating-point noise
 
 

@@ -29,7 +29,7 @@ class Unstable:
 
     exact: int
     mujoco: int | None
-    own: int | None = off_table("if given", None)  # by a user's own engine
+    own: int | None = off_table("if given", None)  # number by a user's own engine
     others: str = off_table("left out", "")  # the other engine's count and name
 
     @classmethod
@@ -153,10 +153,10 @@ class Traces:
     measured: int  # traces with a growth rate
     witnessed: int  # traces that MuJoCo, or a user's own engine, also made
     undecided: int  # traces that are too short for the sign of their rate; eigenvalues decide there
-    largest_difference_per_s: float | None  # between the growth rates of trace and exact loop
+    largest_difference_per_s: float | None  # largest difference of the growth rates of trace and exact loop
     stable_and_settling: int  # stable loops whose handles were slower in the last quarter than in the second
     stable: int
-    slowest_settling: float | None  # largest ratio of these speeds among the stable loops
+    slowest_settling: float | None  # largest ratio of late to early speeds of handles among the stable loops
     slowest_decay_s: float | None  # decay time of the slowest mode that decays
     settling_decides: bool  # whether the traces are long enough for handles to slow down
     reason: str | None = off_table("if given", None)
@@ -227,7 +227,7 @@ class Growing(Generic[_Met]):
     """The number of humans with whom the loop grows while delays or ticks vary; it must be 0 if `covered`."""
 
     met: _Met = off_table("inlined")
-    covered: bool = off_table()  # by certificates
+    covered: bool = off_table()  # whether certificates cover the variation
     unstable: Unstable = off_table()
     humans: int = off_table()
     mujoco_unclipped: int = off_table()

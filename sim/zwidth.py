@@ -501,7 +501,7 @@ class Mark:
     requirement: dict[str, Requirement]
     growth: float  # [1/s] worst over the population
     unstable: int  # number of humans that make the loop unstable
-    stiffest: dict[str, float | None]  # by condition, and "population"
+    stiffest: dict[str, float | None]  # condition, or "population" -> largest safe K [N/m]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _NOT_REACHED = "not reached before the interruption"
 class _Ratio:
     """The figures of one condition over the cells."""
 
-    required_over_available: Array  # (rows, columns) of the grid
+    required_over_available: Array  # (rows, columns) required over available damping
     certified_cells: int
     contradicted_cells: int | None = off_table("if given")  # certified, but unstable with a human of the population
     reason: str | None = off_table("if given")
@@ -103,8 +103,8 @@ class FixedCoupling:
     """The coupling of a map over environments."""
 
     kind: str
-    contact_springs: list[_ContactSpring]  # of the scenario's environment
-    assessment: Assessment  # in that environment
+    contact_springs: list[_ContactSpring]  # the springs at contacts of the scenario's environment
+    assessment: Assessment  # the assessment in the scenario's environment
     remarks: tuple[str, ...]
 
     @classmethod
@@ -185,7 +185,7 @@ class MapReport:
     wall_s: dict[str, float]
     axes: str  # whether K and B belong to the "coupling" or the "environment"
     ratios: dict[str, _Ratio] = off_table("inlined")
-    fixed: FixedCoupling | None = off_table("inlined")  # of a map over environments
+    fixed: FixedCoupling | None = off_table("inlined")  # the coupling of a map over environments
     error: dict[str, MapError | None] | None = off_table("if given")
     marks: list[_Marked] | None = off_table("if given")
     claim: str | None = off_table("if given")  # the claim of a user's own condition, if it certifies a cell

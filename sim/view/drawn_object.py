@@ -144,7 +144,7 @@ class _Motion:
         if coupling.compliance(T) is not None:  # Otherwise the contacts coincide with the devices.
             late = Lti.diag(delay(psi, T), Lti.constant(np.eye(further), T))
             G = Coupling.around(coupling, late @ G, further)
-        self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # from [x; forces on nodes] to [f; nodes' places]
+        self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # maps [x; forces on nodes] to [f; nodes' places]
         self._tick = self._law.transition()
         ports, order = self._law.channels, self._law.open.order
         self._before, self._after = np.zeros((order + ports, 1)), np.zeros((ports + order, 1))

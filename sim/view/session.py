@@ -166,7 +166,7 @@ class Menu:
     """The settings with which keys and scripts choose couplings."""
 
     case: str
-    condition: str | Condition | None = None  # of designs; None for the default of the kind
+    condition: str | Condition | None = None  # condition of designs; None for the kind's default
     given: str | None = None  # the file of --coupling
     limiter: bool | None = None  # False: forces are clipped
 
@@ -179,7 +179,7 @@ class PreparedLoop:
     label: str  # name of the coupling in scripts
     chosen: Chosen
     simulation: Simulation
-    mode: Mode | None  # of the exact linear loop, or of the worst contact state; None for a world
+    mode: Mode | None  # dominant mode of the exact loop, or of its worst contact state; None for a world
     assessment: Assessment
 
     @property
@@ -233,7 +233,7 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 # The session.
 
 
-HISTORY = 4.0  # [s] of forces in a picture
+HISTORY = 4.0  # [s] time span of the forces in a picture
 _BLOCK = 64  # largest number of ticks in one block
 LONGEST_LAG = 0.1  # [s] lag that a window may catch up in one frame; a longer lag is dropped and counted
 _STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as in the hands of the default scenario

@@ -278,7 +278,7 @@ class _ShownWorld(_ShownScene):
         self.model.vis.headlight.ambient[:], self.model.vis.headlight.diffuse[:] = 0.45, 0.5
         away = [rest - self.model.stat.center + (0.0, 0.0, 0.2 * self.model.stat.extent) for rest in self._rest]
         length = 0.45 * self.model.stat.extent
-        self._stylus = [length * one / max(float(np.linalg.norm(one)), 1e-9) for one in away]  # from tip to handle [m]
+        self._stylus = [length * one / max(float(np.linalg.norm(one)), 1e-9) for one in away]  # [m], tip to handle
 
     def show(self, frame: Frame) -> None:
         """Set the bodies to the pose of a frame."""
@@ -432,7 +432,7 @@ def _connect(
 # The window.
 
 _RATE = 60.0  # frames per second
-_PATIENCE = 30  # [s] for the display to answer
+_PATIENCE = 30  # [s] time for the display to answer
 
 # Without a display the viewer's thread dies and its caller waits forever, so a separate process first opens a window.
 _PROBE = (
