@@ -337,7 +337,10 @@ def outside_forces(
             if rows.shape == (t.size, device.axes):
                 rows = rows[:, list(device.free)]
             if len(rows) != t.size or rows.ndim != 2 or rows.shape[1] not in (1, len(columns)):
-                raise InputError(f"human #{i}.voluntary_force(t) has the shape {force.shape} for {t.size} times")
+                raise InputError(
+                    f"human #{i}.voluntary_force(t) has the shape {force.shape} for {t.size} times, expected one force "
+                    "per time, or one per time and axis"
+                )
             if not (finite := np.isfinite(rows).all(axis=1)).all():
                 k = int(np.argmin(finite))
                 raise InputError(

@@ -101,7 +101,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
-            raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
+            raise ValueError(f"name has {len(self.name)} characters, allowed are up to {_LONGEST_NAME}")
         self._per_channel()
         if self.channels > _MOST_CHANNELS:
             raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")

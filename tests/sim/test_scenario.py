@@ -405,7 +405,7 @@ def test_incomplete_or_unknown_devices_are_refused(device, message):
 
 
 def test_too_many_delay_states_are_refused():
-    with pytest.raises(ValueError, match=r"1998 samples in all, allowed are 1000: each sample is a state, .* 80 s"):
+    with pytest.raises(ValueError, match=r"1998 samples in all, allowed are 1000: each sample is a state, .*about 8 s"):
         load().replace(theta=(999, 999))
 
 
