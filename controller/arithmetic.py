@@ -298,8 +298,9 @@ def solve(M: Array, right: Array) -> Array:
 def _solve_exactly(M: Any, right: Any) -> Any:
     """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
-    The matrices come from series of small blocks and are triangular after a permutation. The next pivot is in the row
-    with the fewest entries, and there in the column with the fewest (Markowitz), so that few zeros become nonzero.
+    Most of the matrices come from series of small blocks and are triangular after a permutation. The next pivot is in
+    the row with the fewest entries, and there in the column with the fewest entries (Markowitz), so that few zeros
+    become nonzero.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]

@@ -205,10 +205,10 @@ class EnergyBudget(_Net):
         damping = (1 - EPS) * delta[:, None]
         self._step, self._coarse = steps[:, None], bool(steps.any())
         self._damping, self._square = damping / T, T / (4 * damping)  # coefficients of dx^2 and of a^2
-        #: (depth, m, nsim) largest loss [J] of this tick and of the next ones, for the packets sent so far
+        #: (depth, m, nsim) largest loss [J] of this tick and of each later tick, for the packets sent so far
         self._reserve = np.zeros((int(oldest.max()) + 1, delta.size, nsim))
-        ahead = np.arange(len(self._reserve))[:, None]
-        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) whether a packet sent now may act then
+        ahead = np.arange(len(self._reserve))[:, None]  # ticks from now
+        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) whether a packet sent now can act then
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
         self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth

@@ -69,7 +69,7 @@ class Complementarity(_Problem):
             part, inverse = self.M[chosen], np.zeros((w, w))
             if not np.linalg.det(part / np.abs(self.M).max(initial=1e-300)) > 0:
                 which = [i + 1 for i, on in enumerate(pushing) if on]
-                raise SingularLoop(f"the forces of walls {which} are not determined: {part.tolist()}")
+                raise SingularLoop(f"the forces of walls {which} are not determined by their matrix {part.tolist()}")
             inverse[chosen] = np.linalg.inv(part)
             maps.append(inverse)
         return np.concatenate(maps)
@@ -121,7 +121,7 @@ class BoxProblem(_Problem):
                 minor = np.linalg.det(unit[np.ix_(chosen, chosen)])
                 if minor < -_LEAST_MINOR:
                     which = [i + 1 for i in chosen]
-                    raise SingularLoop(f"limited forces {which} are not determined: {self.M.tolist()}")
+                    raise SingularLoop(f"limited forces {which} are not determined by the matrix {self.M.tolist()}")
                 regular &= bool(minor > _LEAST_MINOR)
         return regular
 
@@ -198,7 +198,7 @@ class BoxProblem(_Problem):
             left = left[wrong.any(axis=0)]
             if not left.size:
                 return np.where(signs * v > 0, v, 0.0)
-        raise SingularLoop(f"limited forces are not determined: {self.M.tolist()}")
+        raise SingularLoop(f"limited forces are not determined by the matrix {self.M.tolist()}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ class _BallBlock:
         least = float(np.linalg.eigvalsh((unit + unit.T) / 2)[0])
         if least < -GROUNDED:
             rows = (at + 1).tolist()
-            raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
+            raise SingularLoop(f"forces {rows}, limited as vectors, are not determined by the matrix {own.tolist()}")
         self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # makes v unique, too
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
         self._by_tau, self.tau = self.M / tau, tau[:, None]

@@ -36,7 +36,7 @@ class Coupling:
     """
 
     kind: ClassVar[str] = "own"  # name of the class in reports
-    holds_model: ClassVar[bool] = False  # whether it contains a linear model of the environment (without walls)
+    holds_model: ClassVar[bool] = False  # whether the coupling contains a linear model of the environment
     one_period: ClassVar[bool] = False  # whether coefficients are valid only for the T of the design
 
     def around(self, environment: Block, further: int = 0) -> Block:
@@ -85,7 +85,7 @@ class Coupling:
     def turned(self, Q: Array) -> Coupling:
         """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m).
 
-        Raises ValueError for a class of couplings that cannot be turned, and for velocity filters.
+        Raises ValueError for a class of couplings that cannot be turned, and for springs with filtered dampers.
         """
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be turned to other axes")
 
@@ -520,10 +520,10 @@ NO_PAIRS = np.zeros((0, 2))
 def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
     """Return the basis functions b_k(z) for n poles and p pairs, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
-    b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each function
-    is multiplied by the all-pass sections of the poles before it. For real poles this makes it a Takenaka-Malmquist
-    function up to scale; the two functions of a pair span the same space as two such functions. Poles at zero give 1,
-    1/z, 1/z^2 and so on.
+    b_0 = 1. A real pole a adds (1 - a)/(z - a). A pair adds the two functions (1 + b1 + b2) z/d and (1 + b1 + b2)/d
+    with d = z^2 + b1 z + b2. Each function is multiplied by the all-pass sections of the poles before it. For real
+    poles this makes it a Takenaka-Malmquist function up to scale; the two functions of a pair span the same space as
+    two such functions. Poles at zero give 1, 1/z, 1/z^2 and so on.
     """
     values, through = [np.ones_like(z)], np.ones_like(z)
     for a in poles:

@@ -40,7 +40,7 @@ def delay(steps: Sequence[int], T: Number) -> Lti:
 
 
 def moving_sum(steps: Sequence[int], T: Number) -> Lti:
-    """Return diag(1 + 1/z + ... + z^-n_i)."""
+    """Return diag(1 + 1/z + ... + z^-n_i) in the arithmetic of T."""
     return _chains(tuple((1,) * (n + 1) for n in steps), T)
 
 

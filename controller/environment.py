@@ -41,7 +41,7 @@ _MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can h
 def _check_amount(what: str, value: float, unit: str) -> None:
     if value != 0 and not _LEAST_AMOUNT <= value <= MOST_AMOUNT[unit]:
         raise ValueError(
-            f"{what} is {value}, allowed are 0 and 1e-12 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)"
+            f"{what} is {value}, allowed in a passive network are 0 and 1e-12 to {MOST_AMOUNT[unit]:g} {unit}"
         )
 
 
@@ -472,7 +472,10 @@ class Network(
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
-        """Return the elongations that a part resists, each as (node, coefficient) pairs: one, or one per coordinate."""
+        """Return the elongations that a part resists, each as (node, coefficient) pairs.
+
+        A part with a direction resists one elongation, a part without a direction one for each coordinate.
+        """
         direction = part.along if isinstance(part, Spring) else part.normal
         ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
         count = len(ends[0][0]) if ends else 0
@@ -559,8 +562,9 @@ _MOST_COMPUTED = 32
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:
     """Return the environment with ports for walls, from [x; p] to [f; y].
 
-    p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node also has a port
-    from a force against its displacement to this displacement. These ports come before those of the walls.
+    p are the forces [N] of the walls, and y the displacements [m] across them. With `places` every node also has a
+    port, whose input is a force against the node's displacement and whose output is this displacement. These ports come
+    before those of the walls.
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)

@@ -84,7 +84,7 @@ class Law(ReadOnly):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        """The pairs (row of [f; z+], bound [N]) of limited forces; within all bounds no force is changed."""
+        """The pair (row of [f; z+], bound [N]) of each limited force. Within these bounds the limiter changes none."""
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:

@@ -44,7 +44,7 @@ class DelayRange(Strict, frozen=True):
     def __post_init__(self) -> None:
         shown = f"delays from {list(self.lo)} to {list(self.hi)} samples"
         if len(self.lo) != len(self.hi):
-            raise ValueError(f"{shown}, expected as many largest delays as least ones")
+            raise ValueError(f"{shown}, expected equal numbers of least and largest delays")
         if any(not 0 <= a <= b <= MOST_SAMPLES for a, b in zip(self.lo, self.hi, strict=True)):
             raise ValueError(f"{shown}, expected 0 <= lo <= hi <= {MOST_SAMPLES} on every channel")
 
@@ -103,7 +103,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and largest latency of forces after kT
     T_min: _Positive | None = None  # [s] shortest period, for the known-device condition and the latency
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
-    axes: tuple[int, ...] | None = None  # number of channels of each device; None: one each
+    axes: tuple[int, ...] | None = None  # number of channels of each device; None: one for each device
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], with diagonals as in delta; None: diag(delta)
     unit: PositionUnit = "m"  # unit of positions; with "rad" N m, N m s/rad and kg m2 replace N, N s/m and kg
 
@@ -196,7 +196,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
 
     @property
     def devices(self) -> tuple[slice, ...]:
-        """The channels of every device."""
+        """The channels of every device, as a slice."""
         ends = np.cumsum(self.axes or (1,) * self.channels).tolist()
         return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
 
@@ -224,7 +224,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return out
 
     def period(self, exact: bool = False) -> Number:
-        """Return T, whose type determines the arithmetic of all blocks."""
+        """Return T, a Fraction if `exact`; its type determines the arithmetic of all blocks."""
         return rational(self.T) if exact else self.T
 
     def E(self, exact: bool = False) -> Lti:

@@ -43,7 +43,7 @@ Complex = NDArray[np.complex128]
 
 
 def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
-    """Return a read-only float64 copy of `value`. Raises ValueError, with `name`, unless it has `ndim` axes."""
+    """Return a read-only float64 copy of `value`. Raises ValueError about `name` unless `value` has `ndim` axes."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -70,10 +70,10 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # largest block that fits the processor's cache: rows, points, entries
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # rows, points and entries that are computed together in the cache
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
-_UNIT = 1e-15  # bound on the rounding of a product of few matrices, relative to its terms
+_UNIT = 1e-15  # bound on the rounding of a product of a few matrices, relative to its terms
 _UNSEEN = 1e-18  # trailing weights below this size, relative to the response, are omitted
 _ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] a response's size is evaluated here and at the angles of its poles
 _OFF_CIRCLE = 1e-9  # largest | |z|^2 - 1 | of a point on the unit circle

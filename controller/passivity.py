@@ -22,10 +22,10 @@ _TOGETHER = 2**18  # largest number of entries of resolvents in memory
 def hermitian_floor(G: Lti, enough: float, unwanted: float, rounding: float = 1.0) -> tuple[float, float, float]:
     """Bound the least eigenvalue of He G(e^jw) from below over all w, by intervals that are halved where necessary.
 
-    R = (zI - A)^-1 at the middle of an interval bounds |G'| and |G''| on it. Near a narrow resonance |R| is large and
-    the intervals become short, so that no resonance is missed. On an interval of half-width h around w0,
-    He G(w0 + t) >= He [G(w0) + t G'(w0)] - h^2 M/2 with M >= |G''|. The least eigenvalue of the right side is concave
-    in t, so it is evaluated at both ends only. An a-priori bound on the rounding errors is subtracted.
+    Let G(w) be short for G(e^jw). R = (zI - A)^-1 at the middle of an interval bounds |G'| and |G''| on the interval.
+    Near a narrow resonance |R| is large and the intervals become short, so that no resonance is missed. On an interval
+    of half-width h around w0, He G(w0 + t) >= He [G(w0) + t G'(w0)] - h^2 M/2 with M >= |G''|. The least eigenvalue of
+    the right side is concave in t, so it is evaluated at both ends only. A bound on the rounding errors is subtracted.
 
     Args:
         G: A stable block of floats. It is real, so that the interval [0, pi] is enough.
@@ -71,7 +71,7 @@ def _balanced(G: Lti) -> Lti:
     return Lti(G.A * size / size[:, None], G.B / size[:, None], G.C * size, G.D, G.T)
 
 
-_IDLE = 1e-13  # smaller singular values, relative to the largest one, belong to idle directions
+_IDLE = 1e-13  # smaller singular values, relative to the largest one, belong to directions in which G is zero
 _Lost = tuple[float, float, float]
 
 

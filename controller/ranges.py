@@ -60,8 +60,8 @@ class Member:
 class Region:
     """A part of the ranges with a fixed set of present springs, in which only numbers vary."""
 
-    low: Array  # (n,) the ends of the ranges
-    high: Array  # (n,)
+    low: Array  # (n,) the lower ends of the ranges
+    high: Array  # (n,) the upper ends
     at: Callable[[str, Array], Member]  # (name, point between low and high) -> the member at this point
 
 

@@ -52,7 +52,7 @@ class Net(Protocol):
         ...
 
     def figures(self) -> NetFigures:
-        """Return figures of the net's action so far."""
+        """Return figures of the layer's action so far."""
         ...
 
 
@@ -64,7 +64,7 @@ class Process(ReadOnly):
     force_limit: Array  # (m,) [N], inf without a limit
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
-    net: Callable[[int], Net] | None = None  # makes a net for a number of simulations
+    net: Callable[[int], Net] | None = None  # makes a passivity layer for a number of simulations
     balls: tuple[slice, ...] = ()  # neighbouring channels with one limit for the length of their force vector
 
     def __post_init__(self) -> None:

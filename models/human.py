@@ -1,4 +1,4 @@
-"""Humans as passive ports at the handles: chains of masses, persons with several devices, random humans, own classes.
+"""Humans as passive ports at the handles: chains of masses, persons with several devices, and random humans.
 
 Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
 feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). The constructor of a `Port` checks passivity,
@@ -495,7 +495,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_
 
 
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
-    """Raise ValueError where a person holds a device that does not exist or that another person holds."""
+    """Raise ValueError if a person holds a device that does not exist or that another person holds."""
     held: set[int] = set()
     for i, holds in enumerate(held_by, start=1):
         for channel in holds:

@@ -640,8 +640,8 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) of free axes; () if links have three numbers, else 1 + 2 axes^2 each
-    mechanics: _Drawn = ()  # (nsim, devices), or empty where every hand holds the scenario's devices
+    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes; () if links have three numbers, else 1 + 2 axes^2
+    mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
@@ -838,7 +838,10 @@ class Variants:
 
 
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
-    """Return the models of the devices with every set of humans. Raises ValueError as `build` does."""
+    """Return the models of the devices with every set of humans.
+
+    Raises ValueError as `build` does, or if humans of one device differ in their structure.
+    """
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)
     scene = _compiled(devices, first, drawn=False)

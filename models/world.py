@@ -35,7 +35,7 @@ ITERATIONS, TOLERANCE = 100, 1e-10  # limits of the Newton solver
 _MOST_REPETITIONS = 8  # largest number of repetitions of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # hysteresis of the decision whether a force is limited, relative to the limit
 _DIRECTION_SLACK = 1e-6  # repetitions end when they change limited forces by less than this part of the limit
-_TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
+_TOO_LARGE = 50_000_000  # [bytes] largest size of an XML file of a scene
 
 
 @dataclass(frozen=True)
@@ -444,7 +444,10 @@ def _force_settings(spec: Any, h: float, gravity: bool) -> None:
 
 
 def _off_rest(model: mujoco.MjModel) -> None:
-    """Lengthen tendon springs by 1e-12 of their length, or from 0 to 1e-12: MuJoCo ignores a spring exactly at rest."""
+    """Lengthen tendon springs by 1e-12 of their rest length, or from 0 to 1e-12 m.
+
+    MuJoCo ignores a tendon spring exactly at rest. Springs with a range of rest lengths are not changed.
+    """
     if not model.ntendon:
         return
     exact = (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(axis=1)
@@ -561,7 +564,7 @@ class WorldPort:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Repeat the step until two in a row limit the same contacts with the same forces.
+        """Repeat the step until two in a row limit the same contacts with the same forces, up to _DIRECTION_SLACK.
 
         At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force acts instead of the
         spring.
