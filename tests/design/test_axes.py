@@ -210,6 +210,7 @@ def test_any_environment_with_a_latency_takes_levels() -> None:
         for n, late in ((1, 1e-4), (2, 2e-4))
     ]
     needs = required_damping(LATE, BUILT, "any-environment")
+    # Z misses 6e-7 of the peak.
     assert needs.ratio == pytest.approx(least_multiple(of_devices(*each), hermitian_part(V)), rel=1e-4)
 
 
@@ -270,7 +271,7 @@ def test_moving_averages_take_full_levels(loop: Loop) -> None:
     design = design_by_kind(loop, "moving-average")
     assert 0.999 < design.requirement.ratio < 1
     assert prove(loop, design.coupling, "any-environment").proof == "rational"
-    if loop is LATE:  # V(1) = ((theta + 1) T + tau)/2 Delta^-1
+    if loop is LATE:  # V(1) = ((theta + 1) T + tau)/2 Delta^-1; the design is 2e-4 softer
         stiffness = np.linalg.inv(design.coupling.compliance(loop.T).dc())[:2, :2]
         np.testing.assert_allclose(stiffness, 2 / 2.1e-3 * np.array(LEVELS[0]), rtol=3e-4)
 
@@ -306,7 +307,7 @@ def test_a_stiffness_matrix_meets_its_closed_form() -> None:
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
     loop = Loop(1e-3, (2, 2), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1])
-    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))  # softens K by up to 2.5e-6 of K
     largest = np.linalg.eigvals(np.linalg.solve(level, K)).real.max()
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.5e-3 * largest, rel=1e-5)
     isotropic = msgspec.structs.replace(loop, environment=wall.turned(np.eye(2)))
@@ -332,7 +333,7 @@ def test_longest_period_scales_matrix_levels() -> None:
     K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
     wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
     loop = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1], T_max=1.4e-3)
-    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    stiff = _MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))  # softens K by up to 2.5e-6 of K
     largest = np.linalg.eigvals(np.linalg.solve(level, K)).real.max()
     assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.1e-3 * largest, rel=1e-5)
 
@@ -642,7 +643,7 @@ def test_stiffest_coupling_attains_the_matrix_bound() -> None:
     design = design_by_kind(LOOP, "moving-average")
     assert design.requirement.certified
     V1 = design.coupling.compliance(LOOP.T).dc()
-    np.testing.assert_allclose(np.linalg.inv(V1)[:2, :2], [[1500, 400], [400, 900]], rtol=2e-4)
+    np.testing.assert_allclose(np.linalg.inv(V1)[:2, :2], [[1500, 400], [400, 900]], rtol=2e-4)  # 2e-4 softer
     bound = LOOP.T / 2 * np.diag([2.0, 2.0, 3.0, 3.0]) @ np.linalg.inv(LOOP.Delta())
     assert np.linalg.eigvalsh(V1 - bound)[0] > 0
     assert prove(LOOP, design.coupling, "any-environment").proof == "rational"

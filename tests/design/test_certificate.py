@@ -328,7 +328,7 @@ def test_the_bound_on_rounding_holds_over_ticks():
         assert np.abs(off).max() > 0
 
 
-def test_near_sharp_resonances_proof_and_run_agree():
+def test_proof_and_run_agree_near_sharp_resonances():
     """The responses of the float and the rational loop are computed exactly at a point of the circle near a sharp peak.
 
     Their response in floating point errs by more than they differ. `rounding` still bounds their difference, and the

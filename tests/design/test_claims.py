@@ -201,7 +201,7 @@ def test_index_25_of_the_default_environment_is_infinite(case):
     z = np.exp(2j * np.pi * np.array([1e-1, 1e-2, 1e-3]) * T)
     E = figure_4_at(z)
     least = np.linalg.svd(E, compute_uv=False)[:, -1]
-    np.testing.assert_allclose(least[:-1] / least[1:], 100, rtol=0.05)
+    np.testing.assert_allclose(least[:-1] / least[1:], 100, rtol=0.05)  # 3e-4 off at 0.1 Hz
     assert np.linalg.norm(mismatch_at(z, E, *LOOPS[case]), 2, axis=(1, 2)).min() > 50
 
 

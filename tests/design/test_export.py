@@ -65,7 +65,7 @@ def run(program):
     return subprocess.run([program], capture_output=True, text=True, check=False)
 
 
-def test_plain_python_sums_in_the_exported_order():
+def test_plain_python_repeats_the_exported_bits():
     """Python's floats, with one rounding per operation, give the outputs of the test vector to the last bit."""
     block = process_block(Stored.of(PAIR, SOFT))
     test, G = trial(block), block.system
@@ -108,7 +108,7 @@ def limited_files(tmp_path_factory):
     ("name", "limit"), [("pair", (12.0, 5.0)), ("star", (2.0,) * 5), ("free", (3.0, 2.0, 1.0, 2.0))]
 )
 def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
-    """The simulator gives the same forces to 1e-7 of the largest limit, where 20 to 90 % of the ticks reach a limit."""
+    """The simulator's forces differ by rounding, below 1e-7 of the largest limit; 20 to 90 % of ticks reach a limit."""
     stored = limited_files[1][name]
     block = process_block(stored, force_limit=limit)
     test, m = trial(block), len(limit)

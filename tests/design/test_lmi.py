@@ -260,7 +260,7 @@ def test_analysis_refuses_an_active_environment():
         analysis(Lti.constant([[1e-3]], T), active, [0], [0], [1.0])
 
 
-def test_the_matrices_take_parameters():
+def test_lemmas_2_and_3_are_affine_in_systems():
     """Lemmas 2 and 3 are affine in (A, B, C, D): a problem can be compiled once for many systems."""
     rng = np.random.default_rng(3)
     data = {name: cp.Parameter((2, 2)) for name in "ABCD"}

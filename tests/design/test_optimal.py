@@ -208,7 +208,7 @@ def test_every_basis_is_reported_as_it_is_finished():
 @pytest.mark.parametrize(
     ("script", "taken"),
     [
-        ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),  # negligible stiffness
+        ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),  # negligible g may fall
         ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # less than half of another's stiffness is rejected
         ([(0.8, 0.5), (0.7, 0.6), (0.699, 0.6), (0.6, 0.6), (0.58, 0.6), (0.578, 0.6)], 4),
     ],
@@ -465,7 +465,7 @@ def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
 
 
 @pytest.mark.slow
-def test_partial_delay_constraints_leave_a_bound(monkeypatch):
+def test_fewer_delay_constraints_weaken_the_bound(monkeypatch):
     loop = loop_of("n3")
     whole = short_bound(loop).rms
     monkeypatch.setattr("haptic_loop.design.budgets.BOUND_SUMS", 2)
@@ -665,12 +665,12 @@ def test_filters_sum_their_functions_in_every_arithmetic():
     np.testing.assert_array_equal(again.pairs, R.pairs)
 
 
-def test_a_filter_stands_behind_the_environment():
+def test_a_filter_multiplies_the_environments_force():
     loop = loop_of("n0")
     E = loop.E()
     R = best("n0").coupling
     z = on_circle(np.array([0.1, 1.0]))
-    # the series has defective poles: a chain of eleven delays costs eight of sixteen digits
+    # The series has defective poles, a chain of eleven delays, which cost four of sixteen digits here.
     np.testing.assert_allclose(R.around(E).at(z), R.filter(E.T).at(z) @ E.at(z), rtol=1e-6)
     with pytest.raises(ValueError, match="cannot include the walls"):
         R.around(E, further=1)

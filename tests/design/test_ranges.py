@@ -110,7 +110,7 @@ def test_the_nominal_environment_is_no_second_vertex():
     assert [m.network.masses["mass"] for m in members(FIGURE_4, ranges)] == [1.0, 2.0]
 
 
-def test_samples_lie_inside_whatever_their_number():
+def test_samples_lie_inside_and_extend_shorter_draws():
     drawn = inside(FIGURE_4, SMALL, 40, seed=3)
     assert [m.network for m in inside(FIGURE_4, SMALL, 7, seed=3)] == [m.network for m in drawn[:7]]
     stiffness = np.array([m.network.springs[0].stiffness for m in drawn])

@@ -106,7 +106,7 @@ def test_without_m_closed_forms_bound_the_requirement():
         assert found.required[0] >= need * (1 - 1e-6)
 
 
-def test_the_block_is_the_definition():
+def test_the_block_equals_its_definition():
     """The block equals (f) of docs/theory.md at four frequencies, for two channels and three walls."""
     G, s = DAMPED.walled(BOTH), 0.9
     k, b, _, _ = walls_by_hand(DAMPED)
