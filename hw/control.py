@@ -163,7 +163,9 @@ class SentBudget:
         """Return the figures of the budget since arming."""
         loss = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
         dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
-        return self._budget.figures(f"no passive hand is given {loss} {dissipated}")
+        # A longer tick dissipates less than the budget credits, so that its energy has no bound.
+        ticks = f"while no tick lasts longer than {1e3 * self.plan.T:.4g} ms"
+        return self._budget.figures(f"no passive hand is given {loss} {dissipated}, {ticks}")
 
 
 class WorldController:

@@ -16,7 +16,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.hw.control import _HostController, certified_coupling, certified_couplings
+from haptic_loop.hw.control import BudgetPlan, SentBudget, _HostController, certified_coupling, certified_couplings
 from haptic_loop.hw.driver import Driver
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
@@ -533,3 +533,18 @@ def test_walls_on_the_bridge_replay_bit_by_bit(tmp_path, capsys):
     assert replay_command.main([str(tmp_path / "trace.npz")]) == 0
     with pytest.raises(ValueError, match="cannot face walls"):
         bridge.main(["--rehearse", "--coupling", "optimal", *words])
+
+
+@pytest.mark.parametrize(("length", "exceeded"), [(1e-3, False), (2e-3, True)])
+def test_a_budget_holds_up_to_its_longest_tick(length, exceeded):
+    """The hand moves with the force f at f/(2 delta), which in a tick costs f^2/(4 delta) times its length."""
+    force_step, delta, start = 1e-6, 1.0, 1e-3
+    budget = SentBudget(BudgetPlan(start, None, (delta,), (1e-9,), (force_step,), 1, 0, 1e-3))
+    x, force, given = 0.0, 0.0, 0.0
+    for _ in range(200):
+        (steps,) = budget.limit((round(-1.0 / force_step),), (x,), np.array([force]), 0)
+        v = -force / (2 * delta)
+        given -= (force * v + delta * v**2) * length
+        x, force = x + v * length, -steps * force_step
+    assert (given > start) == exceeded
+    assert "no tick lasts longer than 1 ms" in budget.figures().guarantee
