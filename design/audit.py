@@ -292,7 +292,7 @@ _FACTORS = (0.75, 0.5, 0.25, 0.1)  # factors on B and T that are tried
 
 @dataclass(frozen=True, eq=False)
 class _Remedy:
-    """The mildest change of one kind that certifies the coupling, or else the one that lowers the requirement most."""
+    """The mildest change of one kind that certifies the coupling, or else the change with the least requirement."""
 
     change: str
     requirement: Requirement
@@ -325,7 +325,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
+    """Return the least reduction of the delays `name` that certifies, or else that with the least requirement.
 
     The delays of all channels fall by the same number of samples, but not below 0. The changed loop has lam = 0.
     """
@@ -340,7 +340,7 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """Return the remedy of the largest factor that certifies, rounded down to 0.001, or else that requires least."""
+    """Return the remedy of the largest certified factor, rounded down to 0.001, or else of the least requirement."""
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
@@ -396,7 +396,7 @@ def audit(
     Args:
         loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
-        condition: The condition that must hold; None for the one that `assess` chooses.
+        condition: The condition that must hold; None for the condition that `assess` chooses.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
         force_limit: (m,) force limits [N], for the report.
         progress: Called with (points done, number of points) of the search over ranges.
@@ -411,7 +411,7 @@ def audit(
     constant, needs = loop.at(loop.environment).switching(None), assessment.requirements
     own = {condition.name: condition} if condition else {}
     conditions = {name: own.get(name) or named(name) for name in needs if name != "switching"}
-    # Changes are searched for the condition that must hold, or, if it is certified, for the first one that is not.
+    # Changes are searched for the condition that must hold or, if it is certified, for the first that is not certified.
     decisive = assessment.condition
     fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
     switching = None

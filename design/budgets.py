@@ -26,7 +26,7 @@ RANGES = 60.0
 
 # Sizes and numbers of the bases of an optimal coupling ----------------------------------------------------------------
 
-#: Largest number of states of a loop with a basis. Design and proof of one with 268 states take 8 units (n6).
+#: Largest number of states of a loop with a basis. Design and proof of a loop with 268 states take 8 units (n6).
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
@@ -70,9 +70,9 @@ FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
 #: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.
 BETA_CUTS, BETA_ROUNDS = 40, 60
-#: Points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, but on one edge at
-#: least RANGE_ALONG[0] (from six parameters on these are more) and at most RANGE_ALONG[1]; RANGE_DRAWN on faces and
-#: inside. RANGE_STARTS compass searches follow. Up to five parameters all of these take about the 500 sweeps of RANGES.
+#: Points that a search between the vertices of ranges tries: RANGE_EDGES on all edges together, but on each edge at
+#: least RANGE_ALONG[0] (from six parameters on, more than RANGE_EDGES in total) and at most RANGE_ALONG[1]; RANGE_DRAWN
+#: on faces and inside. RANGE_STARTS compass searches follow. Up to five parameters this takes the 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
 
 # Steps of iterations that converge, with the largest measured number in brackets. Measured with the optimal and the

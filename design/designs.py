@@ -112,9 +112,9 @@ def design_by_kind(
 
     Args:
         loop: The loop.
-        kind: A name of KINDS, or FILE.py:NAME of a function of the user's own.
+        kind: A name of KINDS, or FILE.py:NAME of a user's own function.
         condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed by the
-            kind's usual condition, with the largest share of the damping for which it satisfies the user's own.
+            kind's usual condition, with the largest share of the damping for which the user's condition holds.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
             forces if LIMITER has designs for the loop and one is found; `limiter` True requires it. `switching`

@@ -38,8 +38,8 @@ from haptic_loop.design.result import RANGES, listed
 # channels and needs no pivoting, because all principal minors are positive. The tick then adds KICK e to [y; z+], with
 # the matrix `kick` of controller.law.Limiter, and sets the sent forces to f.
 #
-# If the force of a device is limited as a vector, the tick solves controller.complementarity.BallProblem instead. Each
-# step is one of Newton's method in u = f + tau e, or, if this one does not halve the residual, one of the
+# If the force of a device is limited as a vector, the tick solves controller.complementarity.BallProblem instead. It
+# takes Newton steps in u = f + tau e. A step that does not halve the residual is replaced by a step of the
 # Douglas-Rachford iteration, which converges. Forces that miss their tolerance after _MOST_STEPS steps are set to 0;
 # `unsolved` counts these ticks.
 

@@ -20,7 +20,7 @@ from haptic_loop.design import budgets
 # Integrals over frequency, by Gauss's rule on intervals that are halved until the result settles.
 
 
-_ERROR = 1e-6  # relative error of an integral
+_ERROR = 1e-6  # allowed relative error of an integral
 _ROUNDING = 1e-20  # Smaller means count as 0: rounding causes them in squared differences of nearly equal responses.
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 

@@ -1,7 +1,7 @@
 """The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
-The designs by Theorem 4 use them. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive
-(semi)definite; their arguments are arrays or cvxpy expressions.
+The designs by Theorem 4 use this module. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be
+positive (semi)definite; their arguments are arrays or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them. The remedies are in
 design.conditions; the formulas here have T = 1:

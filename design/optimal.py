@@ -37,8 +37,8 @@ _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 #: The search ends before a basis of more than 26 taps if the last basis was certified and gained less than 0.1 dB.
 _LARGE, _PROMISING_DB = 26, 0.1
 _FEWEST_TAPS = {True: 22, False: 14}  # From this number of taps a small gain ends the search. Key: `_Search.simply`.
-_KEPT_STIFFNESS = 0.5  # A solution is rejected if its static stiffness is below this share of an accepted solution's.
-_FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's is dropped.
+_KEPT_STIFFNESS = 0.5  # A solution is rejected below this share of the static stiffness of an accepted solution.
+_FELT_STIFFNESS = 0.02  # A floor of the static stiffness below this share of the environment's stiffness is dropped.
 # Starting values (beta, c) of a limiter. If psi = 0, only the first is tried.
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))
 _HOPELESS = 0.9  # Above this mismatch (`_Search.mismatch`) the result is compared with simpler couplings.

@@ -1,4 +1,4 @@
-"""Robustness: the damping that a coupling requires in environments near the one of its design."""
+"""Robustness: the damping that a coupling requires in environments near the environment of its design."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import ANY, suffices
 
-#: More than _FEW environments are first compared at every _THIN-th frequency. Only those within _NEAR of the worst one
-#: are then swept at all frequencies.
+#: More than _FEW environments are first compared at every _THIN-th frequency. Only environments within _NEAR (relative)
+#: of the worst ratio are then swept at all frequencies.
 _FEW, _THIN, _NEAR = 12, 12, 0.03
 _PERCENT = 10.0  # change of a parameter in reports
 
@@ -73,7 +73,7 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
 def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness:
     """Return the worst requirement in the environment and in `vertices`, by the refined sweep of the condition.
 
-    If there are many vertices and delays are constant, a coarse sweep first selects those near the worst one.
+    If there are many vertices and delays are constant, a coarse sweep first selects the vertices near the worst one.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network)}
     loops = {name: loop.at(one) for name, one in networks.items()}

@@ -604,10 +604,11 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
 
 
 def _stiffest_in_frame(loop: Loop) -> Design:
-    """Return the stiffest linear coupling for any environment with a latency or switching delays.
+    """Return the stiffest linear coupling of a loop with a latency or switching delays, for any environment.
 
-    He[V/(1-z)] = chi is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, whose series is finite, and V(1)/2 is the
-    mean of chi (docs/theory.md). A convex program or a closed form gives the multiplier that minimises this mean.
+    The least admissible He[V/(1-z)], chi (docs/theory.md), is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k,
+    whose series is finite. V(1)/2 is the mean of chi. A convex program or a closed form gives the multiplier that
+    minimises this mean.
     """
     if loop.latency and loop.varying_delay:
         line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
@@ -633,7 +634,7 @@ def _rounded_inverse(level: Array) -> Array:
 def _late_chi(loop: Loop, i: int, delta: float) -> Array:
     """Return the coefficients chi_k of l (Q d)^-1 l*/4, l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], for the best Q.
 
-    d is (1 - RESERVE) delta.
+    Q is the multiplier of facts.Latency, and d is (1 - RESERVE) delta.
     """
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
@@ -648,8 +649,8 @@ def _late_chi(loop: Loop, i: int, delta: float) -> Array:
 def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
     """Return the coefficients chi_k of |v|^2/(4 (d - alpha/2)) + h^2/(2 alpha) for switching delays.
 
-    v is the mean of the windows of lo and hi, h = (hi - lo)/2, and d = (1 - RESERVE) delta/T_max. A constant delay has
-    no alpha.
+    v is the mean of the windows 1 + .. + z^-n of the delays n = lo and n = hi, h = (hi - lo)/2, and
+    d = (1 - RESERVE) delta/T_max. A constant delay has no alpha.
     """
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
@@ -664,7 +665,7 @@ def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _best_charge(loop: Loop, i: int, theta: int) -> Array:
-    """Return the Q (2, 2) [1/s] that minimises trace(Q^-1 M), where M holds the inner products of both windows."""
+    """Return the Q (2, 2) [1/s] that minimises trace(Q^-1 M), where M holds the inner products of l in `_late_chi`."""
     hands, scale = Latency(), 1 / loop.T
     root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))
     one = loop.channel(i)
