@@ -61,8 +61,8 @@ def design_coupling(
     Args:
         loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions). The coupling is then designed by
-            the kind's usual condition and judged by your Condition. None selects the usual condition
+        condition: The name of a condition, or your own Condition (design.conditions). For your own Condition the
+            coupling is designed by the kind's usual condition and judged by yours. None selects the usual condition
             (design.designs.usual_condition), as the commands do.
         options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
@@ -130,8 +130,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     """Judge a coupling in its loop by "any-environment" and "this-environment".
 
     Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or else
-    that of the design, is also judged. With loop.varying_delay there is a further entry "switching", for delays that
-    switch in any way within that range.
+    your own condition in the Design, is also judged. With loop.varying_delay there is a further entry "switching", for
+    delays that switch in any way within that range.
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If

@@ -112,13 +112,13 @@ class RangesResult:
 
     @property
     def worst(self) -> tuple[Member, Requirement]:
-        """The member that requires the most damping."""
+        """The member that requires the most damping, and its requirement."""
         i = worst(self.at_members)
         return self.members[i], self.at_members[i]
 
     @property
     def worst_found(self) -> tuple[Member, Requirement]:
-        """The environment that requires the most damping among members, search and samples."""
+        """The environment that requires the most damping among members, search and samples, and its requirement."""
         places = (*self.members, self.searched.worst[0].member, *self.samples)
         requirements = (*self.at_members, self.at_found, *self.at_samples)
         i = worst(requirements)
@@ -259,7 +259,7 @@ class ForceLimits:
 
     Attributes:
         rho: (m,) stiffnesses of the limiter [N/m]; None if forces are clipped.
-        reason: Why a condition covers limited forces, or why none does.
+        reason: Why a condition covers limited forces, or why no condition does.
         requirement: The requirement of the condition `limiter`, if it was evaluated.
         c: The multiplier of the condition `limiter`, one row per device, no unit.
         certificate: The proof of the condition `limiter`, or None.
@@ -458,7 +458,7 @@ class Assessment:
         ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
         transparency: The mismatch; None if it cannot be computed, for example because the environment has no E(z).
-        certificate: The exact proof that the caller supplied and that holds, or that for the ranges, or None.
+        certificate: The exact proof that the caller supplied and that holds, or the proof for the ranges, or None.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
         condition: The name of the condition that must hold for `holds`; another condition may give the guarantee.
@@ -557,10 +557,10 @@ def assess(
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
         energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
             world. Without a shell, W0 of an energy budget at the devices (controller.budget); the default is no budget.
-        certificate: A proof on file. It counts only if it holds for exactly this loop and coupling; it is verified
+        certificate: A stored proof. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
-        condition: The condition that must hold, by name or a user's own. The default is this-environment, or
-            known-device if the loop has bounds of its devices.
+        condition: The name of the condition that must hold, or a user's own condition. The default is this-environment,
+            or known-device if the loop has bounds of its devices.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
         searched: A design's search between the vertices for this loop and coupling.

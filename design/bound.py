@@ -91,7 +91,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
     T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1, the
     condition's rows for the displacements after the latch have at most the damping Delta/(T_max - t1)
-    (design.facts.Latency). They alone are this-environment without latency for more damping, which the bound uses.
+    (design.facts.Latency). These rows alone are this-environment without a latency for more damping, which is bounded.
     """
     started, level = time.perf_counter(), even_level(loop)
     if loop.latency:
@@ -116,7 +116,7 @@ class _Dual:
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner): `inner` basis functions of H on the grid; over the band, those of h are orthonormal
+    heights: Array  # (k, inner): basis functions of H on the grid; the basis functions of h are orthonormal on the band
     target: Array  # (2 inner, m^2) coefficients of -Lambda E/|E| in the functions of h, real and then imaginary parts
     knots: Array  # [rad/sample] of the splines h
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
@@ -293,7 +293,7 @@ class _Dual:
         return again - error + m * min(lower, 0.0), where, least
 
     def best(self) -> tuple[float, float]:
-        """Return two bounds on J: an estimate with D >= 0 at samples, and one with D >= 0 on the whole circle.
+        """Return two bounds on J: an estimate with D >= 0 at samples, and a bound with D >= 0 on the whole circle.
 
         The points are taken from the barrier's path. After each round, frequencies are added at which D is negative.
         """

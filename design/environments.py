@@ -1,7 +1,7 @@
 """Conditions with multipliers: this-environment with its facts, and any-environment.
 
 The blocks for a latency, walls, switching delays and limited forces are affine in their multipliers; `Multiplied`
-searches for the best ones. The members of ranges are proved one by one.
+searches for the best multipliers. The members of ranges are proved one by one.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class Multiplied(Condition):
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """Return the block, affine in s and in `multiplier`, which holds s times the multipliers of the hands' side."""
+        """Return the block, affine in s and in `multiplier`, whose numbers for the hands' side are multiplied by s."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
@@ -136,7 +136,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement at this multiplier; for None, at the best one found, with the search's `bound`."""
+        """Return the requirement at `multiplier`; for None, at the best multiplier found, with the search's `bound`."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -150,7 +150,7 @@ class Multiplied(Condition):
             return refusal(self.name, loop.delta, str(error))
 
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
-        """Return the requirement for the map G at this multiplier; for None, at the best one found."""
+        """Return the requirement for the map G at `multiplier`; for None, at the best multiplier found."""
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
@@ -401,7 +401,8 @@ class ThisEnvironment(Multiplied):
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
         """Return the largest requirement of all members with `multiplier`.
 
-        For None, two multipliers are tried, the usual one and the best one of the worst member; the better one counts.
+        For None, the usual multiplier and the best multiplier of the worst member are tried, and the better result
+        counts.
         """
         loops = [loop.at(member.network) for member in loop.members()]
 
@@ -438,7 +439,7 @@ class ThisEnvironment(Multiplied):
         return ratio_in(loop, coupling, thin) if quick else super().ratio(loop, coupling, thin)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the ratios (n,) for constant delays and touching walls; None for a subclass."""
+        """Return the ratios (n,) of `Condition` for constant delays and touching walls; None for a subclass."""
         if not self.extensible:
             return None
         poles = loop.F(coupling).poles()
@@ -505,7 +506,7 @@ def _half_widths(loop: Loop) -> Array:
 # environment together are passive. So any-environment covers limited forces without a further proof. This does not
 # hold if the environment has a delay.
 
-BETA = 0.01  # default lag of a limiter under this-environment, relative to Delta/T
+BETA = 0.01  # default lag of a limiter under this-environment, relative to the device's least damping over T
 
 
 @dataclass(frozen=True)

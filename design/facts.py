@@ -416,7 +416,7 @@ class HandsSide(ABC):
         """Return the matrix (n, n) over the inputs that is proportional to the devices' damping [N/m]."""
 
     def rest(self, loop: Loop, T: Number, values: Values) -> Sequence[Any]:
-        """Return M_0, M_1 over the inputs; the part M_0 + M_1/z of the form does not scale with the damping."""
+        """Return the matrices M_0, M_1 of the part M_0 + M_1/z of the form, which does not scale with the damping."""
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:

@@ -96,7 +96,7 @@ class _FixedOrder:
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
-        """Return p of a spring-damper. Each further state is driven by the one before, and no output reads it.
+        """Return p of a spring-damper. Each further state is driven by the state before it, and no output reads it.
 
         With dampers all states are reachable, and the storage of the weighted loop is well conditioned. A state that is
         read but not driven would make the storage singular, and rounding would decide whether the first step succeeds.
@@ -211,9 +211,9 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 #
 # Lemmas 2 and 3 are affine in the coupling except for the inversions Y = Q^-1, X = U^-1 (20), (24b). The inverse of a
 # positive matrix is convex: Q^-1 >= 2 Q0^-1 - Q0^-1 Q Q0^-1, with equality at Q0. With this tangent for Y (likewise for
-# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. Each semidefinite
-# program (SDP) therefore improves on the previous one. It needs no bisection, because mu^2 enters linearly. In state
-# coordinates with Q0 = I the tangent is 2I - Q.
+# X) the feasible set shrinks to a convex part of itself that still contains the current coupling. So each semidefinite
+# program (SDP) improves the coupling. It needs no bisection, because mu^2 enters linearly. In state coordinates with
+# Q0 = I the tangent is 2I - Q.
 
 
 _Judge = Callable[[Array, float], bool]  # whether the coupling p is certified with a norm of at most mu
@@ -223,7 +223,7 @@ _LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step from
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
-    """Yield the couplings p of successive steps from a strictly feasible one with the given norm.
+    """Yield the couplings of successive steps from the strictly feasible coupling p, whose norm is `norm`.
 
     The descent ends when Q or U is singular to rounding, because the coupling is then on the boundary.
     """

@@ -109,14 +109,14 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
 
 #: [rad/sample] _LOWEST stands for 0 with an error of 1e-8, as responses are even in w. _BELOW resolves slow poles.
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
-_EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced ones
+_EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced frequencies
 _PER_LOBE = 24  # evenly spaced frequencies for each lobe that a delay causes in the response
 #: distances of frequencies from that of a pole, in widths of the pole
 _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
-    """Return the frequencies (k,) common to n systems, and those (n, j) around the poles (n, p) of each system.
+    """Return frequencies (k,) common to n systems, and frequencies (n, j) around the poles (n, p) of each system.
 
     `delay` [samples] is the longest delay of the loop; a delay of n samples causes n lobes in the response.
     """
@@ -354,7 +354,7 @@ def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.comple
 def _least_of_two(a: Array, d: Array, b: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
     """Return the least eigenvalues (k,) of [[a, b], [b*, d]], (k,) each, and their unit eigenvectors (k, 2).
 
-    Of the two rows of (H - lambda I) v = 0, the one with the larger diagonal entry is solved: it cancels no digits.
+    Of the two rows of (H - lambda I) v = 0, the row with the larger diagonal entry is solved, which cancels no digits.
     """
     half = (a - d) / 2
     radius = np.hypot(half, np.abs(b))

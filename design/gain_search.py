@@ -64,7 +64,7 @@ class SampledLoop:
     multiplier.
     """
 
-    #: indices of the channels with a multiplier and a second row in the block; in KnownDeviceLoop those of all devices
+    #: indices of the channels with a multiplier and a second row in the block; KnownDeviceLoop: indices of all devices
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     #: bounds of the entries of x for the multiplier
     bounds = (0.0, 0.0)
@@ -128,7 +128,7 @@ class SampledLoop:
         return None
 
     def add(self, w: float) -> None:
-        """Add the frequency w [rad/sample] to those of the condition."""
+        """Add w [rad/sample] to the frequencies at which the condition is imposed."""
         self._impose(np.append(self.conditions, w))
 
     def _impose(self, w: Array) -> None:
