@@ -268,7 +268,7 @@ def test_reserve_and_scale_match_brute_force():
             assert budget.reserved[0] == pytest.approx(reserve(packets), rel=1e-9, abs=1e-15)
             assert budget.reserved[0] <= budget.energy[0] + 1e-12 <= 0.03 + 2e-12
             scale = sent @ wanted / (wanted @ wanted) if wanted.any() else 1.0
-            np.testing.assert_allclose(sent, scale * wanted, atol=1e-12)
+            np.testing.assert_allclose(sent, scale * wanted, rtol=0, atol=1e-12)
             if scale < 0.999:
                 acts += 1
                 assert reserve([*packets[:-1], sent + 1e-4 * wanted]) > budget.energy[0]

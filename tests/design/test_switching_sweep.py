@@ -91,6 +91,7 @@ def test_the_least_factor_matches_a_convex_solver():
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
+        rtol=0,
         atol=1e-12,
     )
 

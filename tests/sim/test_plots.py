@@ -82,7 +82,8 @@ def test_pictures_contain_every_sample(drawn):
     whole = lines(figure.axes[2])
     for i in range(3):
         np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
-        np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # x in mm equals f
+        mm = lines(figure.axes[0])[f"device {i + 1}"][:, 1]
+        np.testing.assert_allclose(mm, f[:, i], rtol=1e-12)  # x in mm equals f
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
     assert figure.axes[0].get_ylabel() == "displacement of the handle [mm],\nwhere the encoder is"
     assert legend(figure) == [
@@ -100,7 +101,7 @@ def test_the_label_says_how_near_encoders_are(drawn):
     )  # At an amplitude of 1 m, curves 4 mm apart look like one line.
     (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
     assert axis.get_ylabel() == "displacement of the handle [mm],\nwithin 4 mm of the encoder"
-    np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
+    np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0], rtol=1e-12)
 
 
 def test_legends_name_walls_and_curves_that_coincide(drawn):
@@ -124,7 +125,7 @@ def test_legends_name_walls_and_curves_that_coincide(drawn):
     edges = T * np.flatnonzero(np.diff(touching.astype(int)) != 0).reshape(-1, 2)
     for axis in (displacement, force):
         spans = [(part.get_x(), part.get_x() + part.get_width()) for part in axis.patches]
-        np.testing.assert_allclose(spans, edges + T)
+        np.testing.assert_allclose(spans, edges + T, rtol=1e-12)
 
 
 def test_onsets_have_amplitudes_and_grey_times(drawn):
@@ -143,8 +144,8 @@ def test_onsets_have_amplitudes_and_grey_times(drawn):
     names = [f"device 1, {what}" for what in ("handle (thick)", "encoder (thin)", "force")]
     assert legend(figure)[:3] == names
     handles, encoders = (lines(figure.axes[0])[f"device 1, {what}"] for what in ("handle (thick)", "encoder (thin)"))
-    np.testing.assert_allclose(handles[:, 1], 1e3 * handle)
-    np.testing.assert_allclose(encoders[:, 1], 1e3 * x[:, 0])
+    np.testing.assert_allclose(handles[:, 1], 1e3 * handle, rtol=1e-12)
+    np.testing.assert_allclose(encoders[:, 1], 1e3 * x[:, 0], rtol=1e-12)
     (veil,) = figure.axes[0].patches
     assert veil.get_x() == 4.0
     assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom shows the credible part only
@@ -196,10 +197,11 @@ def report(available=(1.37, 1.37), psi=(0, 0)):
 
 def test_binding_frequencies_are_marked(undrawn):
     here, anywhere = undrawn(plots.plot_required_damping, report()).axes
-    np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
+    np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]), rtol=1e-12)
     marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
-    np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37))
-    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # 0 Hz and a ratio of 40 are drawn at the edges
+    np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37), rtol=1e-12)
+    # 0 Hz and a ratio of 40 are drawn at the edges
+    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37), rtol=1e-12)
     assert here.get_title() == "this environment"
     assert here.get_ylabel() == "required damping [N s/m]"
     assert "soft (no curve: see the printed remarks)" in lines(anywhere)
@@ -274,8 +276,8 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
 
 
 def test_cells_meet_halfway():
-    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 2.0, 4.0]), "linear"), [1, 1.5, 3, 4])
-    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 100.0, 1e4]), "log"), [1, 10, 1e3, 1e4])
+    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 2.0, 4.0]), "linear"), [1, 1.5, 3, 4], rtol=1e-12)
+    np.testing.assert_allclose(map_plot._cell_edges(np.array([1.0, 100.0, 1e4]), "log"), [1, 10, 1e3, 1e4], rtol=1e-12)
 
 
 def test_panels_show_forces_beside_ideal_ones(undrawn):

@@ -150,9 +150,9 @@ def test_rest_is_where_a_held_position_leads(published):
     """At rest the state z obeys z = A z + B x, and the transfer function F gives the force F(1) x."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
     z = published.simulation.process.law.at_rest(x)
-    assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
+    assert np.allclose(F.A @ z + F.B @ x, z, rtol=0, atol=1e-12)
     # The forces are 4 N; rounding in z and F(1) changed them by 5e-13 N when measured.
-    assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
+    assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-8)
 
 
 def test_switching_keeps_the_plant_state(none):
@@ -164,7 +164,7 @@ def test_switching_keeps_the_plant_state(none):
     assert np.array_equal(running.state, alone.state)  # position and velocity do not jump
     F, x = running.prepared.simulation.F, before.q[:2]
     force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
-    assert np.allclose(force, F.at(1.0 + 0j).real @ x, atol=1e-8)
+    assert np.allclose(force, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-8)
 
 
 def test_the_oscillation_starts_and_dies(none):
@@ -575,7 +575,7 @@ def test_arrows_show_what_devices_feel(none):
     stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
     told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
     ways, bars = arrows(stage, replace(session(none).frame(0.0), **told))
-    np.testing.assert_allclose([way[0] for way in ways], [-1, 1, 1], atol=1e-6)  # the last one is the push
+    np.testing.assert_allclose([way[0] for way in ways], [-1, 1, 1], rtol=0, atol=1e-6)  # the last one is the push
     for bar, handle, f, most in zip(bars, scene.handles, (2.0, -2.0), limit, strict=True):
         at = stage.data.xpos[stage.model.jnt_bodyid[handle]]
         assert bar[0] - at[0] == pytest.approx(-f / most * drawing._LONGEST, abs=1e-6)
@@ -812,7 +812,7 @@ def test_arrows_in_worlds_show_what_devices_feel(ball):
     stage = stage_for(running)
     ways, _ = arrows(stage, replace(running.frame(0.0), **told))
     along = [stage._along[i][0] for i in (0, 1, 1)]
-    np.testing.assert_allclose([w @ a for w, a in zip(ways, along, strict=True)], [-1, 1, 1], atol=1e-6)
+    np.testing.assert_allclose([w @ a for w, a in zip(ways, along, strict=True)], [-1, 1, 1], rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow

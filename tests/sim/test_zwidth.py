@@ -185,7 +185,7 @@ def test_suprema_equal_those_of_a_dense_sweep():
     common, own = np.linspace(0, np.pi, 60), np.broadcast_to(np.linspace(0, np.pi, 60), (3, 60))
     found = suprema(peaks, common, own)
     # Points are 8e-6 rad apart and second derivatives at most 800 per rad^2: maxima exceed the points by under 1e-8.
-    np.testing.assert_allclose(found, dense, atol=2e-8)
+    np.testing.assert_allclose(found, dense, rtol=0, atol=2e-8)
     assert suprema(lambda w: np.where(w > 3, np.nan, w), common, own).tolist() == [np.inf] * 3
 
 
@@ -226,7 +226,7 @@ def test_population_growth_equals_that_of_single_humans(links):
     growth, audible = crowd.growth(F)
     for index, some in crowds(sweep.population, 1, 3, range(30), links):
         modes = dominant_mode(exact_loops(variants(sweep.devices, some), F))
-        np.testing.assert_allclose(growth[index], modes.growth, atol=1e-7)
+        np.testing.assert_allclose(growth[index], modes.growth, rtol=0, atol=1e-7)
         np.testing.assert_array_equal([crowd.links(human) for human in index], some.links)
     assert (audible <= growth + 1e-9).all()
     assert (growth > 0).any()
@@ -261,7 +261,7 @@ def test_marks_take_the_worst_contact_state():
     growth = [dominant_mode(state).growth for state in states]
     assert (growth[0] < growth[1] - 1).any()
     found = zwidth_map._growth(sweep, crowd, 1500.0, 0.4)
-    np.testing.assert_allclose(found, np.maximum(*growth), atol=1e-7)
+    np.testing.assert_allclose(found, np.maximum(*growth), rtol=0, atol=1e-7)
 
 
 def test_random_hands_meet_the_latest_forces():
@@ -270,7 +270,7 @@ def test_random_hands_meet_the_latest_forces():
     F = sweep.force_maps(np.array([900.0]), np.array([0.4]))[0][0]
     ((_, some),) = crowds(sweep.population, 1, 3, range(4), 1)
     modes = dominant_mode(exact_loops(variants(sweep.devices, some), F, late=[5e-4]))
-    np.testing.assert_allclose(crowd.growth(F)[0], modes.growth, atol=1e-7)
+    np.testing.assert_allclose(crowd.growth(F)[0], modes.growth, rtol=0, atol=1e-7)
 
 
 # --- the simulated points ------------------------------------------------------------------------------------------
@@ -378,7 +378,7 @@ def test_hands_press_steadily_after_half_a_second():
     scene, press = build(PAIR.device, PAIR.human), np.array([3.0, -3.0])
     w = _press_forces(scene, T, press, 0, 800)
     for force, column in zip(press, scene.pushed, strict=True):
-        np.testing.assert_allclose(w[[0, 250, 500, 799], column], [0, force / 2, force, force], atol=1e-12)
+        np.testing.assert_allclose(w[[0, 250, 500, 799], column], [0, force / 2, force, force], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(_press_forces(scene, T, press, 300, 500), w[300:])
 
 
