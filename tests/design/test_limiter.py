@@ -280,7 +280,7 @@ def test_limiter_designs_use_all_the_damping():
     made = design(PAIR, "this-environment", limiter=True)
     assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
-    assert rms_db(made.coupling) < -10.5  # the linear design has -11.19, but no proof for limited forces
+    assert rms_db(made.coupling) < -10.5  # without limiter -11.19 dB, but no proof
     with pytest.raises(ValueError, match="constant delays"):
         design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 

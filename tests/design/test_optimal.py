@@ -311,7 +311,10 @@ def test_random_loops_get_a_proved_design(seed):
 
 
 def test_designs_keep_small_forces_accurate():
-    """At 0.6 Hz hands that move together should feel under 2 % of the largest force; they feel it with 5 % of error."""
+    """At 0.6 Hz hands that move together should feel under 2 % of the largest force.
+
+    The design errs by less than 5 % of this small force.
+    """
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
     ideal = z[:, None, None] ** -np.asarray(loop.lam)[:, None] * loop.E().at(z)

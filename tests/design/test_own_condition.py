@@ -197,7 +197,7 @@ def test_an_own_fact_is_proved_and_mapped(repeats):
     judged = compare.judge(PAIR, SOFT, own=[own])
     binding = judged.requirements[own.name]
     w = 2 * np.pi * PAIR.T * np.array([binding.frequency_hz])
-    assert judged.demands[own.name](w)[0] == pytest.approx(binding.ratio, rel=1e-9)  # at the multiplier that was found
+    assert judged.demands[own.name](w)[0] == pytest.approx(binding.ratio, rel=1e-9)  # with the search's multiplier
     nearby, plain = robustness(PAIR, SOFT, condition=own), robustness(PAIR, SOFT)
     assert nearby.required_over_available > plain.required_over_available
 

@@ -241,7 +241,7 @@ def test_vertex_force_maps_match_raw_matrices(robust):
     for member in LOOP.members():
         F = force_map(environment(member.network, T), robust.coupling, THETA, (0,)).at(np.exp(1j * w))
         expected = by_hand(member.network, robust.coupling, w)
-        # Both lose digits near a resonance and by dividing by (z - 1)^2, 1e-6 at the lowest frequency: here three.
+        # Both computations lose digits near a resonance and from dividing by (z - 1)^2, here three of sixteen.
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
