@@ -81,7 +81,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
         files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, rows)
     tables = [_beside(rows, args.condition)]
-    render.publish(args, report, tables, _held_torques(scenario, args.case), out, files, _nearest(rows))
+    render.publish(args, report, tables, _not_covered(scenario, args.case), out, files, _nearest(rows))
     return options.exit_code(True)
 
 
@@ -143,9 +143,11 @@ def _share(value: float | None, absent: str) -> str:
     return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
-def _held_torques(scenario: Scenario, case: str) -> list[str]:
+def _not_covered(scenario: Scenario, case: str) -> list[str]:
     torques = held_torques(scenario.loop(case))
-    return [f"Held torques: {torques}."] if torques else []
+    steps = any(device.encoder_step for device in scenario.axis_devices)
+    said = [f"Held torques: {torques}."] if torques else []
+    return [*said, *(["Guarantees are for exact positions: sim.run judges the encoder steps."] if steps else [])]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -157,7 +159,7 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     chosen, failed = _chosen(scenario, args, args.coupling)
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
-    lines = [*report.notes, *_held_torques(scenario, args.case)]
+    lines = [*report.notes, *_not_covered(scenario, args.case)]
     tables = [_guarantees(report), _feel(report)]
     render.publish(args, report, tables, lines, out, files, _guaranteed(report))
     return options.exit_code(not failed)

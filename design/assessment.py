@@ -53,6 +53,7 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, Limi
 from haptic_loop.design.result import (
     ANY,
     CONDITIONS,
+    HERE,
     KNOWN_CONDITIONS,
     RANGES,
     Design,
@@ -713,7 +714,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
                     return _stated(assessment, requirements[name], ANY), None
                 if ranges := _over_ranges(assessment):
                     return ranges, None
-                return _stated(assessment, requirements[name], loop.environment.here), None
+                return _stated(assessment, requirements[name], getattr(assessment.environment, "here", HERE)), None
         shortfall = requirements[here[-1]].shortfall
         return None, f"delays that switch within {loop.varying_delay} are not covered: {shortfall}"
     held = [need for need in requirements.values() if need.certified and need.guarantee]

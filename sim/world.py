@@ -108,10 +108,11 @@ class Claim:
             elsewhere = f" The coupling is certified for {certified_for} only." if certified_for else ""
             return cls(False, f"No guarantee: {assessment.reason}.{elsewhere}")
         energy = f"W0 = {_energy(guarantee.energy_J)}"
+        swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
         return cls(
             True,
             f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
-            "released.",
+            f"released.{swept}",
         )
 
 

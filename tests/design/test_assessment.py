@@ -14,7 +14,7 @@ from haptic_loop.cli.validate import main as validate
 from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
-from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import assessment as assessment_module
@@ -336,3 +336,13 @@ def test_switching_before_walls_needs_more_damping():
     assert assess(loop, coupling).holds
     switching = assess(change(loop, varying_delay=DelayRange((0,), (2,))), coupling)
     assert not switching.holds
+
+
+def test_guarantees_name_the_environment_that_runs():
+    """A rigid wall behind 50,000 N/m needs at least 5/2 K T = 125 N s/m; the spring of 500 N/m that runs is soft."""
+    rigid = Loop(1e-3, (1,), (0,), (0,), (1.37,), RIGID_WALL, varying_delay=DelayRange((1,), (2,)))
+    soft = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
+    coupling = SpringDamper([50_000.0], [0.0])
+    assert assess(rigid, coupling).guarantee is None
+    assert assess(rigid, coupling, environment=soft).guarantee.environments == HERE
+    assert assess(rigid.at(soft), SpringDamper([400.0], [0.0]), environment=RIGID_WALL).guarantee.environments != HERE

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace as replace_fields
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,17 @@ from haptic_loop.models import world as world_of
 from haptic_loop.sim.couplings import choose, read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, HandsInWorld, InWorld, Touched, _contacts_of, linearise, scene_of, thrown
+from haptic_loop.sim.world import (
+    START_J,
+    Claim,
+    HandsInWorld,
+    InWorld,
+    Touched,
+    _contacts_of,
+    linearise,
+    scene_of,
+    thrown,
+)
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -540,3 +551,13 @@ def test_worlds_dissipate_in_the_longest_period():
     simulation = assemble(scenario, SpringDamper([800.0, 800.0], [0.4, 0.4]))
     world = Touched().net(simulation, simulation.process, 1)
     np.testing.assert_allclose(world._damping, simulation.loop.Delta() / 2e-3, rtol=1e-12)
+
+
+def test_claims_name_a_sweep_without_proof():
+    """A claim that only a sweep supports says so, as the verdicts of other loops do."""
+    swept, proved = (
+        Claim.of(SimpleNamespace(guarantee=SimpleNamespace(energy_J=2e-3, proof=proof))).words
+        for proof in ("sampled", "rational")
+    )
+    assert "without an exact proof" in swept
+    assert "without an exact proof" not in proved
