@@ -410,7 +410,7 @@ def compare_engines(
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
-    """Return the cheapest setting with a small enough error and the right verdict. Raises InputError."""
+    """Return the cheapest setting with an error up to `error` and the right verdict. Raises InputError without any."""
     right = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if right:
         return min(right, key=lambda choice: choice.cost)

@@ -107,7 +107,7 @@ def _choose(
 
 
 def own_of(name: str, loop: Loop) -> Chosen:
-    """Return the coupling that a user's own function makes for a loop. Raises InputError."""
+    """Return the coupling of a user's own function for a loop. Raises InputError if it does not fit the loop."""
     coupling = own_coupling(name, loop)
     called(f"--coupling {name}", fitting, loop, coupling)
     return given(coupling, name)
@@ -123,7 +123,7 @@ def given(coupling: Any, kind: str = "given") -> Chosen:
 
 
 def read_coupling(path: str | Path) -> Stored:
-    """Read a stored coupling. Raises InputError."""
+    """Read a stored coupling. Raises InputError if the file or its coupling is invalid."""
     stored = load(path)
     try:
         stored.built()

@@ -178,7 +178,7 @@ class _Budgeted(_InLoop):
 
 
 def _answer(forces: Any, channels: int) -> Array:
-    """Check the answer of a user's environment function: one finite force [N] per channel. Raises InputError."""
+    """Return the forces [N] of a user's function. Raises InputError unless each channel has one finite force."""
     try:
         answer = np.empty(0) if np.iscomplexobj(forces) else np.asarray(forces, dtype=float)
     except (TypeError, ValueError):

@@ -352,7 +352,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
-        """Return Lambda of a case: `lam` if set, else 0 in case II and theta + psi otherwise. Raises InputError."""
+        """Return Lambda: `lam` if set, else 0 in case II, else theta + psi. Raises InputError for an unknown case."""
         if case not in CASES:
             raise InputError(f"case is {case!r}, allowed are {', '.join(CASES)}")
         if self.lam is not None:
@@ -440,14 +440,15 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 def own_environment(text: str) -> Any:
     """Return the environment of FILE.py:NAME: a Network, or an object with contacts and E or parts().
 
-    `Scenario.replace` accepts both. A class or a function is called without arguments. Raises InputError.
+    `Scenario.replace` accepts both. A class or a function is called without arguments. Raises InputError if the file
+    or the call fails.
     """
     own = named("--environment", text)
     return called(f"--environment {text}", own) if callable(own) else own
 
 
 def load(source: str | Path = DEFAULT) -> Scenario:
-    """Load a scenario from a TOML file, or a built-in one by its name. Raises InputError."""
+    """Load a scenario from a TOML file, or a built-in one by name. Raises InputError if it is missing or invalid."""
     if not isinstance(source, str | Path):
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
@@ -535,7 +536,7 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
-    """Return the scenario with the hands or the population of a TOML file or of FILE.py:NAME. Raises InputError."""
+    """Return the scenario with the people of a TOML file or of FILE.py:NAME. Raises InputError if they do not fit."""
     people = _load_humans(text, len(scenario.device))
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
@@ -716,7 +717,7 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
-    """Give each point of the environment a node per axis if devices have several axes. Raises ValueError."""
+    """Give each point of an environment a node per axis if devices have several. Raises ValueError if they differ."""
     devices, table = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
@@ -823,7 +824,7 @@ def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
 
 
 def world_environment(table: dict[str, Any]) -> Network:
-    """Return the environment of an [environment] table with the key `world`. Raises InputError."""
+    """Return the environment of an [environment] table with the key `world`. Raises InputError for an invalid table."""
     try:
         return msgspec.convert(_with_world({"environment": table}, Path())["environment"], Network)
     except ValueError as error:
@@ -838,7 +839,7 @@ def _require_no_along(environment: Any) -> None:
 
 
 def _direction(number: int, row: Any) -> list[float]:
-    """Return a direction x, y, z of unit length. Raises ValueError."""
+    """Return a direction x, y, z scaled to unit length. Raises ValueError unless `row` is a direction."""
     length = 0.0
     if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) and abs(c) < 1e6 for c in row):
         length = float(np.linalg.norm(row))
@@ -856,7 +857,7 @@ def _without_folder(environment: Network) -> Network:
 
 
 def _network(own: Any, T: Any) -> Network:
-    """Convert a user's own environment, with `contacts` and `E(T)` or `parts()`, to a network. Raises InputError."""
+    """Convert an object with `contacts` and `E(T)` or `parts()` to a network. Raises InputError for other objects."""
     label = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
     has_E = getattr(type(own), "E", Environment.E) is not Environment.E
@@ -890,7 +891,7 @@ class _Damped(msgspec.Struct, frozen=True):
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
-    """Convert fields to `kind` by the rules of a file. Raises InputError."""
+    """Convert fields to `kind` by the rules of a file. Raises InputError for a wrong field."""
     raw = {name: _plain(name, value) for name, value in fields.items()}
     try:
         return msgspec.convert(_in_space(_with_catalogue(raw)), kind)
@@ -899,7 +900,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Convert structs, tuples, and NumPy's numbers and arrays to the types of a file. Raises InputError."""
+    """Convert structs, tuples and NumPy's types to the types of a file. Raises InputError for any other type."""
 
     def of_numpy(part: Any) -> Any:
         if isinstance(part, np.ndarray | np.generic):
@@ -931,7 +932,7 @@ def _is_own(name: str, value: Any) -> bool:
 
 
 def _checked_own(value: Any) -> Any:
-    """Return a user's own population as it is, or humans of any class after a check. Raises ValueError."""
+    """Return a user's own population as it is, or humans of any class. Raises ValueError for an invalid human."""
     if not isinstance(value, list | tuple):
         return value
     for i, human in enumerate(value, start=1):

@@ -165,7 +165,7 @@ def _contacts_of(environment: Network) -> list[Contact]:
 
 
 def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
-    """Return G = D_V^-1 of each device. Raises ValueError."""
+    """Return G = D_V^-1 of each device. Raises ValueError if D_V is not positive definite or couples devices."""
     ends = np.cumsum([0, *(len(contact.along) for contact in contacts)])
     if V.D.shape != (ends[-1], ends[-1]):
         raise ValueError(f"the coupling has {len(V.D)} channels, the world has {ends[-1]}")

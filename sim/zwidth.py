@@ -332,7 +332,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
     The scale of K is the sweep's stiffness_scale, that of B the largest delta. A linear map goes up to 2.5 times these
-    scales, a logarithmic one from far below to far above. Raises InputError.
+    scales, a logarithmic one from far below to far above. Raises InputError for an impossible range, or a mark outside.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":

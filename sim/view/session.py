@@ -107,7 +107,7 @@ Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
 
 
 def parse_script(text: str, channels: int) -> Script:
-    """Parse '0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError."""
+    """Parse '0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError for other text."""
     script = []
     for entry in text.split():
         when, colon, what = entry.partition(":")

@@ -695,7 +695,7 @@ def pictures_for(session: LiveLoop) -> _FlatPictures:
 
 
 def _offscreen(width: int, height: int) -> Any:
-    """Return an OpenGL context without a window, by EGL, OSMesa or CGL. Raises InputError."""
+    """Return an OpenGL context without a window, by EGL, OSMesa or CGL. Raises InputError if there is none."""
     for kind in ("egl", "osmesa", "cgl"):
         try:
             return import_module(f"mujoco.{kind}").GLContext(width, height)
