@@ -61,9 +61,9 @@ def design_coupling(
     Args:
         loop: The loop, for example `scenario.loop("I")`.
         kind: "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal".
-        condition: The name of a condition, or your own Condition (design.conditions). For your own Condition the
-            coupling is designed by the kind's usual condition and judged by yours. None selects the usual condition
-            (design.designs.usual_condition), as the commands do.
+        condition: The name of a condition, or your own Condition (design.conditions), which judges a coupling that is
+            designed by the kind's usual condition. None selects the usual condition (design.designs.usual_condition),
+            as the commands do.
         options: Options of the kind (DesignOptions). `switching` replaces loop.varying_delay.
 
     Returns:
