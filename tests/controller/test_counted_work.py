@@ -1,6 +1,10 @@
 """Counted work depends on sizes and numbers only, and ends when its budget is spent."""
 
+import os
+import subprocess
+import sys
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ import pytest
 from haptic_loop.controller.arithmetic import TooLong, solve, spend, spent, times, within
 from haptic_loop.controller.lti import Lti
 
+ROOT = Path(__file__).parents[2]
 Z = np.exp(1j * np.linspace(0.01, 3, 50))
 
 
@@ -56,3 +61,26 @@ def test_only_a_given_clock_ends_work():
     with pytest.raises(TooLong), within(np.inf, clock=lambda: True):
         spend(0.0)
     spend(0.0)
+
+
+LOAD = """
+import sys, threading, time
+from importlib.machinery import ExtensionFileLoader
+from haptic_loop.controller.arithmetic import compiled
+
+run = ExtensionFileLoader.exec_module
+ExtensionFileLoader.exec_module = lambda loader, module: (time.sleep(0.2), run(loader, module))
+complete = []
+use = lambda: complete.append(hasattr(compiled("scipy.linalg.cython_blas"), "__pyx_capi__"))
+threads = [threading.Thread(target=use) for _ in range(3)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert "scipy.linalg" not in sys.modules
+sys.exit(complete != [True] * 3)
+"""
+
+
+def test_threads_wait_for_a_compiled_module():
+    """Loading is slowed down, so that other threads ask for the module before it is complete."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    assert subprocess.run([sys.executable, "-c", LOAD], env=environment, check=False).returncode == 0
