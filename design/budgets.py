@@ -14,7 +14,7 @@ from haptic_loop.controller.arithmetic import TooLong
 
 # Work that is counted [units] -----------------------------------------------------------------------------------------
 
-#: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and one over 800, the largest, takes 30.
+#: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and a proof over 800, the largest, takes 30.
 EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.006 for two devices and 0.008 for three.
 SWEEPS = 60.0
@@ -47,7 +47,7 @@ RANGED_BASES = 3
 PROOF_STATES = 800
 #: Rounds of cutting planes for a multiplier (one-wall takes 8), and rounds without progress after which they end.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
-#: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have that many.
+#: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have 24 rows.
 MULTIPLIER_ROWS = 24
 #: Rounds of a search for gains with added frequencies (case I takes 3), and its numbers of steps. With many channels
 #: the search takes the first number from every start, and the second from the best starts. With few channels it takes

@@ -32,7 +32,7 @@ FEEL_HZ = (1.0, 10.0)  # frequencies of the table of perceived stiffness and dam
 
 @dataclass(frozen=True, eq=False)
 class Perceived:
-    """The effective impedance of each channel with the others held still, as a spring and a damper."""
+    """The effective impedance of each channel with the other channels held still, as a spring and a damper."""
 
     stiffness: Array  # (k, m) Re G_ii [N/m]
     damping: Array  # (k, m) Im G_ii / omega [N s/m]; negative if the loop adds energy to the motion
@@ -78,7 +78,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Return frequencies [Hz] up to Nyquist's, dense around poles, with FEEL_HZ and the binding frequencies."""
+    """Return frequencies [Hz] up to 1/(2 T), dense around poles, with FEEL_HZ and the binding frequencies."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz

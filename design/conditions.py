@@ -615,7 +615,7 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
     a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). Friction of a device with
     several `axes` opposes its velocity in space. It must be at least |W|_2 of these axes, because the power of the
-    errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for a wrong number of steps or a negative one.
+    errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for a wrong number of steps or a negative step.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
@@ -632,7 +632,7 @@ _Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at 
 def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
     """Return required over available damping (n,) of n loops; inf if no damping is enough.
 
-    `at` returns the responses of their force maps, and `poles` (n, p) are the poles of these maps.
+    `at` returns the responses of the loops' force maps, and `poles` (n, p) are the poles of these maps.
     """
     here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
@@ -650,7 +650,7 @@ def any_environment_ratios(
 ) -> Array:
     """Return required over available damping (count,) of any-environment for `count` compliances V.
 
-    V returns their responses, and `demand` the block of any-environment for these.
+    V returns their responses, and `demand` the block of any-environment for these responses.
     """
 
     def needed(w: Array) -> Array:

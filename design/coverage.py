@@ -63,7 +63,7 @@ class SwitchingFigures:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Cost of a guarantee for ranges: the robust coupling compared with the nominal one.
+# Cost of a guarantee for ranges: the robust coupling compared with the nominal coupling.
 
 
 @dataclass(frozen=True)

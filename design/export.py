@@ -49,7 +49,7 @@ _MOST_TURNS = 100_000  # largest number of switches in a tick's box problem; a h
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 84 units in the last place
 _RESIDUAL = 1e-12  # allowed residual of a force vector relative to its limit, unless rounding is larger
 _BALL_ROUNDING = 16  # allowed rounding of a block's residual, in epsilons times the largest row sum of absolute terms
-_MOST_STEPS = 1000  # largest number of steps for force vectors; 5 are usual, well-conditioned random ones took up to 93
+_MOST_STEPS = 1000  # largest number of steps for force vectors; 5 are usual, random well-conditioned M took up to 93
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
 

@@ -5,7 +5,7 @@ b in parallel. A passive hand may have any passive response at each alias w_n = 
 responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
 conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
 held. With one channel, or channels with equal devices, every point of the disk is attained by some passive hand, and
-every point of its circle by a lossless one. The sweep uses the device of least mass, least damping, stiffest spring
+every point of its circle by a lossless hand. The sweep uses the device of least mass, least damping, stiffest spring
 and least damper within the bounds. Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for
 one channel. docs/theory.md has the proof.
 """
@@ -70,7 +70,7 @@ def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
     """Return the least share of the damping at which no passive hand makes the loop unstable, by a refined sweep.
 
     The motors' dynamics are assumed to be linear. For one channel or equal devices no condition on these devices
-    requires less than this share. Otherwise the share is sufficient, and close to the least one.
+    requires less than this share. Otherwise the share is sufficient, and close to the least share.
     """
     assert loop.known_devices
     known, T, m = loop.known_devices, loop.T, loop.channels
@@ -105,7 +105,7 @@ def _necessary_share(F: Lti, loop: Loop) -> _Necessary:
 
 @dataclass(frozen=True)
 class LeftOver:
-    """The damping at which Theorem A holds and the one that known-device requires.
+    """The damping at which Theorem A holds, and the damping that known-device requires.
 
     Attributes:
         required_damping: (m,) [N s/m] by a sweep. If `attained`, no condition for these devices requires less, and

@@ -71,7 +71,7 @@ class Requirement(Generic[C]):
         reason: Why `required` is infinite.
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
         multiplier: The multiplier with which `required` was computed, or None.
-        bound: Lower bound of `ratio` over the multipliers that the search allows, at its frequencies, or None.
+        bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
@@ -128,7 +128,7 @@ class Requirement(Generic[C]):
 
     @property
     def margin(self) -> float | None:
-        """Available over required damping; None if no damping is required, 0 if none is enough."""
+        """Available over required damping; None if no damping is required, 0 if no damping is enough."""
         return finite(1 / self.ratio) if self.ratio > 0 else None
 
     @property
@@ -249,13 +249,13 @@ class Design(Chosen):
 
     Attributes:
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
-        condition: The name of the condition that it was designed for.
+        condition: The name of the condition that the coupling was designed for.
         figure: The objective: "loop-norm" (23), "rms" and "sup" (mismatch) are minimised, "stiffness" is maximised.
         objective: The value of the objective for the returned coupling; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per device, for loops in which its search takes long; otherwise None.
+        c: The multiplier of the limiter, one row per device, if a repeated search for it would take long; else None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether the time limit ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.

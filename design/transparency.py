@@ -14,7 +14,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
-BAND_HZ = (0.5, 80.0)  # default band of the mismatch
+BAND_HZ = (0.5, 80.0)  # [Hz] default band of the mismatch
 _ROUNDING = 1e-10  # Responses that differ by less than this share of the environment count as equal.
 
 
@@ -96,7 +96,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         return F.at(z) - target.at(z)
 
     def sizes(w: Array) -> tuple[Array, Array, Array]:
-        """Return sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; those of the grid are cached."""
+        """Return sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; the values at the grid are cached."""
         if w is grid and known:
             return known[0]
         E = np.linalg.svd(environment.at(on_circle(w)), compute_uv=False)

@@ -134,7 +134,7 @@ def _points(region: Region) -> Iterator[Array]:
 
 
 def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
-    """Return points with their values, largest value first, without points close to one of larger value."""
+    """Return points with their values, largest value first, without points close to a point of larger value."""
     chosen: list[tuple[Array, float]] = []
     for i in np.argsort(-np.array(values), kind="stable"):
         if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
@@ -144,7 +144,7 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
-    # With many parameters only some vertices were tried, so the first steps go to others.
+    # With many parameters only some vertices were tried, so the first steps go to other vertices.
     step = 1.0 if point.size > _MANY else _FIRST
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
