@@ -482,6 +482,9 @@ class Armable(Protocol):
     def controller(self, cap: Sequence[float]) -> Controller: ...  # return a new controller for `cap` (m,) [N]
 
 
+_LATE = "no certificate covers a force that the device holds because an answer is late"
+
+
 @dataclass(frozen=True, eq=False)
 class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
@@ -542,9 +545,9 @@ class CertifiedCoupling:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             facts = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
             facts += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
-            return [*said, f"forces act as they come: certified for {facts}, as measured"]
+            return [*said, f"forces act as they come: certified for {facts}, as measured", _LATE]
         if self.held < 1:
-            return said
+            return [*said, _LATE]
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
         rho = lag(self.scenario.loop(self.case), self.chosen.certificate)  # rho of the limiter in the file's proof
         below = "" if rho and rho == self.assessment.force_limits.rho else " while forces stay below their limits"

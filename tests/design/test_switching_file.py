@@ -438,5 +438,9 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     (second,) = certified_couplings(later, "I", str(tmp_path / "one.json"), None, 2, spare=0)
     assert second.scenario.theta == (2, 2)
     assert second.remarks() == [
-        "the file proves delays switching within [1, 2] samples, which covers the constant theta = [2, 2]"
+        "the file proves delays switching within [1, 2] samples, which covers the constant theta = [2, 2]",
+        "no certificate covers a force that the device holds because an answer is late",
     ]
+    longer = change(LOOP, theta=(2, 2), varying_delay=DelayRange((2, 2), (3, 3)))
+    held = required_damping(longer, SOFT, "this-environment")
+    assert not held.certified
