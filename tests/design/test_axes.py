@@ -679,7 +679,7 @@ def test_a_turned_filter_keeps_its_static_share() -> None:
     before = ForceFilter([0.5], np.zeros((0, 2)), R)
     after, z = before.turned(TURN), np.exp(1j * np.array([0.1, 1.0, 3.0]))
     assert after.g == before.g == 0.75
-    np.testing.assert_allclose(after.filter(1e-3).at(z), TURN @ before.filter(1e-3).at(z) @ TURN.T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(after.filter(1e-3).at(z), TURN @ before.filter(1e-3).at(z) @ TURN.T, rtol=0, atol=1e-12)
 
 
 def test_switching_searches_take_delays_per_device() -> None:

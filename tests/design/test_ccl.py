@@ -61,7 +61,7 @@ def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case
     demand = any_environment_demand(Lti(V.A, V.B, V.C, V.D, T), loop)  # from V itself, in SI units
     root = np.sqrt((1 - RESERVE) * np.array(loop.delta) / T)
     wanted = demand.gain.at(Z) + demand.free.at(Z) / (1 - RESERVE)
-    np.testing.assert_allclose(family.block(p).at(Z), root[:, None] * wanted * root, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(family.block(p).at(Z), root[:, None] * wanted * root, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("diagonal", [True, False])
@@ -75,7 +75,7 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
         return np.concatenate([np.ravel(M) for G in both for M in (G.A, G.B, G.C, G.D)])
 
     middle = (everything(one) + everything(two)) / 2
-    np.testing.assert_allclose(everything((one + two) / 2), middle, rtol=0, atol=1e-9 * np.abs(middle).max())
+    np.testing.assert_allclose(everything((one + two) / 2), middle, rtol=0, atol=1e-12 * np.abs(middle).max())
 
 
 @pytest.mark.slow

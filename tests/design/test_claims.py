@@ -272,7 +272,7 @@ def test_the_moving_average_attains_the_stiffness_limit(theta):
     assert 1 / V.dc()[0, 0] == pytest.approx(2 * DELTA / ((theta + 1) * T))
     # V needs exactly delta at every frequency: Re[(z-1) V/(Tz)] = (1 - cos n w)/(2 delta)
     spent = (RATE * V.at(Z)[:, 0, 0]).real
-    np.testing.assert_allclose(spent, np.sin((theta + 1) * W / 2) ** 2 / DELTA, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(spent, np.sin((theta + 1) * W / 2) ** 2 / DELTA, rtol=0, atol=1e-12)
     softer = V + Lti.constant([[1e-4 * V.dc()[0, 0]]], T)  # strictly within the condition
     assert any_environment(softer, [theta], [DELTA]).certified
 
@@ -344,7 +344,7 @@ def test_no_storage_excludes_the_static_pole():
         P = root @ root.T
         assert abs(v.conj() @ (hat.A.T @ P @ hat.A - P) @ v) < 1e-8 * abs(v.conj() @ P @ v)
     # The Hermitian part of T E(1) z/(z-1) on the circle is the constant T E(1)/2
-    np.testing.assert_allclose((1 / (T * RATE)).real, 0.5, rtol=0, atol=1e-9)
+    np.testing.assert_allclose((1 / (T * RATE)).real, 0.5, rtol=0, atol=1e-12)
 
 
 def test_unilateral_springs_are_passive_under_backward_euler():

@@ -72,7 +72,7 @@ def test_balancing_leaves_the_response_alone(seed):
     padded = Lti.diag(G, Lti([[0.5]], [[0.0]], [[1.0]], [[2.0]], 1.0))
     found = balanced(padded)
     assert found.order == 5
-    np.testing.assert_allclose(found.at(Z), padded.at(Z), rtol=0, atol=1e-8 * np.abs(padded.at(Z)).max())
+    np.testing.assert_allclose(found.at(Z), padded.at(Z), rtol=0, atol=1e-11 * np.abs(padded.at(Z)).max())
 
 
 def test_units_preserve_the_eigenvalues_of_e_v():
@@ -88,8 +88,10 @@ def test_realisation_16_and_its_quotient_are_v_hat():
     np.testing.assert_allclose(v_hat_printed(V, theta).at(Z), hat, rtol=0, atol=1e-12)
     ports = v_hat_ports(V, theta)
     y2 = Lti(ports.A, ports.B, ports.C2, ports.D2, 1.0).at(Z)
-    np.testing.assert_allclose(hermitian(y2), hermitian(hat) / np.abs(1 - 1 / Z)[:, None, None] ** 2, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(y2, _v_hat(V - theta_hat(theta))[1].at(Z), rtol=0, atol=1e-9)  # the design's formula
+    # Where z is near 1, a division by |1 - 1/z|^2 = 1e-4 makes rounding errors of 1e-12.
+    quotient = hermitian(hat) / np.abs(1 - 1 / Z)[:, None, None] ** 2
+    np.testing.assert_allclose(hermitian(y2), quotient, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(y2, _v_hat(V - theta_hat(theta))[1].at(Z), rtol=0, atol=1e-10)  # the design's formula
 
 
 def test_e_hats_regular_part_keeps_the_hermitian_part():

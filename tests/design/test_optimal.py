@@ -166,7 +166,8 @@ def test_causal_parts_match_the_transform():
     D = np.diff(H, axis=1, prepend=0)
     D[:, 0] = 0  # -H_0 + H_0
     at = [0, 3000, 9000, 20000, w.size - 1]
-    np.testing.assert_allclose(_causal(grid, heights, w[at]), -np.fft.rfft(D, n=2**18)[:, at].T, rtol=0, atol=1e-5)
+    # The transform of 2^17 samples differs by 4e-8 from the exact one.
+    np.testing.assert_allclose(_causal(grid, heights, w[at]), -np.fft.rfft(D, n=2**18)[:, at].T, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow

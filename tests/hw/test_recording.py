@@ -331,6 +331,6 @@ def test_sessions_state_damping_axis_by_axis():
     full = PLANAR.replace("axes = 2 }", "axes = 2, damping = [[1.5, 0.4], [0.4, 0.9]] MORE }", 1)
     delta = session_for(parse(full.replace("MORE", "")), LinkSettings()).scenario.delta[:2]
     share = 1 - 0.4 / np.sqrt(1.5 * 0.9)  # the least eigenvalue of [[1, r], [r, 1]]
-    np.testing.assert_allclose(delta, [1.5 * share, 0.9 * share], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(delta, [1.5 * share, 0.9 * share], rtol=0, atol=1e-6)  # INFO has whole uN s/m
     assert np.linalg.eigvalsh(np.array([[1.5, 0.4], [0.4, 0.9]]) - np.diag(delta))[0] >= 0
     assert session_for(parse(full.replace("MORE", ", delta = 0.7")), LinkSettings()).scenario.delta[:2] == (0.7, 0.7)
