@@ -59,7 +59,7 @@ def test_responses_equal_impulse_convolution():
     x = np.random.default_rng(0).normal(size=(120, 2))
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, n) @ G.B for n in range(119))]
     y = np.array([sum(impulse[n] @ x[k - n] for n in range(k + 1)) for k in range(120)])
-    np.testing.assert_allclose(response(G, x), y, rtol=0, atol=1e-9 * np.abs(y).max())
+    np.testing.assert_allclose(response(G, x), y, rtol=0, atol=1e-12 * np.abs(y).max())
 
 
 def test_uncoupled_loops_are_ideal_despite_clipping():

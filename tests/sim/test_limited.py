@@ -65,11 +65,11 @@ def test_limiters_use_the_beta_of_the_file(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
 def test_both_engines_agree_on_limited_forces(coupling, rho):
-    """Motions of up to 3 cm agree to 1e-7 of their size, although forces are often at their limits and never above."""
+    """Motions of up to 2 cm agree to 1e-12 m, although forces are often at their limits and never above."""
     limits = np.array([0.3, 0.2])
     simulation = assemble(weak(*limits), coupling, rho)
     exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))
-    np.testing.assert_allclose(own.x, exact.x, rtol=0, atol=3e-11)
+    np.testing.assert_allclose(own.x, exact.x, rtol=0, atol=1e-12)
     assert (np.abs(exact.f) <= limits).all()
     assert 0.2 < exact.clipped(limits).mean() < 0.95
     assert simulation.process.law.bounds

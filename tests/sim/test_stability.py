@@ -65,7 +65,7 @@ def test_the_left_eigenvector_satisfies_its_equation():
     simulation = assemble(load(), NoCoupling())
     loop = close(simulation.plant, simulation.F)
     left = _left_eigenvector(loop).conj()
-    np.testing.assert_allclose(left @ loop.A, dominant_mode(loop).eigenvalue * left, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(left @ loop.A, dominant_mode(loop).eigenvalue * left, rtol=0, atol=1e-12)
 
 
 def test_traces_without_a_growth_rate_give_a_reason():

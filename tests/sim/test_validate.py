@@ -294,7 +294,8 @@ def test_no_random_human_destabilises_the_designed_coupling():
     assert not unstable(findings.mujoco).any()
     assert not findings.disagreements.any()
     traced = validate(Validation(SCENARIO, coupling, 0, 12, MIXED, "both", 2.0))
-    np.testing.assert_allclose(traced.trace, traced.exact, rtol=0, atol=1e-3)
+    # nearly equal eigenvalues lose half the digits
+    np.testing.assert_allclose(traced.trace, traced.exact, rtol=0, atol=1e-7)
     assert not traced.clipped.any()
     assert (traced.energy >= 0).all()
     # Definition 3 of the paper: damped humans come to rest, so the last quarter is calmer than the second.
@@ -305,7 +306,8 @@ def test_uncoupled_loops_are_mostly_unstable():
     findings = validate(Validation(SCENARIO, NoCoupling(), 0, 200, 1, "exact", 2.0))
     assert unstable(findings.exact).mean() > 0.6
     assert findings.energy.min() < 0
-    np.testing.assert_allclose(findings.trace, findings.exact, rtol=0, atol=1e-6)
+    # nearly equal eigenvalues lose half the digits
+    np.testing.assert_allclose(findings.trace, findings.exact, rtol=0, atol=1e-7)
 
 
 def test_opposite_growth_is_a_disagreement():

@@ -575,7 +575,8 @@ def test_arrows_show_what_devices_feel(none):
     stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
     told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
     ways, bars = arrows(stage, replace(session(none).frame(0.0), **told))
-    np.testing.assert_allclose([way[0] for way in ways], [-1, 1, 1], rtol=0, atol=1e-6)  # the last one is the push
+    forward = [way[0] for way in ways]  # in single precision; the last one is the push
+    np.testing.assert_allclose(forward, [-1, 1, 1], rtol=0, atol=1e-6)
     for bar, handle, f, most in zip(bars, scene.handles, (2.0, -2.0), limit, strict=True):
         at = stage.data.xpos[stage.model.jnt_bodyid[handle]]
         assert bar[0] - at[0] == pytest.approx(-f / most * drawing._LONGEST, abs=1e-6)

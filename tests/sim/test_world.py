@@ -173,9 +173,9 @@ def test_contacts_have_the_axes_of_their_devices(tmp_path):
         for _ in range(400):
             force = port.step(np.concatenate([goal, goal]))
         assert np.abs(force[:n]).max() > 1.0
-        np.testing.assert_allclose(
-            force[:n] @ normal[free] * normal[free] / (normal[free] @ normal[free]), force[:n], rtol=0, atol=1e-5
-        )
+        along = normal[free] / np.linalg.norm(normal[free])
+        # MuJoCo's contact solver is iterative: it left 1e-7 N.
+        np.testing.assert_allclose(force[:n] @ along * along, force[:n], rtol=0, atol=1e-5)
         np.testing.assert_allclose(force[n:], 0.0, rtol=0, atol=1e-9)
 
 
