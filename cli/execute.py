@@ -40,8 +40,9 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     sys.unraisablehook = _repeat_interrupt
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
+    alone = signal.getsignal(signal.SIGINT) is _leave  # whether this process runs only this command
     try:
-        if signal.getsignal(signal.SIGINT) is _leave:
+        if alone:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         # The matrices are small: more BLAS threads only wait for each other and change the last digits.
         with threadpool_limits(1, user_api="blas"), one_command():
@@ -66,6 +67,8 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
             traceback.print_exc()
             if place:
                 code = _say(f"error: {place}, which is your own code: {type(error).__name__}: {error}", BAD_INPUT)
+    if alone:  # A further Ctrl-C leaves at once.
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -115,12 +118,20 @@ def _terminated(number: int, frame: Any) -> NoReturn:
     raise SystemExit(_say("terminated", 128 + number))
 
 
-def _repeat_interrupt(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came during Python's clean-up, where Python would ignore it."""
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        _thread.interrupt_main()
-    else:
-        sys.__unraisablehook__(unraisable)
+_MOMENT = 0.05  # [s]
+
+
+def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__unraisablehook__) -> None:
+    """Repeat a moment later a Ctrl-C that came during a clean-up such as __del__, where Python ignores it.
+
+    Here, too, Python would ignore it. `shown` is an argument because Python deletes `sys` at its end.
+    """
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        shown(unraisable)
+        return
+    timer = threading.Timer(_MOMENT, _thread.interrupt_main)
+    timer.daemon = True
+    timer.start()
 
 
 def _load_on_first_use(*names: str) -> None:

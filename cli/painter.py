@@ -12,9 +12,11 @@ input is closed then. If it cannot be started, or ends without a picture, the fi
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 from contextlib import suppress
+from threading import Thread
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -29,6 +31,18 @@ def begin() -> None:
     """Start the second process of the next Painter, while this process still loads its own modules."""
     global _begun
     _begun = _started()
+    atexit.register(_end_begun)
+
+
+def _end_begun() -> None:
+    """End the second process if the command failed before it made its Painter."""
+    if _begun:
+        _end(_begun)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.communicate()
 
 
 def _started() -> subprocess.Popen[bytes] | None:
@@ -58,8 +72,7 @@ class Painter:
     def __del__(self) -> None:
         """End the second process if the command failed before its picture."""
         if self._process and self._process.returncode is None:
-            self._process.kill()
-            self._process.communicate()
+            _end(self._process)
 
     def ask(self, function: str, *arguments: Any) -> None:
         """Let the second process draw the figure that a function of sim.plots returns for these arguments."""
@@ -70,9 +83,9 @@ class Painter:
             from haptic_loop.controller.units import spoken
 
             request = pickle.dumps((spoken(), function, arguments), pickle.HIGHEST_PROTOCOL)
-            with suppress(BrokenPipeError), self._process.stdin as stdin:
+            stdin, self._process.stdin = self._process.stdin, None  # communicate() must not use the closed pipe
+            with suppress(BrokenPipeError), stdin:
                 stdin.write(request)
-            self._process.stdin = None  # communicate() must not use the closed pipe
 
     def save(self, path: Path) -> Path:
         """Write the figure of `ask` as a PNG file. Raises InputError if the file cannot be written."""
@@ -91,15 +104,28 @@ class Painter:
 
 
 def serve() -> None:
-    """Read what `ask` sends from standard input, and write its picture to standard output, in the second process."""
+    """Read what `ask` sends from standard input, and write its picture to standard output, in the second process.
+
+    A thread reads while matplotlib is loaded, so that `ask` does not wait, and ends this process with the first one.
+    """
     import pickle
 
+    request = bytearray()
+
+    def read() -> None:
+        request.extend(sys.stdin.buffer.read())
+        if not request:
+            os._exit(1)
+
+    reader = Thread(target=read)
+    reader.start()
     os.environ["MPLBACKEND"] = "Agg"
     skip_docstrings()
     from haptic_loop.controller.units import speak
     from haptic_loop.sim import plots
 
-    unit, function, arguments = pickle.load(sys.stdin.buffer)
+    reader.join()
+    unit, function, arguments = pickle.loads(request)
     speak(unit)
     sys.stdout.buffer.write(plots.png(getattr(plots, function)(*arguments)))
     sys.stdout.flush()

@@ -158,3 +158,27 @@ def interrupted_at(command, module, code, folder):
 def said(done):
     """Return standard error without the lines that say, on a slow machine, what a command waits for."""
     return "".join(line for line in done.stderr.splitlines(keepends=True) if not line.endswith(" ..\n"))
+
+
+LOST = """
+import os, signal, sys, time
+from haptic_loop.cli.execute import execute
+
+class Cleaned:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000): pass
+
+def main(argv):
+    Cleaned()
+    time.sleep(60)
+    return 0
+
+execute(main, [])
+"""
+
+
+def test_ctrl_c_during_a_clean_up_is_repeated():
+    """Python ignores the KeyboardInterrupt that __del__ raises."""
+    done = subprocess.run([sys.executable, "-c", LOST], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")

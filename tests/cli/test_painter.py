@@ -1,8 +1,11 @@
 """A second process draws the same picture, and this process draws if there is no second one."""
 
+import os
 import pickle
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from haptic_loop.controller.units import speak, spoken
 from haptic_loop.sim import plots
 from haptic_loop.sim.shown import Signals
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 T = np.arange(300) * 1e-3
 WAVE = np.sin(30 * T)[:, None]
 SHOWN = Signals(T, 1e-3 * WAVE, WAVE, 1e-3 * WAVE, ("knob",)), "a turn", 5.0
@@ -92,3 +96,32 @@ def test_a_begun_process_draws_for_the_next_painter(monkeypatch):
     assert second._process is None
     del first
     assert begun.returncode < 0
+
+
+LEFT = """
+import os
+from haptic_loop.cli import painter
+painter.begin()
+print(painter._begun.pid, flush=True)
+{end}
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system shows no processes in /proc")
+@pytest.mark.parametrize("end", ["os._exit(1)", "raise SystemExit(2)", "os.kill(os.getpid(), 9)"])
+def test_no_second_process_outlives_the_first(end):
+    program = [sys.executable, "-X", "dev", "-W", "error", "-c", LEFT.format(end=end)]
+    done = subprocess.run(program, capture_output=True, text=True, check=False, env=ENVIRONMENT)
+    assert "Warning" not in done.stderr
+    patience = time.monotonic() + 60
+    while running(int(done.stdout)) and time.monotonic() < patience:
+        time.sleep(0.02)
+    assert not running(int(done.stdout))
+
+
+def running(process: int) -> bool:
+    """Return whether this process runs; one that has ended may wait for its parent as a zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][0] != "Z"
+    except FileNotFoundError:
+        return False
