@@ -24,7 +24,7 @@ from haptic_loop.controller.tick import StepBuffer
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant
 from haptic_loop.models.scene import quiet_warnings
-from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, pace
+from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, least_substeps, pace
 from haptic_loop.sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
@@ -569,7 +569,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
-        return 1
+        return least_substeps(EXPONENTIAL)
     if integrator == "discrete":  # `_agrees` measures a map of position and velocity; this integrator has more state.
         raise InputError(f"--integrator discrete gives no reliable verdict: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even

@@ -103,10 +103,17 @@ def started(words: str, folder: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(call, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
 
 
+def ended(process: subprocess.Popen[bytes]) -> None:
+    """Wait for a command. Raises CalledProcessError if it failed."""
+    process.communicate()
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+
+
 def cost(words: str, folder: str) -> float:
     """Return the CPU seconds of a command and its child processes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    started(words, folder).communicate()
+    ended(started(words, folder))
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
@@ -114,7 +121,7 @@ def cost(words: str, folder: str) -> float:
 def waited(words: str, folder: str) -> float:
     """Return the seconds until a command has ended."""
     begin = time.perf_counter()
-    started(words, folder).communicate()
+    ended(started(words, folder))
     return time.perf_counter() - begin
 
 
@@ -125,7 +132,7 @@ def first_line(words: str, folder: str) -> float:
     assert process.stdout is not None
     process.stdout.readline()
     spent = time.perf_counter() - begin
-    process.communicate()
+    ended(process)
     return spent
 
 

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from asked import prove_limiter
+from threadpoolctl import threadpool_limits
 
 from haptic_loop import certify, design_coupling
 from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
@@ -107,7 +108,7 @@ def delays() -> None:
 
 def hands() -> None:
     """Measure verdicts by both engines, without traces and with traces of 2 s."""
-    for count in (1000, 10_000):
+    for count in (1000, 10_000, 100_000):
         for duration in (0.0, 2.0) if count == 1000 else (0.0,):
             question = Validation(load(), PUBLISHED["I"], 0, count, MIXED, "both", duration)
             found, used = cpu(lambda question=question: validate(question))
@@ -125,5 +126,6 @@ def duration() -> None:
 
 if __name__ == "__main__":
     known = {f.__name__: f for f in (devices, commands, delays, hands, duration)}
-    for name in sys.argv[1:] or known:
-        known[name]()
+    with threadpool_limits(1, user_api="blas"):
+        for name in sys.argv[1:] or known:
+            known[name]()
