@@ -319,4 +319,5 @@ def test_searched_parts_equal_the_block():
         (cross, block[:, 2:, :2]),
         (corner[:, :, None] * np.eye(2), block[:, 2:, 2:]),
     ):
+        # Rounding moved entries by up to 4e-12 of the largest one.
         np.testing.assert_allclose(made, part, rtol=0, atol=1e-9 * np.abs(block).max())

@@ -287,7 +287,7 @@ def test_both_engines_trace_late_forces():
     late = load("one-wall").replace(environment=wall, latency=((3e-4, 3e-4),), tap=None)
     found = _examine(Validation(late, NoCoupling(), 0, 2, 1, "both", 0.25), range(2))
     assert found.witnessed.all()
-    np.testing.assert_allclose(found.trace, found.exact, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.trace, found.exact, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.mujoco, found.exact, rtol=0, atol=1e-3)  # MuJoCo steps by RK4 here
 
 

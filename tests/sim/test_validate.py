@@ -140,9 +140,8 @@ def test_both_engines_agree_on_a_person():
     mujoco, exact = run(simulation), run(simulation, "exact")
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
-    np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], rtol=0, atol=1e-7)
-    # The tolerance suits RK4 x 4, too, which errs by 1.3e-5 of the largest speed: speeds ring at 90 Hz after the tap.
-    np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], rtol=0, atol=1e-4 * np.abs(exact.s).max())
+    np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], rtol=0, atol=1e-10 * np.abs(exact.s).max())
 
 
 def test_the_worst_person_and_hands_replay(tmp_path):

@@ -152,7 +152,7 @@ def test_rest_is_where_a_held_position_leads(published):
     z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, rtol=0, atol=1e-12)
     # The forces are 4 N; rounding in z and F(1) changed them by 5e-13 N when measured.
-    assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-8)
+    assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-10)
 
 
 def test_switching_keeps_the_plant_state(none):
@@ -164,7 +164,7 @@ def test_switching_keeps_the_plant_state(none):
     assert np.array_equal(running.state, alone.state)  # position and velocity do not jump
     F, x = running.prepared.simulation.F, before.q[:2]
     force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
-    assert np.allclose(force, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-8)
+    assert np.allclose(force, F.at(1.0 + 0j).real @ x, rtol=0, atol=1e-10)
 
 
 def test_the_oscillation_starts_and_dies(none):
