@@ -70,15 +70,12 @@ coverage: .venv/ready
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5
-	$(PY) -m sim.run --case I --condition any-environment --out out/figure-6
-	$(PY) -m design.compare --out out/compare
-	cp out/compare/couplings.png docs/pictures/side-by-side.png
+	$(PY) -m sim.run --case I --coupling published --out out/figure-6
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
 	$(PY) -m design.compare --coupling published,spring-damper:any-environment,spring-damper --out out/couplings
 	for name in required-damping perceived; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
-	cd docs/pictures && ../../$(PY) ../../examples/limits_of_any_coupling.py
 	$(PY) examples/wheel.py docs/pictures/wheel.png
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
