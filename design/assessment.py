@@ -37,7 +37,7 @@ from haptic_loop.design.certificate import (
     requirements_of,
 )
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coupling_file import Certificate
+from haptic_loop.design.coupling_file import Certificate, digest
 from haptic_loop.design.environments import (
     ANY_ENVIRONMENT,
     LIMITER,
@@ -582,7 +582,9 @@ def assess(
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
     if isinstance(coupling, Design):
         certificate, condition = certificate or coupling.certificate, condition or coupling.asked
-        searched, coupling = searched or coupling.searched, coupling.coupling
+        made = coupling.certificate  # The design's search is of this loop's ranges only if its proof is.
+        own_search = coupling.searched if made and made.scenario == digest(loop, coupling.coupling.form()) else None
+        searched, coupling = searched or own_search, coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment

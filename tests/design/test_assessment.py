@@ -22,8 +22,10 @@ from haptic_loop.design import compare as comparison
 from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
-from haptic_loop.design.environments import LIMITER, ThisEnvironment
-from haptic_loop.design.result import HERE, NotProved
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, ThisEnvironment
+from haptic_loop.design.result import HERE, Design, NotProved
+from haptic_loop.design.robustness import ranges_around
+from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.scenario import load, parse
@@ -346,3 +348,16 @@ def test_guarantees_name_the_environment_that_runs():
     assert assess(rigid, coupling).guarantee is None
     assert assess(rigid, coupling, environment=soft).guarantee.environments == HERE
     assert assess(rigid.at(soft), SpringDamper([400.0], [0.0]), environment=RIGID_WALL).guarantee.environments != HERE
+
+
+def test_a_search_of_other_ranges_is_repeated():
+    """Within 40 % the coupling needs 0.98 of the damping, within 1 % 0.84: the design's own search is too narrow."""
+    coupling, loop = SpringDamper([2000.0, 1500.0], [0.4, 1.6]), load().loop("I")
+    narrow, wide = (change(loop, ranges=ranges_around(loop.network, percent)) for percent in (1.0, 40.0))
+    needs, searched = THIS_ENVIRONMENT.required(narrow, coupling), search_ranges(narrow, coupling)
+    proof = prove(narrow, coupling, THIS_ENVIRONMENT)
+    design = Design(coupling, needs.condition, "stiffness", 1.0, needs, certificate=proof, searched=searched)
+    assert assess(narrow, design).ranges.searched is searched
+    most = search_ranges(wide, coupling).worst[0].ratio
+    assert most > searched.worst[0].ratio + 0.1
+    assert assess(wide, design).ranges.searched.worst[0].ratio == pytest.approx(most)
