@@ -28,6 +28,7 @@ from haptic_loop.design.coupling_file import (
 )
 from haptic_loop.design.environments import (
     ANY_ENVIRONMENT,
+    LIMITER,
     THIS_ENVIRONMENT,
     LimitedForces,
     SwitchingDelays,
@@ -306,16 +307,17 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
 def condition_of(certificate: Certificate, own: Condition | None = None) -> Condition:
     """Return the condition that a certificate proves. Raises ValueError for an unknown name or wrong multipliers."""
     base = named(own or certificate.condition)
+    limits = isinstance(base, LimitedForces)
     if not certificate.limiter:
         return base
-    if not (base.extensible or base is KNOWN_DEVICE):
+    if not (limits or base.extensible or base is KNOWN_DEVICE):
         raise ValueError(f"facts: the file lists the limiter, but {certificate.condition} covers no limited forces")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(
             f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected c to have equally many per rho"
         )
-    limiter = LimitedForces(lags=len(c) // len(rho), held=rho)
+    limiter = replace(base if limits else LIMITER, lags=len(c) // len(rho), held=rho)
     return LimitedKnownDevice(limiter) if base is KNOWN_DEVICE else limiter
 
 

@@ -182,7 +182,10 @@ class Multiplied(Condition):
 
 
 def named_parts(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> dict[str, Sequence[Any]]:
-    """Return the values of each multiplier by name. Raises ValueError for a wrong number of values."""
+    """Return the values of each multiplier by name. Raises ValueError for a wrong number of values or equal names."""
+    names = [each.name for each in unknowns]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two multipliers have one name: {', '.join(names)}")
     return {each.name: part for each, part in zip(unknowns, _parted(unknowns, values), strict=True)}
 
 
@@ -332,7 +335,7 @@ class ThisEnvironment(Multiplied):
 
     @property
     def extensible(self) -> bool:
-        """False for subclasses: the block for limited forces and the fast sweeps do not contain a subclass's facts."""
+        """False for subclasses: the block for limited forces and every shortcut leave out a subclass's facts."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
@@ -379,8 +382,8 @@ class ThisEnvironment(Multiplied):
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block; without a multiplier all walls touch and delays are constant."""
-        if multiplier is not None:
+        """Return the block; this-environment without a multiplier has touching walls and constant delays."""
+        if multiplier is not None or not self.extensible:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
         if exact:
@@ -391,7 +394,7 @@ class ThisEnvironment(Multiplied):
         """Return the largest requirement over all members of ranges, with one multiplier for all."""
         if loop.ranges and self.unknowns(loop) and not self.beyond(loop):
             return self._of_members(loop, coupling, multiplier)
-        if self.unknowns(loop) or self.beyond(loop):
+        if not self.extensible or self.unknowns(loop) or self.beyond(loop):
             return super().required(loop, coupling, multiplier)
         if loop.ranges is None:
             return this_environment(loop.F(coupling), loop)
@@ -530,7 +533,10 @@ class LimitedForces(ThisEnvironment):
 
     @property
     def base(self) -> str:
-        return ThisEnvironment.name
+        return ThisEnvironment.name if self.name == LimitedForces.name else self.name
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return loop.per_channel(self.rho(loop))
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
         return {"rho": self.rho(loop)}
@@ -689,9 +695,18 @@ class _AnyEnvironment(Multiplied):
     name, source = "any-environment", "the paper's Theorem 4"
     covers = BEYOND
 
+    @property
+    def _extended(self) -> bool:
+        """Whether this is a user's subclass, whose facts only the composed block contains."""
+        return type(self) is not _AnyEnvironment
+
+    def _in_frame(self, loop: Loop) -> bool:
+        """Return whether `compose_any` composes the block: for a latency, switching delays, or a user's facts."""
+        return bool(self._extended or loop.latency or loop.varying_delay)
+
     def separable(self, loop: Loop) -> bool:
         # Matrix levels couple the axes of a device, and so do multipliers of a latency or of delays that switch.
-        return not loop.levels and not (loop.axes and self.unknowns(loop))
+        return not self._extended and not loop.levels and not (loop.axes and self.unknowns(loop))
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
         """Return the facts of the environment's side that the block needs."""
@@ -711,7 +726,7 @@ class _AnyEnvironment(Multiplied):
         return self._composed(G, loop, multiplier, scaled=True)
 
     def _composed(self, V: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
-        if not _in_frame(loop):
+        if not self._in_frame(loop):
             return any_environment_demand(V, loop)
         values = self.named(loop, () if multiplier is None else multiplier)
         return compose_any(V, loop, self.facts(loop), values, scaled)
@@ -728,17 +743,19 @@ class _AnyEnvironment(Multiplied):
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment the condition covers no walls"
-        if _in_frame(loop) and any(loop.psi):
-            obstacle = "latency" if loop.latency else "delays that switch"
+        if self._in_frame(loop) and any(loop.psi):
+            obstacle = (
+                "latency" if loop.latency else "delays that switch" if loop.varying_delay else "facts of your own"
+            )
             return f"with delay in the environment the condition covers no {obstacle}"
-        return None if any(loop.psi) else loop.environment.active(loop.T)
+        return None if any(loop.psi) else super().beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
         return "with psi >= 1 each K, T and delay needs another multiplier: not searched" if any(loop.psi) else None
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
-        if V is not None and _in_frame(loop):
+        if V is not None and self._in_frame(loop):
             return partial(least_scale, self.block(V, loop, multiplier or self.usual(None, loop)))
         phi = multiplier if any(loop.psi) else None
         if V is None or (phi is None and any(loop.psi)):
@@ -750,7 +767,7 @@ class _AnyEnvironment(Multiplied):
 
         def demand(V: Sampled) -> Demand[Sampled]:
             """Return the block, with default multipliers for a latency that varies and for switching delays."""
-            if _in_frame(loop):
+            if self._in_frame(loop):
                 return self.block(V, loop, self.usual(None, loop))
             return any_environment_demand(V, loop, multiplier)
 
@@ -767,8 +784,8 @@ class _AnyEnvironment(Multiplied):
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling), applies=False)
-        if _in_frame(loop):
-            return self._in_frame(V, loop, multiplier)
+        if self._in_frame(loop):
+            return self._composed_requirement(V, loop, multiplier)
         if not any(loop.psi):
             channels = coupling.channels(loop.T) if self.separable(loop) else None
             if channels:
@@ -783,10 +800,10 @@ class _AnyEnvironment(Multiplied):
         requirement = any_environment(V, loop, np.array([float(p) for p in multiplier]))
         return replace(requirement, multiplier=tuple(multiplier))
 
-    def _in_frame(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
+    def _composed_requirement(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
         if self.unknowns(loop):
             needs = self.required_of(V, loop, multiplier)
-            if multiplier or loop.latency or needs.certified:
+            if multiplier or loop.latency or needs.certified or self._extended:
                 return needs
             spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
             mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
@@ -824,7 +841,7 @@ class _AnyEnvironment(Multiplied):
         return ()
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        return None if any(loop.psi) else (0.0,) * loop.channels
+        return None if any(loop.psi) or self._extended else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Environments:
         return "this environment" if any(loop.psi) else "any passive environment"
@@ -841,8 +858,3 @@ def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
     """
     half = (hi - lo) / 2
     return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)
-
-
-def _in_frame(loop: Loop) -> bool:
-    """Return whether `compose_any` composes the block, because of a latency or switching delays."""
-    return bool(loop.latency or loop.varying_delay)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
@@ -33,7 +34,7 @@ from haptic_loop.controller.loop import DeviceBounds, Loop, Rows
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import budgets
-from haptic_loop.design.conditions import Condition, Demand, unsound
+from haptic_loop.design.conditions import BEYOND, Condition, Demand, unsound
 from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
 from haptic_loop.design.environments import (
     ANY_ENVIRONMENT,
@@ -43,7 +44,7 @@ from haptic_loop.design.environments import (
     Multiplied,
     named_parts,
 )
-from haptic_loop.design.facts import Fact, KnownMotor, PeriodCost, Unknowns, Values, compose, compose_any
+from haptic_loop.design.facts import Fact, KnownMotor, Limited, PeriodCost, Unknowns, Values, compose, compose_any
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.result import (
     MAKING,
@@ -318,6 +319,7 @@ class Sweep:
         maps: One map for each environment, as `form` takes them.
         form: (map, multipliers by name, hands' side) -> the demand.
         unknowns: The multipliers of the facts.
+        limited: Whether a limiter is among the facts, so that dx is the sum of two inputs.
     """
 
     def __init__(
@@ -326,13 +328,13 @@ class Sweep:
         maps: Sequence[Lti],
         form: Callable[[Any, Values, KnownMotor], Demand[Any]],
         unknowns: Sequence[Unknowns] = (),
+        limited: bool = False,
     ) -> None:
         self.loop, self.maps, self.form, self.unknowns = loop, maps, form, unknowns
         known, m = _known(loop, loop.T), loop.channels
         self.P, self.highest = known.P, 4 * known.mass / known.damping  # `highest` is the beta [s] with c2 = 0
         self.usual = tuple(v for each in unknowns for v in (each.units if each.start is None else each.start))
         self.grids = [np.concatenate([[0.0], frequencies(self.idle(i, np.zeros(m)).free)]) for i in range(len(maps))]
-        limited = any(each.name == "c" for each in unknowns)  # With a limiter dx is the sum of two inputs.
         self.moves = [np.arange(m), 2 * m + np.arange(m)] if limited else [np.arange(m)]
 
     def idle(self, environment: int, beta: Any, values: Sequence[float] | None = None) -> Demand[Lti]:
@@ -403,6 +405,7 @@ class _Search:
         self.units = np.array([unit for _, unit in each])
         self.searched = np.flatnonzero(self.units)
         self.inverse = np.array([each[i][0].name == "alpha" for i in self.searched], dtype=bool)
+        self.inverse &= bool(sweep.loop.varying_delay)  # A user's own multiplier may have the same name.
         bounds = np.array([(each[i][0].least, each[i][0].most) for i in self.searched]).reshape(-1, 2)
         bounds[self.inverse] = 1 / _WEIGHTS, _WEIGHTS
         self.low, self.top = bounds.T
@@ -452,6 +455,7 @@ class _Search:
         m, beta, weights = self.device.size, self.beta(x), self.weights(x)
         block = parts[0] + np.tensordot(np.concatenate([x[: self.m], weights]), parts[1:], axes=1)
         alpha, loop = named_parts(self.sweep.unknowns, self.values(x)).get("alpha"), self.sweep.loop
+        alpha = alpha if loop.varying_delay else None
         even = loop.per_channel([np.mean(loop.delta[own]) for own in loop.devices])
         for i, each in enumerate(loop.per_channel(alpha) if alpha else ()):
             weight, speed, v = each * (loop.delta[i] / even[i]), beta[i] * (z - 1), m + i
@@ -678,6 +682,16 @@ class KnownDevice(Condition):
         """Return the facts of the environment's side that need multipliers."""
         return self.plain.facts(loop)
 
+    @property
+    def at_zero(self) -> Multiplied:
+        """The condition for beta -> 0: `plain`, with this class's facts if a user's subclass replaces them."""
+        if type(self).facts is KnownDevice.facts:
+            return self.plain
+        base, own, extended = type(self.plain), copy(self.plain), {"name": self.name, "covers": BEYOND}
+        extended["facts"] = lambda _, loop: self.facts(loop)
+        object.__setattr__(own, "__class__", type(base.__name__, (base,), extended))
+        return own
+
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         return tuple(each for fact in self.facts(loop) for each in fact.unknowns(loop))
 
@@ -696,10 +710,12 @@ class KnownDevice(Condition):
     def sweep(self, loop: Loop, coupling: Coupling) -> Sweep:
         """Return the sweep of all environments of the loop. Raises SingularLoop."""
         maps = [self.map(each, coupling) for each in self._loops(loop)]
-        one = loop.at(loop.environment)
-        return Sweep(
-            _straightened(one), maps, lambda G, values, hands: self.form(G, one, values, hands), self.unknowns(loop)
-        )
+        one, limited = loop.at(loop.environment), any(isinstance(fact, Limited) for fact in self.facts(loop))
+
+        def form(G: Any, values: Values, hands: KnownMotor) -> Demand[Any]:
+            return self.form(G, one, values, hands)
+
+        return Sweep(_straightened(one), maps, form, self.unknowns(loop), limited)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
@@ -709,7 +725,8 @@ class KnownDevice(Condition):
         beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
         own, unknowns = tuple(multiplier[3 * m :]), self.unknowns(loop)
         if not any(beta):
-            return self.plain.demand(loop, coupling, exact, own) if own else self.plain.demand(loop, coupling, exact)
+            plain = self.at_zero
+            return plain.demand(loop, coupling, exact, own) if own else plain.demand(loop, coupling, exact)
         values = named_parts(unknowns, own)
         for each in unknowns:
             each.check(values[each.name])
@@ -737,7 +754,7 @@ class KnownDevice(Condition):
             return refusal(self.name, loop.delta, reason)
         if multiplier is not None and any(multiplier[:m]):
             return self._at(loop, coupling, tuple(float(v) for v in multiplier))
-        plain = self.plain.required(loop, coupling, tuple(multiplier or ())[3 * m :] or None)
+        plain = self.at_zero.required(loop, coupling, tuple(multiplier or ())[3 * m :] or None)
         plain = replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *(plain.multiplier or ())))
         if plain.reason or multiplier is not None:
             return plain
@@ -782,7 +799,7 @@ class KnownDevice(Condition):
             multiplier = self.required(loop, coupling).multiplier
         m, values = loop.channels, multiplier or ()
         if not any(values[:m]):
-            return self.plain.over_frequency(loop, coupling, tuple(values[3 * m :]) or None)
+            return self.at_zero.over_frequency(loop, coupling, tuple(values[3 * m :]) or None)
         beta, sweep = np.array(values[:m], dtype=float), self.sweep(loop, coupling)
         return sweep.response(0, beta, tuple(values[3 * m :]), max(_MOST_SHARE, 2 * sweep.floor(beta)))
 
@@ -791,10 +808,11 @@ class KnownDevice(Condition):
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
         beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map over K and B (sim.zwidth)
-        needs thousands of couplings. Returns None for matrix levels or if the plain condition returns None, and inf if
-        this condition does not cover the loop or has multipliers of facts.
+        needs thousands of couplings. Returns None for matrix levels, for a user's subclass, or if the plain condition
+        returns None, and inf if this condition does not cover the loop or has multipliers of facts.
         """
-        plain = None if loop.levels else self.plain.ratios(loop, coupling)
+        ours = type(self) in (KnownDevice, _KnownDeviceAny)  # The block of a user's fact may not be affine in beta.
+        plain = self.plain.ratios(loop, coupling) if ours and not loop.levels else None
         if plain is None or self.unknowns(loop) or self.beyond(loop):
             return plain if plain is None else np.full(plain.size, np.inf)
         holds = self._drawn(loop, coupling, plain.size)
@@ -888,7 +906,7 @@ class _KnownDeviceAny(KnownDevice):
         return ()
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        return (0.0,) * loop.channels
+        return (0.0,) * loop.channels if type(self) is _KnownDeviceAny else None
 
     def guarantee(self, loop: Loop) -> Environments:
         return "any passive environment"
