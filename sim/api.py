@@ -96,7 +96,7 @@ def run_scenario(
     settled = EngineSettings(settings.engine, integrator, substeps)
     stepped = make_engine(simulation, settings.engine, integrator, substeps)
     begin, unsolved = time.perf_counter(), ran.process.law.unsolved
-    trace = run(ran, stepped, progress=progress)
+    trace = run(ran, stepped, progress=progress, may_end_early=True)
     wall, unsolved = time.perf_counter() - begin, ran.process.law.unsolved - unsolved
     return ScenarioRun(simulation, ran, period, choices, settled, remarks, trace, wall, seed, unsolved)
 

@@ -168,6 +168,7 @@ def run(
     ticks: int | None = None,
     start: Array | None = None,
     progress: Progress = lambda done, ticks: None,
+    may_end_early: bool = False,
 ) -> Trace:
     """Run the loop and return the trace.
 
@@ -178,10 +179,13 @@ def run(
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
         progress: Called with (ticks done, number of ticks).
+        may_end_early: Whether Ctrl-C only ends the trace early, which then has `interrupted`.
 
     Returns:
-        The trace. It ends early when a number stops being finite, the engine reports trouble, or the keyboard
-        interrupts.
+        The trace. It ends early when a number stops being finite or the engine reports trouble.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C without `may_end_early`, or before any tick is finished.
     """
     process, scenario = simulation.process, simulation.scenario
     engine = make_engine(simulation, engine)
@@ -196,14 +200,16 @@ def run(
     def keep(buffer: StepBuffer, first: int, count: int) -> bool:
         nonlocal diverged, net, done
         finite = _finite_ticks(buffer, count)
+        record[first : first + finite] = buffer.rows[:finite, :, 0]
         net, diverged, done = buffer.net, engine.troubled() or finite < count, first + finite
-        record[first:done] = buffer.rows[:finite, :, 0]
         progress(done, ticks)
         return diverged
 
     try:
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
-    except KeyboardInterrupt:  # The finished ticks are kept.
+    except KeyboardInterrupt:
+        if not (may_end_early and done):
+            raise
         interrupted = True
     record.setflags(write=False)
     n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles

@@ -1,9 +1,12 @@
 """After Ctrl-C, or if a reader closes the pipe, a command has the right exit code and no traceback."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,7 @@ from haptic_loop.cli.execute import execute
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.files import check_file, out_file
+from haptic_loop.sim import run as loop
 from haptic_loop.sim.scenario import InputError, load
 
 ROOT = Path(__file__).parents[2]
@@ -45,6 +49,59 @@ def test_an_interrupted_comparison_reports_nothing(tmp_path):
     """The runs import MuJoCo after some couplings are designed."""
     assert interrupted_after("mujoco", ["design.compare", "--json", "r.json"], tmp_path) == (130, ["interrupted"])
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def interrupt(monkeypatch, simulation, blocks=1):
+    """Let Ctrl-C come when so many blocks of the command's simulation of this number are finished."""
+    run_blocks, numbers = loop.run_blocks, count(1)
+
+    def interrupted(process, engine, outside, ticks, start, keep, block):
+        if next(numbers) != simulation:
+            return run_blocks(process, engine, outside, ticks, start, keep, block)
+        if blocks:
+            run_blocks(process, engine, outside, blocks * block, start, keep, block)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "run_blocks", interrupted)
+
+
+RUN = ["sim.run", "--coupling", "published", "--duration", "3"]
+
+
+@pytest.mark.parametrize(
+    ("command", "simulation"),
+    [([*RUN, "--cross-check"], 2), ([*RUN, "--cross-check"], 3), (["design.compare"], 1), (["design.compare"], 2)],
+)
+def test_interrupted_secondary_runs_give_no_report(command, simulation, tmp_path, monkeypatch):
+    """Besides the reported run, sim.run simulates the exact loop, and design.compare every coupling."""
+    interrupt(monkeypatch, simulation)
+    with pytest.raises(KeyboardInterrupt):
+        finish(command, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("simulation", [1, 2])
+def test_interrupted_references_measure_nothing(simulation, tmp_path, monkeypatch):
+    """The exact engine runs the loop without the coupling, and the loop with it, before any engine is measured."""
+    interrupt(monkeypatch, simulation)
+    assert finish(["sim.accuracy", *RUN[1:]], tmp_path) == 130
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["interrupted"]
+    assert not report["rows"]
+
+
+@pytest.mark.parametrize("scenario", [["--case", "none"], ["--scenario", "world-cube"]])
+def test_no_finished_tick_means_no_report(scenario, tmp_path, monkeypatch):
+    interrupt(monkeypatch, 1, blocks=0)
+    with pytest.raises(KeyboardInterrupt):
+        finish(["sim.run", *scenario], tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def finish(command, folder):
+    """Run a command in this process, without pictures, and return its exit code."""
+    main = import_module(f"haptic_loop.cli.{command[0].rpartition('.')[2]}").main
+    return main([*command[1:], "--no-plot", "--out", str(folder)])
 
 
 def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
