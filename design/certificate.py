@@ -46,7 +46,9 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import KNOWN_CONDITIONS, NotProved, Requirement, refusal, switching_guarantee
 
-_CLAIM_TOLERANCE = 1e-6  # allowed relative error of required damping and margin on file; repeated sweeps agree to 1e-9
+#: allowed error of figures on file: of required damping relative to the largest available one, of the margin relative
+#: to itself; repeated sweeps agree to 1e-9
+_CLAIM_TOLERANCE = 1e-6
 
 
 @contextmanager
@@ -409,10 +411,10 @@ def _check_part(
 
 def _other_figures(claim: Certificate, needed: Requirement) -> str | None:
     """Return a message if the figures on file differ from those of the sweep, or None."""
-    required = needed.required
-    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
+    required, allowed = needed.required, _CLAIM_TOLERANCE * max(needed.available)
+    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=0, atol=allowed):
         return f"required is {list(claim.required)}, the sweep finds {list(required)}"
-    if not np.isclose(claim.margin, _margin(needed), rtol=_CLAIM_TOLERANCE):
+    if not np.isclose(claim.margin, _margin(needed), rtol=_CLAIM_TOLERANCE, atol=0):
         return f"margin is {claim.margin:.9g}, the sweep finds {_margin(needed):.9g}"
     return None
 

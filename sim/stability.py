@@ -237,7 +237,7 @@ def ringing(simulation: Simulation) -> Ringing | None:
     modes = modes[np.abs(modes) > _CLEAR]  # A free drift neither rings nor decays.
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
-    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # Both belong to one conjugate pair.
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # Both belong to one conjugate pair.
         least = slowest
     shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
     return Ringing(*map(float, shown))
