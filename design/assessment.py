@@ -596,6 +596,8 @@ def assess(
     if wanted_condition.name not in requirements:
         requirements[wanted_condition.name] = judged(here, coupling, wanted_condition)
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
+    if known and known.condition != over.name:
+        searched = None  # That search was for another condition.
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
     if loop.varying_delay:
         switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
