@@ -247,6 +247,8 @@ def _remarks(report: MapReport) -> Iterator[str]:
             yield f"{name}: {ratio.reason}."
         if ratio.contradicted_cells:
             yield f"[red]CONTRADICTION[/]: {ratio.contradicted_cells} certified cells are unstable."
+    if any(simulation.effects.encoder_step_m):
+        yield "Guarantees are for exact positions: sim.run judges the encoder steps."
     if simulation.contradicts:
         yield f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation.differ_from_linear} points."
     if report.walls:

@@ -14,6 +14,7 @@ from haptic_loop.cli.compare import main as compare_command
 from haptic_loop.cli.design import main as design_command
 from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.cli.verdict import verdict
+from haptic_loop.cli.zwidth import main as zwidth_command
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -118,8 +119,11 @@ def test_friction_is_compared_in_the_running_environment():
         lambda out: compare_command(
             ["--coupling", "none", "--no-plot", "--out", f"{out}/c", "--scenario", f"{out}/s.toml"]
         ),
+        lambda out: zwidth_command(
+            ["--grid=4", "--points=0", "--humans=1", "--no-plot", "--out", f"{out}/z", "--scenario", f"{out}/s.toml"]
+        ),
     ],
-    ids=["design", "validate", "bridge", "compare"],
+    ids=["design", "validate", "bridge", "compare", "zwidth"],
 )
 def test_commands_say_that_steps_are_not_covered(run, tmp_path, capsys):
     """A session's device always counts encoder steps, so bridge says so without a scenario that declares them."""
