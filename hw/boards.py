@@ -4,7 +4,7 @@ In a step, the host takes one sample of every board and computes one force for e
 the leading board. Each other board contributes its next sample, or repeats its last sample where its clock has fallen
 behind by a period. A repeated sample is a tick of length zero, in which no force exchanges energy. So every board sees
 forces that are a whole number of steps old, and ticks that are no longer than its own period. A certificate for T_max
-covers both.
+covers these delays and ticks.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class _Board:
         self.last: wire.State | None = None  # newest STATE that came after the last CONFIG; None before
         self.misses = 0  # State.misses in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
-        self._steps = self._shifted = 0  # steps since the board was first paired; their number at the last shift
+        self._steps = self._shifted = 0  # steps since the first pairing; their number when `offset` was last lowered
 
     def configure(self, config: wire.Config) -> None:
         """Forget all samples and store the board's part of a configuration."""
@@ -71,7 +71,7 @@ class _Board:
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] leads of its last samples
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
-        """Receive a STATE. Raises SafetyStop if the board keeps applying wrong forces, or holds one for too long."""
+        """Receive a STATE. Raises SafetyStop if the board keeps applying wrong forces, or holds a force too long."""
         ticks = wire.distance(state.tick, self.last.tick) if self.last else 1
         if ticks <= 0:
             return
@@ -103,7 +103,7 @@ class _Board:
     def follow(self, step: int, at: int, driving: bool) -> None:
         """Change the pairing of steps and samples if the median lead is outside of its limits.
 
-        Raises SafetyStop if this clock is clearly faster than the leading one, or slower by more than CLOCK_TOLERANCE.
+        Raises SafetyStop if this clock is clearly faster than the leading clock, or slower beyond CLOCK_TOLERANCE.
         """
         assert self.offset is not None
         if self._shift_at is not None and wire.distance(step, self._shift_at) >= 0:
@@ -122,11 +122,13 @@ class _Board:
             raise wire.SafetyStop(f"its clock is faster than that of the board that leads: {_EXCHANGE}")
         elif lead < _EARLY * self.period and self._shift_at is None:
             if self._shifted and self._steps - self._shifted < 1 / CLOCK_TOLERANCE - _SMOOTHED:
-                raise wire.SafetyStop(f"its clock is more than {100 * CLOCK_TOLERANCE:g} % slower than the leading one")
+                raise wire.SafetyStop(
+                    f"its clock is more than {100 * CLOCK_TOLERANCE:g} % slower than the leading clock"
+                )
             self._shifted, self._shift_at = self._steps, (step + self.config.theta + 1) & 0xFFFF
 
     def _compare(self, step: int, lead: float) -> None:
-        """Raise SafetyStop if this clock is clearly faster than the leading one, or slower beyond CLOCK_TOLERANCE."""
+        """Raise SafetyStop if this clock is clearly faster than the leading clock, or slower beyond CLOCK_TOLERANCE."""
         assert self.offset is not None
         if self._start is None or (elapsed := wire.distance(step, self._start[0])) < 0:
             self._start = step, lead, self.offset
@@ -137,7 +139,7 @@ class _Board:
                 ppm = f"{1e6 * faster:.0f} ppm faster than that of the board that leads"
                 raise wire.SafetyStop(f"its clock is {ppm}: {_EXCHANGE}")
             if -faster > CLOCK_TOLERANCE:
-                raise wire.SafetyStop(f"its clock is {-100 * faster:.2g} % slower than the leading one")
+                raise wire.SafetyStop(f"its clock is {-100 * faster:.2g} % slower than the leading clock")
 
     def due(self, step: int) -> int | None:
         """Return the tick at which the force of a step acts, or None if that tick has no length."""

@@ -2,8 +2,8 @@
 
 The link takes `link` ticks from a sample to the latch of its force, for every axis; several boards add `behind` ticks.
 Where a channel's delay theta_i in the scenario is longer, the host delays its force by the remaining ticks. The loop
-therefore has the scenario's delays unless the link is slower; then it has longer ones. Where the device latches a force
-on arrival, `link` is 0, and the measured latency replaces the scenario's.
+therefore has the scenario's delays unless the link is slower; then some delays are longer. Where the device latches a
+force on arrival, `link` is 0, and the measured latency replaces the scenario's.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from haptic_loop.sim.world import START_J, scene_of
 
 #: relative clock difference of boards with ceramic resonators, which a certificate covers by a longer T_max
 CLOCK_TOLERANCE = 5e-3
-_SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder in it is 0.03 m/s
+_SPEED_SECONDS = 0.01  # [s] window of a speed estimate; one count of the coarsest encoder per window is 0.03 m/s
 _JOLT = 20.0  # [N] motor and hand together never apply this force for one tick and its opposite for the next
-_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of reserves that the requested kind cannot give
+_FALLBACK = ("spring-damper", "any-environment")  # kind and condition of a reserve if the requested kind gives none
 
 
 class Controller(Protocol):
@@ -80,7 +80,7 @@ def host_controller(
     behind: Sequence[int] = (),
     balls: Sequence[slice] = (),
 ) -> Controller:
-    """Return the loop as the host runs it, at rest and without the delay of `link` ticks that the link adds.
+    """Return a controller for the loop, at rest and without the delay of `link` ticks that the link adds.
 
     With several boards, the link adds `link` + `behind` (m,) ticks.
 
@@ -238,7 +238,7 @@ class WorldController:
             self._tested, self._test = self._tested + self._test.spent, None
 
     def later(self, steps: Sequence[int], ticks: int) -> tuple[int, ...]:
-        """Put `steps`, computed `ticks` ticks after the last ones, into the delay lines. Return the steps to send."""
+        """Put `steps`, computed `ticks` ticks after the last call, into the delay lines. Return the steps to send."""
         sent = []
         for line, step in zip(self._lines, steps, strict=True):
             line.extend([line[-1] if line else step] * (ticks - 1) + [step])
@@ -303,8 +303,8 @@ class Drive:
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
-        self._path = deque[tuple[float, ...]](maxlen=4)  # [m] displacements since the last gap
-        self._uneven = deque[float](maxlen=3)  # [s] differences of the last ticks from T
+        self._path = deque[tuple[float, ...]](maxlen=4)  # [m] last displacements, without a gap between them
+        self._uneven = deque[float](maxlen=3)  # [s] by how much the lengths of the last ticks differ from T
         late = settings.behind or (0,) * config.axes
         axes = zip(expected.mass, expected.mode, still, units.encoder_step, late, strict=True)
         #: (m,) [m] largest jolt (`check_jolt`): by the force _JOLT, or by a motor that swings on its transmission at
@@ -565,7 +565,7 @@ def certified_coupling(
     start: float = START_J,
     behind: tuple[int, ...] = (),
 ) -> CertifiedCoupling:
-    """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: latch on arrival).
+    """Return the coupling `name`, or the user's coupling `own`, certified for a link of `link` ticks (0: on arrival).
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
     them, with W0 = `start` [J]. With several boards, forces act `behind` (m,) ticks later than `link`, and each board
@@ -608,7 +608,7 @@ def certified_couplings(
     spare: int = 2,
     **more: Any,
 ) -> tuple[CertifiedCoupling, ...]:
-    """Return the coupling for the measured delay, and up to `spare` reserves that are each certified for one tick more.
+    """Return the coupling for the measured delay, and up to `spare` reserves, each for a link slower by one tick.
 
     `more` are the other arguments of `certified_coupling`.
 
@@ -630,7 +630,7 @@ def certified_couplings(
     return tuple(candidates)
 
 
-_EQUAL = 1e-6  # relative difference of static stiffnesses that counts as none: the tolerance of a design's search
+_EQUAL = 1e-6  # relative difference up to which static stiffnesses count as equal: a design's search has this tolerance
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:

@@ -5,7 +5,7 @@ comes, within tick k, and the caller must then set the motors to `applied` at on
 
 This state machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
 There are two implementations because each tests the other, and because rehearsals and Force Dimension devices run this
-one without a compiler. docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
+file without a compiler. docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
 """
 
 from haptic_loop.hw import protocol as wire
@@ -69,7 +69,7 @@ class Device:
             self.phase = wire.Phase.ARMED
 
     def latch(self, frame: wire.Force | None) -> None:
-        """Apply the force of this tick. Without one, hold the last force for `hold` ticks, then halt."""
+        """Apply this tick's force; halt on IDLE. Without a FORCE, hold the last force for `hold` ticks, then halt."""
         assert self.config is not None
         if frame is None:
             self.phase = wire.Phase.HOLDING

@@ -156,7 +156,7 @@ class Line:
         self._faults = [u for u in faults if u.kind in _LINE and u.where in (direction, "both")]
         self._rng = np.random.default_rng([seed, direction == "up"])
         self._latency = latency_us
-        self._held: bytes | None = None  # a frame that the next one overtakes
+        self._held: bytes | None = None  # a frame that the next frame overtakes
 
     def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
         """Return (time of arrival [us], frame) of each frame that arrives in place of `frame`."""

@@ -25,7 +25,7 @@ _PACKAGE = "forcedimension_core"
 _SATURATED = 2  # setForce returns this code when the motors cannot give the force
 _WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new one comes within this time
 _SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
-_SHORTEST = 0.75  # a period that follows a late one lasts at least this share of T
+_SHORTEST = 0.75  # after a late tick, the next tick comes no earlier than this share of T
 
 
 class _Library:
@@ -197,7 +197,8 @@ class ForceDimension:
     def _check_status(self) -> None:
         """Raise SafetyStop if a device has no power, no link or an error.
 
-        An armed device must also not be in reset mode, and its forces must be on. Raises PortLost without a status.
+        An armed device must also not be in reset mode, and its forces must be on. Raises PortLost if a status cannot be
+        read.
         """
         armed = self._device.phase in RUNNING
         for index, ID in self._ids.items():

@@ -13,15 +13,15 @@ a + tau^2 - l tau, so the fit does not mistake it for negative damping. The fit 
 integrates a force held for a tick exactly. The balance is linear in all parameters except the a before g, so a fit
 takes milliseconds. A fit needs no initial state.
 
-Dry friction g is c tanh(x'/v0), or that of a bristle that bends over some distance (Dahl). Either has a part that
-vanishes at high speed (Stribeck). The law is not known, so all _SLIPS are tried, and all _BRISTLES longer than an
-encoder step. Each fit includes a drag q >= 0; of b and q, only b is guaranteed. The periodic term holds forces and
-encoder errors that repeat with position (a motor's poles, an encoder's eccentricity). Their periods are searched in the
-residual.
+Dry friction g is c tanh(x'/v0) with a slip v0, or that of a bristle that bends over some distance (Dahl). Either has a
+part that vanishes at high speed (Stribeck). The law is not known, so all slips v0 of _SLIPS are tried, and all bristles
+of _BRISTLES that bend farther than an encoder step. Each fit includes a drag q >= 0; of b and q, only b is guaranteed.
+The periodic term holds forces and encoder errors that repeat with position (a motor's poles, an encoder's
+eccentricity). Their periods are searched in the residual.
 
 For one law, the bound is b minus the error of b (95 %, by a jackknife over tenths of the record), and minus a share of
 the damping that noise as strong as the residual could imitate. The final bound is the least over all laws that fit
-almost as well as the best one, less the share SCALE.
+almost as well as the best law, less the share SCALE.
 
 The power that dry and viscous friction dissipate, per speed squared, is least at high speed, where only b is left. So
 with such friction, b is a lower bound at every speed.
@@ -63,7 +63,7 @@ _ROUNDS = 3  # iterations for the weight a of friction's second derivative
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
 _NEAR = np.geomspace(0.92, 1.09, 24)  # multiples of the best of these periods, searched next
 _PERIODIC = 4  # largest number of periodic disturbances in a fit
-_CHANCE = 2.0  # least gain of log likelihood beyond the gain of the best pair in pure noise
+_CHANCE = 2.0  # least gain of log likelihood by a periodic pair, beyond the gain of the best pair in pure noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
 
@@ -356,7 +356,7 @@ def at_radius(figures: _Figures, r: float) -> _Figures:
 
 
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:
-    """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's.
+    """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s], with encoder `step` [m].
 
     Raises ValueError where the axis moves in too few samples.
     """

@@ -1,7 +1,7 @@
 """Estimate mass, friction and transmission of one axis from a record of forces and displacements; bound its damping.
 
 The excitation is a chirp of a small force, slow motions, a swing that reaches the speed of a session, a chirp of the
-swing's force, and silence (see `chirp`). It does not depend on the motion, so it closes no loop and needs no
+swing's force, and silence (see `chirp`). This force does not depend on the motion, so it closes no loop and needs no
 certificate. Mass and friction come from the balance of forces (hw/friction.py). Damping that falls with speed or
 frequency is refused (hw/viscosity.py). The transmission is fitted to the spectra of the motion and of the force less
 dry friction.

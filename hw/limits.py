@@ -30,7 +30,7 @@ from haptic_loop.models.device import require
 from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
+_FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear loop
 _COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
@@ -83,7 +83,7 @@ class SafetyLimits:
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
-    #: [m/s] fastest motion while forces act; even with one drifting encoder and 2 N, a handle then stays below 1 m/s
+    #: [m/s] fastest motion while forces act; with a drifting encoder and forces of 2 N, a handle stays below 1 m/s
     speed: float = 0.7
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold indefinitely; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
@@ -350,7 +350,7 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 def probe_delay(T: float) -> int:
     """Return the delay theta [ticks] during the measurement.
 
-    It is the largest delay with which the margin of every answer fits into its field in STATE.
+    It is the largest delay, up to MAX_THETA, with which the margin of every answer fits into its field in STATE.
 
     Raises ValueError where T [s] is too long for theta = 1.
     """

@@ -3,8 +3,8 @@
 The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the clocks of
 device and host are compared with the tick number, and late and missing answers are counted. The force that the device
 reports is compared with the force that the host sent. docs/protocol.md determines the applied force: in ARMED the
-device moves from its last force towards the one for this tick, within slew rate and growing cap; in HOLDING it keeps
-its last force; in DISARMED it applies none.
+device moves from its last force towards the force for this tick, within slew rate and growing cap; in HOLDING it keeps
+its last force; in DISARMED it applies no force.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _IMPULSE = 0.1  # [s] largest time integral of such changes without a motion, in
 _HEAVIEST = 2.5  # [kg] largest mass of hand and handle
 _TEST_FORCE, _TEST_HALF, _BLOCKS = 1.3, 0.03, 4  # force in the last block [N], half a period [s], number of blocks
 _PULSE = 2 / 3  # share of half a period in which the test force acts; without pauses, both directions are always mixed
-_TEST_SPEED = 0.1  # [m/s] expected in the test at the end, even if it takes more force; 0.4 if one direction is dead
+_TEST_SPEED = 0.1  # [m/s] speed in the test at the end, even if it needs over _TEST_FORCE; 0.4 if one direction is dead
 _TEST_BEFORE = 0.012  # [s] time at zero force before the test of an axis
 _TEST_RATIO = 2.0  # largest ratio between a motion and the expected one
 _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they leave 1 % of a motion at 2 Hz
 _FIT = 0.8  # least share of power with the expected shape: loosely moved handles have 0.93, held handles at most 0.5
-_LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short one, but no certificate covers a whole tick
+_LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but no certificate covers a whole tick
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
@@ -53,8 +53,8 @@ _UNEVEN = 1 / 3  # largest difference of the two directions of a motor, as a sha
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
-_PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] for which an encoder may rest under it
-_TREMOR = 3e-5  # [m] least range of a calm hand in _PRESSED; on coarser counts, such a hand looks like a dead encoder
+_PRESSING, _PRESSED = 0.3, 0.5  # force, in the unit of _CHANGE; longest time [s] of rest under this force
+_TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser counts the encoder looks dead
 _FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops if wrong ticks stay more frequent
 
 
@@ -268,8 +268,8 @@ class Counters:
 
     states: int = 0  # STATEs that were acted upon
     gaps: int = 0  # ticks without a STATE
-    duplicates: int = 0  # STATEs of the same tick as the last one
-    stale: int = 0  # STATEs of an older tick than the last one: late or reordered
+    duplicates: int = 0  # STATEs of the same tick as the last STATE
+    stale: int = 0  # STATEs of an older tick than the last STATE: late or reordered
     unexpected: int = 0  # STATEs with a wrong number of axes
     late: int = 0  # answers after their latch, or with theta = 0 after the certified latency
     misses: int = 0  # ticks without an answer in time, by the device's count
@@ -390,7 +390,7 @@ class _ClockDrift:
     _freeze: float = 0.0  # [us] longest delay of one reading in the block, at most forgiven_us
 
     def note(self, at_us: int, ticks: int) -> None:
-        """Process a reading of the clock (modulo 2^32), `ticks` after the last. Raises SafetyStop if it drifts."""
+        """Process a reading of the clock (modulo 2^32), `ticks` ticks after the last. Raises SafetyStop on drift."""
         if self._last is not None:
             elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
             late = elapsed - ticks * self.T_us
@@ -570,15 +570,15 @@ class EncoderTest:
     expected motion in shape (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor
     or encoder gives the wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another
     shape. A motion that comes later than expected shows a hidden delay, because friction and hands advance its phase.
-    Dry friction makes weak motions small, so only the strongest force finds a motion too small. Coarse counts leave the
-    delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
-    (`remarks`). A motor that is weak in one direction adds a motion as under the absolute value of the force. Pauses
-    between the pulses give this motion another shape.
+    Dry friction makes weak motions small, so only with the strongest force is a small motion wrong. Coarse counts leave
+    the delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
+    (`remarks`). A motor that is weak in one direction adds the motion that the absolute value of the force would cause.
+    Pauses between the pulses give this motion another shape.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
     in rehearsals (`held`). A verdict then needs two blocks in a row that agree, and blocks are repeated until the
-    person lets go, at most for 5 s. A small or late motion is a wrong one only where it has the shape of a free handle
+    person lets go, at most for 5 s. A small or late motion counts as wrong only where it has the shape of a free handle
     and not that of a handle in a hand as heavy as the device. The mode of a transmission makes these shapes differ; a
     rigid device has equal shapes. If an axis never moves as a free handle does, the session does not finish. Where it
     swings at the frequency of the force, at any phase, the message names a hand, too, because an axis with a dead motor
@@ -661,10 +661,10 @@ class EncoderTest:
         sum (less the error of the counts; 0 unless this difference explains most of what the other shapes leave), and
         whether the shape is that of the expected handle but not that of a handle in a heavy hand.
 
-        The delay is -a/s in the fit s x + a x' + e y of the expected motion x, and of the motion y under the absolute
-        value of the force; the directions differ by e/s. The row p of the pseudoinverse that yields a turns rounding
-        errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error |p| q/|s| is 3.5
-        standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
+        The delay is -a/s if s x + a x' + e y fits the tested motion, where x is the expected motion and y the motion
+        under the absolute value of the force; the directions differ by e/s. The row p of the pseudoinverse that yields
+        a turns rounding errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error |p|
+        q/|s| is 3.5 standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
         """
         t, expected, loaded, even, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
@@ -793,8 +793,8 @@ class EncoderMonitor:
     of more than 1 N, or of half of a weak motor's cap, are integrated over time. A mass M whose motion a change F
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
     of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. The
-    tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because it
-    holds them while the force changes by 2 F_c (1 N covers 0.5 N), and hides a tremor below F_c.
+    tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because
+    friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:

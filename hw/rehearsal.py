@@ -132,7 +132,7 @@ class Rehearsal:
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, duration [s]) of host freezes
-    arm: bool = True  # whether to arm the first coupling; a softer one waits for a person
+    arm: bool = True  # whether to arm the first coupling; a softer coupling waits for a person
     operator: Operator | None = None  # decides in place of `arm`, as in a live session
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # length of the device's tick as a multiple of T

@@ -67,7 +67,7 @@ class Session:
         self._expected = Expected(scenario, self.settings.held)
         self.missed_while_driving = 0  # ticks without an answer in time while the session drove
         self.request: str | None = None  # what the person at the device has to do at the moment
-        self.now = self.entered = self.heard = 0  # [us] times of the last call, stage and new STATE
+        self.now = self.entered = self.heard = 0  # [us] times of the last call, stage change, and new STATE or ACK
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
         self._shutdown: _Shutdown | None = None
@@ -225,7 +225,8 @@ class Session:
             return self._no_answer() if now - self.entered > _PATIENCE_US else ()
         if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US * self.scenario.channels:
             return self._end(
-                Stage.STOPPED, f"the device did not arm within {_ARMING_US * self.scenario.channels // 1000} ms"
+                Stage.STOPPED,
+                f"the device did not arm and pass its test within {_ARMING_US * self.scenario.channels // 1000} ms",
             )
         silence = now - self.heard
         if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:

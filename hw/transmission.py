@@ -24,7 +24,7 @@ from haptic_loop.hw.viscosity import Spectra, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N causes less motion than a count of 5 um
 _TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
-#: largest rms error, in units of the allowed one: play or presliding friction give 3 to 6, dry friction up to 2.1
+#: largest rms error, in units of the allowed error: play or presliding friction give 3 to 6, dry friction up to 2.1
 _UNEXPLAINED = 2.5
 _GROUPS = 5  # groups of a record's frequencies that are left out in turn
 _SIGMAS, _SCALE = 2.0, 0.005  # standard errors, and relative error of the encoder, by which bounds are moved

@@ -34,7 +34,7 @@ from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 _FAST = 0.25  # a stroke counts if it reaches this share of the highest speed, because dry friction is then saturated
 _FEW = 8  # least number of strokes
 _SIGMAS = 2.0  # a thinning of at most this many standard errors counts as none
-#: [s] time constants of a memory; a shorter memory counts as damping: encoders of 5 um at 0.25 kg do not show 1 ms
+#: [s] time constants of a memory; one of 1 ms counts as damping, as encoders of 5 um at 0.25 kg do not show it
 _TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, 1 N causes less motion than an encoder of 5 um resolves
 _LOUD = 0.05  # least force at a frequency, as a share of the strongest in the band
@@ -65,7 +65,7 @@ class Viscosity:
 def viscosity(x: Array, force: Array, T: float, step: float, friction: Friction) -> Viscosity:
     """Examine displacements x (N,) [m] under forces (N,) [N] held for T [s], of an axis with this `friction`.
 
-    `step` [m] is the encoder's.
+    `step` [m] is the encoder step.
     """
     driving = force - nonviscous(x, T, step, friction)
     return Viscosity(*_thinning(x, force, T), *_lasting(x, driving, T, friction))
@@ -91,9 +91,9 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
-    """Return the highest speed [m/s] (99.5 % of samples), the damping lost up to it, and its standard error [N s/m].
+    """Return the highest speed [m/s] (99.5 % of samples), the damping [N s/m] lost up to this speed, and its error.
 
-    The error is infinite where fewer than _FEW strokes count.
+    The standard error is infinite where fewer than _FEW strokes count.
     """
     import scipy
 
@@ -119,7 +119,7 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
     weight = 1 / np.sqrt(columns[1])  # the error of a stroke's work grows with the stroke
 
     def cubic(keep: NDArray[np.bool_]) -> float:
-        """Return the coefficient q of S3."""
+        """Return the coefficient q of S3, fitted to the strokes `keep`."""
         w = weight[keep]
         return float(np.linalg.lstsq(A[keep] / scale * w[:, None], work[keep] * w, rcond=None)[0][2] / scale[2])
 
