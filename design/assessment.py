@@ -420,7 +420,7 @@ class Guarantee:
     vertices: str = "every vertex"
 
     def __repr__(self) -> str:
-        return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, {self.forces})"
+        return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, forces: {self.forces})"
 
     @property
     def any_environment(self) -> bool:

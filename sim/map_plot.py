@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.result import GUARD, TITLES, suffices
+from haptic_loop.design.result import ANY, GUARD, TITLES, suffices
 from haptic_loop.sim import plots
 from haptic_loop.sim.limit_cycles import UNDECIDED
 from haptic_loop.sim.stability import MARGINAL
@@ -41,7 +41,7 @@ def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     about_environment = report.fixed is not None
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
-    entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, about_environment), *_points(axes, report)]
+    entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, report), *_points(axes, report)]
     for mark in report.marks or ():
         axes.plot(mark.B, mark.K, "*", color="black", markersize=14, clip_on=False, zorder=5)
         axes.annotate(f"{mark.K:g}, {mark.B:g}", (mark.B, mark.K), (9, 5), textcoords="offset points", zorder=5)
@@ -72,8 +72,10 @@ def _cell_edges(axis: Array, scale: str) -> Array:
     return np.exp(borders) if scale == "log" else borders
 
 
-def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
+def _edges(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     entries = []
+    # With psi > 0 any-environment (Theorem 4) covers only the environment of the cell.
+    titles = {name: title for name, title in TITLES.items() if title != ANY or not any(report.psi)}
     order = [*_LINES, *drawn.ratio]
     for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
         style = _LINES.get(name, _OWN_LINE)
@@ -83,11 +85,20 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
         if safe and unsafe:
             drawing = {"colors": style["color"], "linestyles": style["linestyle"], "linewidths": style["linewidth"]}
             axes.contour(drawn.grid.B, drawn.grid.K, height, [1 - GUARD], **drawing)
-        side = "inside this edge" if about_environment else "below this edge"
-        where = side if safe and unsafe else "everywhere here" if safe else "nowhere here"
-        label = f"{TITLES.get(name, name)}: certified {where}"
+        where = "everywhere here" if safe else "nowhere here"
+        if safe and unsafe:
+            where = f"{_side(ratio, drawn, report)} this edge"
+        label = f"{titles.get(name, name)}: certified {where}"
         entries.append(Line2D([], [], label=label, **style))
     return entries
+
+
+def _side(ratio: Array, drawn: Map, report: MapReport) -> str:
+    """Return in a word on which side of its edge the certified part of the map lies."""
+    certified = suffices(ratio).reshape(drawn.grid.shape)  # The rows are stiffnesses, the softest first.
+    if report.fixed is None and not (certified[1:] > certified[:-1]).any():
+        return "below"
+    return "above" if report.fixed is None and not (certified[1:] < certified[:-1]).any() else "inside"
 
 
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:

@@ -262,7 +262,7 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
         "exact: stable with all of 7 humans",
         "exact: unstable with some",
         "this environment: certified below this edge",
-        "any passive environment: certified below this edge",
+        "any-environment: certified below this edge",
         "MuJoCo: rests (1)",
         "MuJoCo: oscillates (1)",
         f"MuJoCo: {map_plot.UNDECIDED} (1)",
@@ -303,6 +303,13 @@ def test_environment_maps_mark_their_design_point(drawn):
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other spring is not on the map
     assert "this environment: certified inside this edge" in legend(figure)
+
+
+def test_legends_say_where_maps_are_certified(drawn):
+    stiffer = k_b_map()
+    stiffer.ratio = {"any-environment": np.array([2, 2, 2, 0.5, 2, 2.0])}
+    figure = drawn(map_plot.plot_zwidth, stiffer, told(psi=[0, 0]))
+    assert "any passive environment: certified above this edge" in legend(figure)
 
 
 def test_every_unit_in_a_picture_becomes_rotary():
