@@ -77,7 +77,8 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     with render.progress("running every coupling") as move:
         rows = alternatives(scenario, args.case, move, args.condition)
     files = []
-    if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in rows)):
+    render.remove_earlier(out, "couplings.png")
+    if any(each.trace is not None for each in rows) and not args.no_plot:
         files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, rows)
     tables = [_beside(rows, args.condition)]

@@ -151,16 +151,14 @@ def announce(args: argparse.Namespace, verdict: str) -> None:
     console(args).print(verdict, soft_wrap=True)
 
 
-def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> bool:
-    """Return whether a picture is to be drawn: False with --no-plot or without content.
+def remove_earlier(folder: Path, *files: str) -> None:
+    """Remove the report and these files of an earlier run, which must not stand beside new results.
 
-    An older picture that is not drawn again is removed, so that it does not stand beside new results. Raises InputError
-    if it cannot be removed.
+    A command removes them before it writes its first file, because Ctrl-C may come between two files. Raises InputError
+    if a file cannot be removed.
     """
-    drawn = content and not args.no_plot
-    if not drawn:
-        remove(picture)
-    return drawn
+    for file in ("report.json", *files):
+        remove(folder / file)
 
 
 def pictures(
@@ -170,13 +168,13 @@ def pictures(
 
     With --no-plot matplotlib is not loaded.
     """
-    drawn_files = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
-    if not drawn_files:
+    remove_earlier(folder, *drawn)
+    if args.no_plot or not content:
         return []
     skip_docstrings()
     from haptic_loop.sim import plots
 
-    return [getattr(plots, name)(report, path) for path, name in drawn_files.items()]
+    return [getattr(plots, name)(report, folder / file) for file, name in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ def main(argv: list[str]) -> int:
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
-    drawn = render.is_drawn(args, out / "figure.png", bool(run.trace.t.size))
+    drawn = bool(run.trace.t.size) and not args.no_plot
     if drawn:
         painter.ask("draw_run", *_shown(args, run, report))
     report = replace(report, robustness=_nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment))
@@ -170,6 +170,7 @@ def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
     from haptic_loop.sim.view.drawn_object import scene_xml
 
     result = replace(run.trace, meta=render.plain(report))
+    render.remove_earlier(out, "trace.npz", "trace.csv", "scene.xml", "figure.png")
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", scene_xml(run.simulation)))
     return files

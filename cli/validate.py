@@ -216,6 +216,7 @@ def _save(
 ) -> list[Path]:
     """Save humans for `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
+    render.remove_earlier(out, "population.png")
     named = {f"disagreement-{i}.toml": int(i) for i in findings.index[findings.disagreements]}
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
@@ -229,7 +230,7 @@ def _save(
     if worst:
         remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
         files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons, worst.mechanics))
-    if render.is_drawn(args, out / "population.png", bool(findings.index.size)):
+    if findings.index.size and not args.no_plot:
         coupling = "no coupling" if args.case == "none" else f"{kind} coupling"
         what = scenario.title(args.case).removesuffix(", no coupling")
         title = f"{what}, {coupling}: {findings.index.size} random humans"

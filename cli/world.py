@@ -176,10 +176,11 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
         wall_s=time.perf_counter() - began,
     )
     labelled = replace(trace, meta=render.plain(report))
+    render.remove_earlier(out, "trace.npz", "trace.csv", *_WRITTEN, "figure.png")
     files = [labelled.save_npz(out / "trace.npz"), labelled.save_csv(out / "trace.csv")]
     written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
-    if render.is_drawn(args, out / "figure.png", trace.t.size > 1):
+    if trace.t.size > 1 and not args.no_plot:
         title, around = f"{scenario.name}: a MuJoCo world", Contacts(scenario.environment.contacts)
         shown = Signals.of(labelled), title, 1.0, None, None, around
         painter.ask("draw_run", *shown)

@@ -66,8 +66,9 @@ def main(argv: list[str]) -> int:
         drawn = zwidth.draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
     points = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, K, B, grid.K) for K, B in marks]
     report = MapReport.of(scenario, sweep, drawn, plan, fixed, points, args.humans, args.seed)
+    render.remove_earlier(out, "map.csv", "zwidth.png")
     files = [save_csv(drawn, out / "map.csv")]
-    if render.is_drawn(args, out / "zwidth.png"):
+    if not args.no_plot:
         skip_docstrings()
         from haptic_loop.sim.map_plot import plot_zwidth
 

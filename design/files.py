@@ -295,6 +295,8 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
                 _fill(device, content)
             return path
         _spare(path)
+        if ledger := _ledger.get():
+            ledger.written |= _places(path)
         handle, name = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -310,27 +312,27 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
 
 
 def remove(path: Path) -> None:
-    """Remove a file that an earlier run wrote, if it is there.
+    """Remove a file that an earlier run wrote, if it is there. For a link, the file that it points to is removed.
 
     Raises InputError if it cannot be removed, or if the command has read it, or has written it and an option names it.
     """
     try:
-        if path.is_symlink() or path.is_file():
+        place = _target(path)
+        if place.is_file():
             _spare(path)
-            path.unlink()
+            place.unlink()
     except OSError as error:
         raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
 
 
 def _spare(path: Path) -> None:
-    """Record that a file will be written. Raises InputError if it was read, or written and named by an option."""
+    """Raise InputError if a file was read, or written and named by an option."""
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):
             raise InputError(f"cannot write {path}: it was read, as {known}")
         if not places.isdisjoint(ledger.written) and (option := _met(places, ledger.named)):
             raise InputError(f"cannot write {path} twice: it is the file of {option} and another output of the command")
-        ledger.written |= places
 
 
 def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> None:

@@ -98,6 +98,39 @@ def test_no_finished_tick_means_no_report(scenario, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+TRACES = ["trace.csv", "scene.xml", "figure.png"]
+
+
+@pytest.mark.parametrize(
+    ("command", "writer", "files"),
+    [
+        ([*RUN[:-1], "0.3"], "haptic_loop.sim.trace.Trace.save_csv", TRACES),
+        (
+            ["sim.run", "--scenario", "world-cube", "--duration", "0.1"],
+            "haptic_loop.sim.trace.Trace.save_csv",
+            [*TRACES, "world.xml"],
+        ),
+        (
+            ["sim.validate", "--coupling", "published", "--humans", "2", "--duration", "0"],
+            "haptic_loop.cli.validate.save_humans",
+            ["population.png"],
+        ),
+    ],
+)
+def test_ctrl_c_while_storing_mixes_no_runs(command, writer, files, tmp_path, monkeypatch):
+    """The folder holds the files of an earlier run, and Ctrl-C comes while this writer is called."""
+
+    def interrupted(*content):
+        raise KeyboardInterrupt
+
+    for name in ("report.json", "trace.npz", *files):
+        (tmp_path / name).write_text("earlier")
+    monkeypatch.setattr(writer, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        finish(command, tmp_path)
+    assert not [name for name in ("report.json", *files) if (tmp_path / name).exists()]
+
+
 def finish(command, folder):
     """Run a command in this process, without pictures, and return its exit code."""
     main = import_module(f"haptic_loop.cli.{command[0].rpartition('.')[2]}").main
