@@ -115,7 +115,7 @@ def _parser() -> options.Parser:
     what = "Say whether a coupling is safe for every passive human, and with what margin."
     parser = options.Parser("design.audit", what, *_EXAMPLES, first="K B rigid device scenario json")
     coupling = parser.add_argument_group("the coupling")
-    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # These limits prevent overflow, as those of B do.
+    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # These limits prevent overflow, as the limits of B do.
     coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m], or one for all")
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m], or one for all")
@@ -253,7 +253,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """Return the range of --varying-delay, else the loop's or None. Raises InputError if the option excludes theta."""
+    """Return the range of --varying-delay, else the loop's range, if any. Raises InputError if theta is outside."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:

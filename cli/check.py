@@ -101,7 +101,7 @@ def _parser() -> options.Parser:
     )
     parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", *examples)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
-    parser.add_condition("the condition of the file's certificate (default), or another one that is proved anew")
+    parser.add_condition("the condition of the file's certificate (default), or another condition to prove anew")
     parser.add_json()
     return parser
 

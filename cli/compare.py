@@ -51,7 +51,7 @@ def _parser() -> options.Parser:
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("condition for names without :CONDITION (default: the coupling's); one of your own judges all")
+    parser.add_condition("condition for names without :CONDITION (default: the coupling's); your own judges all")
     parser.add_output(picture=True)
     parser.only("with --coupling: the runs of every coupling use no seed", lambda args: args.coupling, "seed")
     return parser
@@ -87,7 +87,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Name the guaranteed coupling of least force error; of equal ones, that with the static stiffness nearest E's."""
+    """Name the guaranteed coupling of least force error; if errors are equal, that with dc_ratio nearest to 1."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -115,7 +115,7 @@ def _beside(couplings: Sequence[Alternative], own: Condition | None) -> render.T
         error = "grows" if grows else render.optional(each.force_error_percent, "{:.3g} %")
         cells.append((each.name, *needs, each.guarantee or "none", _share(each.dc_ratio, "-"), error))
     heads = ("coupling", *map(render.short, names), "guarantee", "stiffness", "error")
-    title = "required damping in % of the devices', guarantee,\nrendered stiffness and force error"
+    title = "required damping in % of the devices' damping, guarantee,\nrendered stiffness and force error"
     return render.grid(title, heads, cells, left=(0, heads.index("guarantee")))
 
 
@@ -280,6 +280,6 @@ def _feel(report: Comparison) -> render.Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """Return the values separated by commas; a single one if all are equal."""
+    """Return the values separated by commas; a single value if all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)

@@ -121,7 +121,7 @@ def _percent(text: str) -> float:
 
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """Return the loop with --ranges and --varying-delay; a missing args.condition becomes the usual one.
+    """Return the loop with --ranges and --varying-delay; a missing args.condition becomes the coupling's usual one.
 
     Raises InputError.
     """
@@ -312,7 +312,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
         searched = 0.999 * SOFTEST < min(gains["K"]) < verdicts.SOFT_END  # softer springs are not from this search
-        yield "", f"{SOFTEST:g} N/m is the softest that the search tries" if searched else None
+        yield "", f"{SOFTEST:g} N/m is the softest spring that the search tries" if searched else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)

@@ -146,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of each chirp (default 2.5)")
     rub = "dry friction of an emulated device (default 0)"
     add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
-    fast = "largest speed of a slow swing; the bound holds up to it (default 0.5)"
+    fast = "largest speed of a slow swing, up to which the bound holds (default 0.5)"
     add("--speed", type=number(0.05, 1.5), default=0.5, metavar="M/S", help=fast)
     far = "amplitude of the slow swing (default 30)"
     add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)

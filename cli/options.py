@@ -193,7 +193,7 @@ class Parser(argparse.ArgumentParser):
         self.only(replaced, lambda args: not args.rigid, "environment", "lam")
 
     def add_human(self, more: str = "") -> None:
-        """Add --human; `more` names what else than a list of hands a .py may hold."""
+        """Add --human; `more` names what a .py may hold besides a list of hands."""
         who = f"other humans: one [[human]] per device in a .toml, or a list of hands{more or ' in a .py'}"
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
@@ -220,7 +220,7 @@ class Parser(argparse.ArgumentParser):
         self.add_varying_delay(span, group)
         pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
         group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
-        loss = "probability that a force is lost; the device then holds the last one"
+        loss = "probability that a force is lost; the device then holds the last force"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)
         group.add_argument("--playout", action="store_true", help="a buffer that gives every force the largest delay")
         alike = "without --playout: a playout buffer gives every force the largest delay"
@@ -359,7 +359,7 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """Parse the name of a condition, or FILE.py:NAME of the user's own."""
+    """Parse the name of a condition, or FILE.py:NAME of the user's own condition."""
     if text not in CONDITIONS and ":" not in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return text

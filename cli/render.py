@@ -319,7 +319,7 @@ def robustness_rows(there: Robustness | None) -> Rows:
     """Yield rows on the damping required if the environment's model is wrong, and on how to design for such errors."""
     if there:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
-        yield "robustness", f"{words}, the worst within {there.percent:g} %"
+        yield "robustness", f"{words}, the worst environment within {there.percent:g} %"
         if there.required_over_available > _MUCH:
             yield "", f"python -m design --ranges {there.percent:g}% designs for all of these environments"
 

@@ -18,7 +18,7 @@ class _Compared:
 
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
-    filled_in: int = render.figure("ticks without an answer")
+    filled_in: int = render.figure("ticks without a STATE")
     asked_differ: int = render.figure("requested forces that differ")
     sent_differ: int = render.figure("sent forces that differ")
     largest_difference_n: float = render.figure("largest difference of requested forces [N]")

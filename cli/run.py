@@ -96,7 +96,7 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: 1 with exponential without friction, else enough for the fastest motion)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
-    error = "try integrators and steps on this scene, and run with the fastest whose relative rms error is at most this"
+    error = "try integrators and steps on this scene, and run with the fastest setting of a relative rms error up to E"
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
     check = "repeat the run with RK4, which uses other formulas (with exponential, if RK4 ran), and compare"
     add("--cross-check", action="store_true", help=check)
@@ -267,7 +267,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield (
         "force error",
-        f"{apart}, compared before clipping (after it with a limiter or switching delays)"
+        f"{apart}, compared before clipping (with a limiter or switching delays: after clipping)"
         if apart
         else f"- ({report.ideal_force.reason})",
     )

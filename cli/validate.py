@@ -106,7 +106,7 @@ def _parser() -> options.Parser:
     add("--engine", choices=ENGINES, default="both", help="engines that judge; mujoco means both (default both)")
     seconds = "length of the traces [s] (default 2; 0: no traces)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
-    traced = "hands that MuJoCo also simulates: all, or sampled (default): nearest to the limit, lossless, 64 random"
+    traced = "hands that MuJoCo also simulates: all, or sampled (default): nearest to instability, lossless, 64 random"
     add("--traces", choices=("sampled", "all"), default="sampled", help=traced)
     add(
         "--shards",
@@ -314,7 +314,7 @@ class _Report:
 def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
-    """Return how many hands make the loop grow with varying delays and with varying periods; None for constant ones."""
+    """Return how many hands make the loop grow with varying delays and with varying periods; None if constant."""
     from haptic_loop.sim.switching import DelaysCovered
 
     scenario, switching, timing = question.scenario, None, None

@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change of the loop: its time, and the verdicts on the loop after it."""
+    """A change of the loop: its time, and the verdicts on the changed loop."""
 
     t_s: float
     event: str

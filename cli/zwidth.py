@@ -30,7 +30,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
 _FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
-_PRESS = 3.0  # [N] steady force of a hand; 0 in maps of environments, because soft ones would yield to a steady force
+_PRESS = 3.0  # [N] steady force of a hand; 0 in maps of environments, because a soft environment would yield
 
 
 def main(argv: list[str]) -> int:
@@ -261,7 +261,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
         yield (
             f"A simulated point oscillates if, at the end of {simulation.duration_s:g} s, some octave above "
             f"{simulation.from_hz:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude and exceeds "
-            f"{simulation.threshold_m:g} m; {UNDECIDED}: the linear loop is within {DECIDED:g} 1/s of the edge."
+            f"{simulation.threshold_m:g} m; {UNDECIDED}: the linear growth rate is within {DECIDED:g} 1/s of zero."
         )
     if report.interrupted:
         yield "Interrupted: the map shows the finished parts."

@@ -4,8 +4,8 @@
  * The sketch is written for Teensy 4, whose Serial is native USB. On another board check:
  *   1. Serial is the port that you plug in (some boards call their native USB SerialUSB).
  *   2. Serial.availableForWrite() exists and returns more than 0 on an idle line. If it returns 0, nothing is ever sent.
- *   3. It returns at least 100 on an idle line. Two axes send an INFO of 68 bytes and STATEs of 32 bytes. With less room they
- *      wait in `queue`, which delays a STATE. The host measures this delay as part of the round trip.
+ *   3. Serial.availableForWrite() returns at least 100 on an idle line. Two axes send an INFO of 68 bytes and STATEs of 32
+ *      bytes. With less room they wait in `queue`, which delays a STATE. The host measures this delay in the round trip.
  *
  * Adapt the pins, the numbers of INFO in setup() (measure them; docs/protocol.md has their units) and the functions below. The
  * safety states are in haptic_link.h: do not change that file. */

@@ -61,14 +61,14 @@ typedef struct { /* the test of one axis: sums over the ticks of a block */
 
 typedef struct {
     process_state process;
-    uint8_t phase, cause, axis; /* axis: the one under test */
+    uint8_t phase, cause, axis; /* axis: the axis under test */
     uint16_t rested;            /* ticks of the window in which noise is measured */
     bool known;                 /* whether the noise of the sensors is known */
     ha_answer answer;
     ha_real gain;
-    ha_real before[PROCESS_CHANNELS], older[PROCESS_CHANNELS]; /* [m] positions at the last tick and the one before */
+    ha_real before[PROCESS_CHANNELS], older[PROCESS_CHANNELS]; /* [m] positions at the last tick and the tick before */
     ha_real reference[PROCESS_CHANNELS], force[PROCESS_CHANNELS];
-    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] range of positions since the last motion */
+    ha_real low[PROCESS_CHANNELS], high[PROCESS_CHANNELS]; /* [m] extremes since the last motion; high: noise in ha_listen */
     ha_real still[PROCESS_CHANNELS];                       /* [m] range in which a sensor rests */
     uint16_t pressed[PROCESS_CHANNELS];                    /* ticks in a row under a force without a motion */
 } ha_runner;

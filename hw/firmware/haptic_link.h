@@ -111,7 +111,7 @@ static inline void hl_latch_estop(hl_device *d, uint8_t cause)
 
 static inline void hl_fault(hl_device *d) { hl_halt(d, HL_BY_DEVICE); }
 static inline void hl_estop(hl_device *d) { hl_latch_estop(d, HL_ESTOP_DEVICE); }
-/* Sets whether somebody holds the deadman. With several boards, the host ignores boards that never set true. */
+/* Sets whether somebody holds the deadman. With several boards, the host ignores a deadman that was never held. */
 static inline void hl_deadman(hl_device *d, bool held) { d->deadman = held; }
 
 /* Returns false, and leaves the device in ESTOP, if a value of the info is impossible. */

@@ -200,7 +200,7 @@ def test_only_searched_springs_are_called_the_softest(condition, searched, tmp_p
     assert main(["--scenario", str(scenario), "--condition", condition, "--out", str(tmp_path / "c.json")]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "Useless on all contacts" in shown
-    assert ("softest that the search tries" in shown) == searched
+    assert ("softest spring that the search tries" in shown) == searched
 
 
 def test_doubling_gives_scipys_reachability_gramian(monkeypatch):
