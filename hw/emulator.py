@@ -93,6 +93,8 @@ _AXIS = {
     "motor": ("share of a force that its motor makes: 0 if dead, -1 if reversed", -10.0, 10.0, 0.0),
     "limit": ("newtons at which its motor saturates", 0.0, 12.0, 0.6),
     "oneway": ("share of a negative force that its motor makes", -10.0, 10.0, 0.0),
+    "zone": ("newtons below which its motor makes no force; of larger forces they are missing", 0.0, 12.0, 0.3),
+    "lose": ("share of the counts in negative direction that its encoder shows", -10.0, 10.0, 0.5),
     "own": ("newtons that its motor makes while armed, whatever FORCE says", -12.0, 12.0, 2.0),
 }
 KINDS = _LINE | _DEVICE | _AXIS
@@ -311,6 +313,7 @@ class Emulator:
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
         self._motor: Array = np.ones((2, scenario.channels))  # shares of a positive and of a negative force
         self._most: Array = np.full(scenario.channels, np.inf)  # [N] forces at which motors saturate
+        self._zone: Array = np.zeros(scenario.channels)  # [N] dead zones of motors
         self._swapped, self._crossed, self._motors_fail = False, 0.0, False
         # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
@@ -347,6 +350,7 @@ class Emulator:
         if not self._motors_fail:
             return forces
         forces = np.clip(forces, -self._most, self._most)
+        forces -= np.clip(forces, -self._zone, self._zone)
         forces *= np.where(forces > 0, *self._motor)
         forces[1:2] += self._crossed * forces[0]
         return forces
@@ -409,6 +413,15 @@ class Emulator:
                 return lambda n: n & ~(1 << int(fault.value))
             case "scale":
                 return lambda n: round(fault.value * n)
+            case "lose":
+                lost, before = 0.0, now
+
+                def shown(n: int) -> int:
+                    nonlocal lost, before
+                    lost, before = lost + min(0, n - before) * (1 - fault.value), n
+                    return round(n - lost)
+
+                return shown
             case "late":
                 earlier = deque([now], maxlen=1 + int(fault.value))
                 return lambda n: (earlier.append(n), earlier[0])[1]
@@ -432,7 +445,7 @@ class Emulator:
     def _misbehave(self, now: int) -> None:
         for fault in [u for u in self._waiting if u.active(self.since_armed(now))]:
             self._waiting.remove(fault)
-            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "cross")
+            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "zone", "cross")
             match fault.kind:
                 case "stall":
                     self.stalled_until = now + round(1e6 * fault.value)
@@ -449,6 +462,8 @@ class Emulator:
                     self._motor[1, fault.axis] = fault.value
                 case "limit":
                     self._most[fault.axis] = fault.value
+                case "zone":
+                    self._zone[fault.axis] = fault.value
                 case "swap":
                     self._swapped = True
                 case "cross":

@@ -49,7 +49,10 @@ _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
-_UNEVEN = 1 / 3  # largest difference of the two directions of a motor, as a share of their sum: a factor of 2
+_UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
+_ZONE = 0.8  # least ratio of the size of a motion to that under twice the force; without a dead zone it is 1
+_CLEAN, _RUBBED = 0.15, 0.25  # largest one-sided share of the former, and largest friction per force in the latter
+_BETTER = 8.0  # least ratio of squares that a fault in one direction explains to the rest; friction and weight: 6
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
@@ -572,8 +575,9 @@ class EncoderTest:
     shape. A motion that comes later than expected shows a hidden delay, because friction and hands advance its phase.
     Dry friction makes weak motions small, so only with the strongest force is a small motion wrong. Coarse counts leave
     the delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
-    (`remarks`). A motor that is weak in one direction adds the motion that the absolute value of the force would cause.
-    Pauses between the pulses give this motion another shape.
+    (`remarks`). A fit of dry friction (`_Shares`) finds a motor that is weak in one direction and an encoder that loses
+    counts in one, because friction under a weight gives the motion other shapes. A dead zone of a motor makes a motion
+    smaller in relation to that under twice the force, which low friction does not.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
@@ -593,14 +597,15 @@ class EncoderTest:
         still: Sequence[int],
         expected: Expected,
         at_once: bool = False,
-        before: Sequence[float] | None = None,
+        before: Sequence[tuple[float, float]] | None = None,
     ) -> None:
         """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
-        `before` has the sizes of the motions at arming, which the test at arming stores in `sizes`.
+        `before` has the sizes and one-sided shares of motions at arming, as the test at arming has them in `sizes`.
         """
-        self._at_once, self._closing, self._before, self.sizes = at_once, before is not None, before, list[float]()
+        self._at_once, self._closing, self._before = at_once, before is not None, before
+        self.sizes: list[tuple[float, float]] = []
         push = 2 * _TEST_SPEED / (limits.lever * _PULSE * _TEST_HALF) * self._closing
         most = [max(_TEST_FORCE * limits.lever, push * mass) for mass in expected.mass]
         self._strongest = list(map(min, limits.cap, most))
@@ -618,6 +623,7 @@ class EncoderTest:
         self._pushed = 0.0  # [N] largest force on the axis in this block
         self._finding: str | None = None  # the fault that the last block found, "" for none; None without an answer
         self._swings = False  # whether the axis swung at the frequency of the force in a block
+        self._weaker = math.nan  # relative size of the motion in the last block without its friction, if it is clear
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.
@@ -653,25 +659,26 @@ class EncoderTest:
         """Return what the person must do so that the axis can pass its test, or None."""
         return f"let go of the handle of axis {self._axis + 1}" if self._block > _BLOCKS else None
 
-    def _compare(self) -> tuple[Array, Array, float, float, float, float, bool]:
+    def _compare(self) -> tuple[Array, Array, float, float, float, _Shares, _Shares, bool]:
         """Compare all motions with the expected one.
 
         Returns the relative size and the fit (m,) of all motions. For the tested axis, also returns the size at any
-        phase of the force, the delay and its error [ticks], the difference of its two directions as a share of their
-        sum (less the error of the counts; 0 unless this difference explains most of what the other shapes leave), and
-        whether the shape is that of the expected handle but not that of a handle in a heavy hand.
+        phase of the force, the delay and its error [ticks], the fits with a motor that is weak in one direction and
+        with an encoder that loses counts in one, and whether the shape is that of the expected handle but not that of a
+        handle in a heavy hand.
 
         The delay is -a/s if s x + a x' + e y fits the tested motion, where x is the expected motion and y the motion
-        under the absolute value of the force; the directions differ by e/s. The row p of the pseudoinverse that yields
-        a turns rounding errors q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error |p|
-        q/|s| is 3.5 standard errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
+        under the absolute value of the force. The row p of the pseudoinverse that yields a turns rounding errors
+        q/sqrt(12) of counts q into a standard error |p| q/sqrt(12)/|s|. The returned error |p| q/|s| is 3.5 standard
+        errors; 1 % of 4000 simulated blocks exceed 3.1. Noise adds to the rounding errors.
         """
         t, expected, loaded, even, *counts = np.array(self._rows).T
         smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
         parts = expected, np.cumsum(expected), np.gradient(expected, t), loaded, even
         wanted, shifted, rate, heavy, even = (a - smooth @ (smooth.T @ a) for a in parts)
         moved = np.array(counts).T * self._units.encoder_step
-        moved -= smooth @ (smooth.T @ moved)
+        slow = smooth @ (smooth.T @ moved)
+        moved -= slow
         power = wanted @ wanted or 1.0
         size = wanted @ moved / power
         # standard deviation [m] of rounding, or of noise if that is larger: the range `still` / 2 spans four of them
@@ -681,15 +688,21 @@ class EncoderTest:
         both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
         shapes, tested, noise = np.stack([wanted, rate, even], axis=1), moved[:, self._axis], scatter[self._axis]
         inverse = np.linalg.pinv(shapes)
-        share, lengths = inverse @ tested, np.linalg.norm(inverse, axis=1)
-        same, doubts = float(share[0]) or 1.0, 12**0.5 * noise * lengths
+        share = inverse @ tested
+        same, doubts = float(share[0]) or 1.0, 12**0.5 * noise * np.linalg.norm(inverse, axis=1)
         late, doubt = -float(share[1]) / same, float(doubts[1]) / abs(same)  # [ticks]
-        rest = max(0.0, float(((tested - shapes @ share) ** 2).sum()) - len(t) * noise**2)
-        explained = share[2] ** 2 > _FIT / (1 - _FIT) * rest * lengths[2] ** 2
-        uneven = explained * (abs(float(share[2])) - float(doubts[2])) / abs(same)
         alike = (heavy @ tested) ** 2 / ((heavy @ heavy or 1.0) * own[self._axis])
         swing = float(np.linalg.norm(both.T @ tested) / math.sqrt(power))
-        return size, fit, swing, late, doubt, uneven, bool(fit[self._axis] > _FIT > alike)
+        free = bool(fit[self._axis] > _FIT > alike)
+        slip, fitted = 0.1 * np.abs(np.gradient(expected, t)).max() or 1.0, shapes @ share
+        fits: list[_Shares] = []
+        for _ in range(2):  # the second fit has friction and path of the motion that the first one fits
+            speed = np.gradient(fitted + slow[:, self._axis], t)
+            rub = np.tanh(speed / slip).cumsum().cumsum() * -(self._T**2) / self._expected.mass[self._axis]
+            rub, path = (a - smooth @ (smooth.T @ a) for a in (rub, np.abs(speed).cumsum()))
+            fits = [_Shares.of([wanted, rub, rate, extra], tested, noise) for extra in (even, path)]
+            fitted = min(fits, key=lambda one: one.rest).fitted
+        return size, fit, swing, late, doubt, fits[0], fits[1], free
 
     def _counted(self, i: int) -> float:
         """Return the range of encoder i in this block [counts]."""
@@ -715,11 +728,16 @@ class EncoderTest:
         """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
         retried = self._closing and not self._unknown_hands
         weak, most = self._block < _BLOCKS - 1 + retried, _LATE + self._at_once
-        axis, name, (size, fit, swing, late, doubt, uneven, free) = (
-            self._axis,
-            f"axis {self._axis + 1}",
-            self._compare(),
-        )
+        axis, name = self._axis, f"axis {self._axis + 1}"
+        size, fit, swing, late, doubt, motor, encoder, free = self._compare()
+        fits, wholes = (motor, encoder), (abs(float(motor.shares[0])) or 1.0, 1.0)
+        # differences of the two directions, and their errors
+        uneven = [(abs(one.shares[3]) / whole, one.doubts[3] / whole) for one, whole in zip(fits, wholes, strict=True)]
+        blamed = int(encoder.explains and 2 * encoder.rest < motor.rest)
+        best, (sided, unsure) = fits[blamed], uneven[blamed]
+        (own, friction, _, fault), doubts = best.shares, best.doubts
+        clear = fit[axis] > _FIT and max(abs(fault), doubts[0]) < _CLEAN
+        weaker, self._weaker = self._weaker, float(own + doubts[0]) if clear else math.nan
         moves = [self._counted(i) > still for i, still in enumerate(self._still)]
         # A block lasts about as long as the window in which the noise was measured, so one count more is a motion.
         near = [self._counted(i) > max(1, still // 2 + 1) for i, still in enumerate(self._still)]
@@ -727,28 +745,31 @@ class EncoderTest:
         follows = [bool(one and good > _FIT) for one, good in zip(near, fit, strict=True)]
         others = [i + 1 for i, one in enumerate(follows) if one and i != axis and abs(size[i]) > _CROSS]
         held = self._unknown_hands and not free  # whether a hand can explain a smaller motion
-        least = _WEAKENED * self._before[axis] if self._before else 0.0
+        farthest, sided_before = self._before[axis] if self._before else (0.0, 0.0)
+        least, most_uneven = _WEAKENED * farthest, _UNEVEN + sided_before
         self._swings = self._swings or (moves[axis] and swing > _ALIVE)
         if not follows[axis]:
             if others and not moves[axis]:
                 raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
             return False
-        if uneven > _UNEVEN and not weak:
-            raise SafetyStop(f"{name} moves much farther in one direction than in the other: its motor is weak in one")
+        if not weak and best.explains and sided - unsure > most_uneven:
+            what = "its encoder loses counts in one" if blamed else "its motor is weak in one"
+            raise SafetyStop(f"{name} moves much farther in one direction than in the other: {what}")
         if held and (abs(size[axis]) < max(least, 1 / _TEST_RATIO) or (doubt < _LATE and late > most)):
             return False
         if size[axis] < 0:
             wrong = "a positive force moves it to negative counts"
             raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
         small = size[axis] < 1 / _TEST_RATIO
-        if weak and (small or uneven > _UNEVEN):
+        unclear = max(map(sum, uneven)) > most_uneven or (self._block and math.isnan(weaker))
+        if weak and (small or sided - unsure > most_uneven or (unclear and not self._closing)):
             return False  # dry friction hides much of a weak motion; a stronger force overcomes it
         if not 1 / _TEST_RATIO <= size[axis] <= _TEST_RATIO:
             than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
             brake = ", or dry friction brakes it" if small else ""
             raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong{brake}")
-        if self._before and size[axis] < least:
-            share = f"{size[axis] / self._before[axis]:.2g} times as far as at arming"
+        if size[axis] < least:
+            share = f"{size[axis] / farthest:.2g} times as far as at arming"
             raise SafetyStop(f"{name} moves {share}: its motor has become weak, or saturates at this force")
         if others:
             raise SafetyStop(f"a force on {name} moves encoder {others[0]}, too: two axes are connected to each other")
@@ -761,7 +782,10 @@ class EncoderTest:
             raise SafetyStop(
                 f"{name} answers {late:.1f} ticks later than agreed: an encoder or motor has a hidden delay"
             )
-        self.sizes.append(float(size[axis]))
+        if weaker < _ZONE * own and abs(friction) + doubts[1] < _RUBBED * self._pushed and not self._closing:
+            small = f"{weaker / own:.2g} times as far as expected of its motion under twice the force"
+            raise SafetyStop(f"{name} moves {small}, and not because of dry friction: its motor has a dead zone")
+        self.sizes.append((float(size[axis]), sided))
         return True
 
     def _unanswered(self) -> str:
@@ -783,6 +807,30 @@ class EncoderTest:
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
             return f"axis {axis} does not follow {at} as a free handle does: let go of it while arming"
         return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"
+
+
+class _Shares(NamedTuple):
+    """The least squares fit of four shapes to a motion: expected motion, motion under a friction of 1 N, speed, fault.
+
+    A motor that is weak in one direction adds the motion under the absolute value of the force. An encoder that loses
+    counts in one direction adds the length of the path.
+    """
+
+    shares: Array  # (4,) coefficients of the shapes
+    doubts: Array  # (4,) errors of the coefficients
+    explains: bool  # whether the last shape explains most of what the others leave
+    rest: float  # [m^2] sum of squares that remains
+    fitted: Array  # (n,) [m]
+
+    @classmethod
+    def of(cls, shapes: Sequence[Array], motion: Array, noise: float) -> _Shares:
+        """Fit shapes (n,) to a `motion` (n,) [m] with noise of this standard deviation [m]."""
+        columns = np.stack(shapes, axis=1)
+        inverse = np.linalg.pinv(columns)
+        shares, lengths, fitted = inverse @ motion, np.linalg.norm(inverse, axis=1), columns @ (inverse @ motion)
+        rest = float(((motion - fitted) ** 2).sum())
+        most = _BETTER * max(0.0, rest - len(motion) * noise**2) * lengths[-1] ** 2
+        return cls(shares, 12**0.5 * noise * lengths, bool(shares[-1] ** 2 > most), rest, fitted)
 
 
 class EncoderMonitor:

@@ -47,7 +47,8 @@ class Fault:
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from the fault to zero force; None: not measured
-    action: _Call | None = None  # what a person or a faulty controller does at _WHEN
+    action: _Call | None = None  # what a person or a faulty controller does
+    acts: float = _WHEN  # [s] from arming to the action
     host_stall: float = 0.0  # [s] that the host freezes at _WHEN
     info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
     baud: int | None = None
@@ -104,6 +105,7 @@ def _signed(
 G, A = Stage, Stage.ARMED
 #: a motion that is too small fails the test only with the strongest force, 120 ms later
 _ENDED: dict[str, Any] = {"action": person("stop"), "within": 2 * (100.0 + _TESTED) + 120.0, "lasts": 1.8}
+_UNFOUND: dict[str, Any] = {"action": person("stop"), "acts": 0.9, "lasts": 1.9}
 _LATE = at("down:jitter=0.0007")
 CASES = (
     Fault("nothing", A),
@@ -249,6 +251,7 @@ CASES = (
             ("saturates at 0.6 N", "limit=0.6@0.6", f"axis {axis} moves 0.* times as far"),
             ("is 0.6 times as strong", "motor=0.6@0.6", f"axis {axis} moves 0.6.* times as far as at arming"),
             ("makes 0.15 of negative forces", "oneway=0.15@0.6", f"axis {axis} moves .*than in the other"),
+            ("makes half of negative forces", "oneway=0.5@0.6", f"axis {axis} moves .*than in the other.*weak in one"),
         )
     ),
     *(
@@ -260,9 +263,40 @@ CASES = (
             _AT_ONCE,
             free=free,
         )
-        for axis in (1, 2)
+        for axis, free in ((1, False), (1, True), (2, True))
         for share in (0, 0.15)
-        for free in (False, True)
+    ),
+    *(
+        Fault(f"{what} of axis {axis} before, free", G.STOPPED, cause, (f"axis{axis}:{fault}",), _AT_ONCE, free=True)
+        for axis in (1, 2)
+        for what, fault, cause in (
+            ("half of negative forces", "oneway=0.5", f"axis {axis} moves .*than in the other.*weak in one"),
+            ("dead zone of 0.1 N", "zone=0.1", f"axis {axis} moves 0.* its motor has a dead zone"),
+            ("dead zone of 0.3 N", "zone=0.3", f"axis {axis} moves 0.* its motor has a dead zone"),
+            ("half of negative counts", "lose=0.5", f"axis {axis} moves .*than in the other.*loses counts"),
+            ("negative counts twice", "lose=2", f"axis {axis} moves .*than in the other.*loses counts"),
+        )
+    ),
+    *(
+        Fault(f"half of negative counts of axis {axis}, then the end", G.STOPPED, cause, (fault,), free=True, **_ENDED)
+        for axis in (1, 2)
+        for fault, cause in ((f"axis{axis}:lose=0.5@0.6", f"axis {axis} moves .*than in the other.*loses counts"),)
+    ),
+    # faults that nothing finds (docs/hardware.md)
+    *(
+        Fault(f"{what} of axis {axis}", G.FINISHED, "asked to", faults, **_UNFOUND)
+        for axis in (1, 2)
+        for what, faults in (
+            ("dead motor for 0.2 s", (f"axis{axis}:motor=0@0.6", f"axis{axis}:motor=1@0.8")),
+            ("reversed motor for 0.2 s", (f"axis{axis}:motor=-1@0.6", f"axis{axis}:motor=1@0.8")),
+            ("three quarters of negative forces", (f"axis{axis}:oneway=0.75",)),
+            ("0.8 of negative counts", (f"axis{axis}:lose=0.8",)),
+            ("dead zone of 0.05 N", (f"axis{axis}:zone=0.05",)),
+        )
+    ),
+    *(
+        Fault(f"motor 2 makes {part} of force 1, too", G.FINISHED, "", (f"cross={part}",), **_UNFOUND)
+        for part in (0.2, -0.2)
     ),
     *(
         Fault(
@@ -427,7 +461,7 @@ def _rehearse_case(
         emulator,
         _plan(case, scenario, made),
         faults,
-        actions=[(_WHEN, case.action)] if case.action else (),
+        actions=[(case.acts, case.action)] if case.action else (),
         host_stalls=[(_WHEN, case.host_stall)] if case.host_stall else (),
         clock=case.period,
     )
