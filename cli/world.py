@@ -17,7 +17,7 @@ from haptic_loop.design.api import proved, store
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import ANY_ENVIRONMENT
-from haptic_loop.design.files import write
+from haptic_loop.design.files import off_table, write
 from haptic_loop.design.result import Chosen, listed
 from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.couplings import assessed, choose
@@ -60,6 +60,7 @@ class _Report:
     peak_force_N: list[float] | None = None
     hands: int = 0
     worst_excess_J: float | None = None
+    interrupted: bool | None = off_table("if given", None)  # of a run
     wall_s: float = 0.0
 
 
@@ -173,6 +174,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
         report,
         world=WorldRecord.of(figures),
         peak_force_N=np.abs(trace.f).max(axis=0, initial=0.0).tolist(),
+        interrupted=trace.interrupted,
         wall_s=time.perf_counter() - began,
     )
     labelled = replace(trace, meta=render.plain(report))
@@ -193,6 +195,8 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
 def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Iterator[tuple[str, str | None]]:
     yield "contacts", ", ".join(scenario.environment.contacts)
     yield from _common_rows(report)
+    ended = f"in tick {figures.ticks}; the trace has the ticks up to the last multiple of 2048"
+    yield "interrupted", ended if report.interrupted else None
     yield "given to hands and devices", f"{_energy(figures.given_J)} beyond what the devices dissipate"
     yield "released", f"{_energy(figures.released_J)} by gravity and springs of the scene"
     yield "least energy at the port", _energy(figures.port_least_J)
