@@ -82,7 +82,8 @@ def verdict(
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
     felt = f": {_percent(share)} of the stiffness" if share else ""
-    words = [f"[green]Stable[/] for {_who(guarantee)}{felt}."]
+    by = f" by the condition {guarantee.own}, which is your own," if guarantee.own else ""
+    words = [f"[green]Stable[/]{by} for {_who(guarantee)}{felt}."]
     if not assessment.holds:
         words.append(f"[red]Not certified[/] {_missing(assessment)}")
     if guarantee.forces == BELOW_LIMITS and assessment.force_limits.force_limit:

@@ -131,7 +131,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
     Loops with known devices are judged by "known-device" and "known-device-any", too. Your own `condition`, or else
     your own condition in the Design, is also judged. With loop.varying_delay there is a further entry "switching", for
-    delays that switch in any way within that range.
+    delays that switch in any way within that range. Your own condition is judged with the loop's ranges and switching.
 
     With ranges around the loop's environment, "this-environment" and "known-device" cover the environment and the
     vertices of the ranges, at most 128. Between the vertices there is no proof, only a search (design.worst_member). If
@@ -149,10 +149,9 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
         SingularLoop: A coupling of your own class makes an algebraic loop without solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    own = coupling.own if isinstance(coupling, Design) else None
-    alone = fitting(loop, coupling)
-    _, own_condition = name_and_own(condition)
-    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=own_condition or own))
+    alone, (_, own) = fitting(loop, coupling), name_and_own(condition)
+    own = own or (coupling.own if isinstance(coupling, Design) else None)
+    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=own))
     over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
     for each in over if loop.ranges else ():
         requirements[each.name] = _over_ranges(loop.switching(None), alone, each, requirements[each.name])
@@ -160,6 +159,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
         switched = judged(loop.at(loop.environment), alone, SWITCHING)
         needs = _over_ranges(loop, alone, THIS_ENVIRONMENT, switched) if loop.ranges else switched
         requirements["switching"] = replace(needs, condition=SWITCHING.name)
+    if own and (loop.ranges or loop.varying_delay):
+        needs = judged(loop, alone, own)
+        over_ranges = loop.ranges and needs.applies and needs.guarantee == RANGES
+        requirements[own.name] = _over_ranges(loop, alone, own, needs) if over_ranges else needs
     return requirements
 
 

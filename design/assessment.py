@@ -26,6 +26,7 @@ from haptic_loop.controller.ranges import Member, inside, number_of_vertices, wh
 from haptic_loop.design.arguments import of_kind
 from haptic_loop.design.certificate import (
     condition_of,
+    is_ours,
     judged,
     lag,
     named,
@@ -49,10 +50,9 @@ from haptic_loop.design.environments import (
     worst,
 )
 from haptic_loop.design.frequency import too_long
-from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice, described
 from haptic_loop.design.result import (
     ANY,
-    CONDITIONS,
     HERE,
     KNOWN_CONDITIONS,
     RANGES,
@@ -185,7 +185,7 @@ def check_ranges(
     certificate: Certificate | None = None,
     condition: Condition = THIS_ENVIRONMENT,
 ) -> RangesResult | None:
-    """Check a coupling over the ranges of its loop by this-environment or known-device; return None without ranges.
+    """Check a coupling over the ranges of its loop by a condition that covers them; return None without ranges.
 
     The search is deterministic. In addition, `samples` environments are drawn at random from inside the ranges, with
     `seed`. The search and the proof are not repeated if an earlier call or design supplies them as `searched` and
@@ -231,7 +231,7 @@ def _proved_ranges(
 ) -> tuple[Certificate | None, str | None, Sequence[Any] | None]:
     """Return (the certificate for all members or None, the reason why there is none, the multipliers)."""
     if certificate and certificate.guarantee == RANGES and certificate.condition == condition.name:
-        values = on_file(condition_of(certificate), loop, certificate.multipliers)
+        values = on_file(condition_of(certificate, condition), loop, certificate.multipliers)
         return certificate, None, values[: sum(condition.multiplier_sizes(loop).values())] if values else None
     swept = required_damping(loop, coupling, condition) if condition.multiplier_sizes(loop) else None
     multiplier = swept.multiplier if swept else None
@@ -406,6 +406,7 @@ class Guarantee:
         energy_J: Bound of the energy [J] that a hand receives beyond what the devices dissipate and a MuJoCo scene
             releases; None for a guarantee that the loop comes to rest.
         vertices: The proved vertices of "these ranges" in words: every vertex, or 128 of 625 vertices.
+        own: Name and file of the user's own condition that gives the guarantee, in words, or None.
     """
 
     condition: str
@@ -418,6 +419,7 @@ class Guarantee:
     periods: float
     energy_J: float | None = None
     vertices: str = "every vertex"
+    own: str | None = None
 
     def __repr__(self) -> str:
         return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, forces: {self.forces})"
@@ -429,7 +431,11 @@ class Guarantee:
 
     @property
     def words(self) -> str:
-        """One line for a report: the environments of the guarantee, and the energy if it is bounded."""
+        """One line for a report: the environments, the energy if it is bounded, and the user's own condition."""
+        return f"{self._covered}, by the condition {self.own}, which is your own" if self.own else self._covered
+
+    @property
+    def _covered(self) -> str:
         if self.energy_J is not None:
             join = "" if self.environments.startswith("and ") else ","
             amount = f"more than {self.energy_J:g} J" if self.energy_J else "any energy"
@@ -444,6 +450,7 @@ class Guarantee:
         part: dict[str, Any] = {"condition": self.condition, "proof": self.proof, "facts": self.facts}
         part |= {"hands": self.hands, "environments": self.environments, "forces": self.forces}
         part |= {"delays_samples": delays, "longest_period_s": self.periods, "words": self.words}
+        part |= {"own_condition": self.own} if self.own else {}
         return part | ({} if self.energy_J is None else {"energy_J": self.energy_J})
 
 
@@ -462,7 +469,9 @@ class Assessment:
         certificate: The exact proof that the caller supplied and that holds, or the proof for the ranges, or None.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold for `holds`; another condition may give the guarantee.
+        condition: The name of the condition that must hold for `holds`; another condition of the package may give the
+            guarantee, but a user's own must give it itself, because others leave out the user's facts.
+        own: The user's own condition, or None.
     """
 
     loop: Loop
@@ -476,6 +485,7 @@ class Assessment:
     guarantee: Guarantee | None
     reason: str | None
     condition: str
+    own: Condition | None = None
 
     def __repr__(self) -> str:
         return f"Assessment({self.coupling!r}: {self.guarantee or f'no guarantee, {self.reason}'})"
@@ -561,7 +571,8 @@ def assess(
         certificate: A stored proof. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
         condition: The name of the condition that must hold, or a user's own condition. The default is this-environment,
-            or known-device if the loop has bounds of its devices.
+            or known-device if the loop has bounds of its devices. With a user's own, no other condition gives the
+            guarantee.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
         searched: A design's search between the vertices for this loop and coupling.
@@ -589,16 +600,19 @@ def assess(
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
     here = loop.at(network).switching(None)
-    own = None if wanted_condition.name in CONDITIONS else wanted_condition
+    own = None if is_ours(wanted_condition) else wanted_condition
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
     requirements = requirements_of(here, coupling, known, own=own)
     if wanted_condition.name not in requirements:
         requirements[wanted_condition.name] = judged(here, coupling, wanted_condition)
     over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
+    over = own if own and not own.beyond(loop) else over
     if known and known.condition != over.name:
         searched = None  # That search was for another condition.
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
+    if ranges and own and over is not own:
+        ranges = replace(ranges, certificate=None, reason=own.beyond(loop))
     if loop.varying_delay:
         switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
         switched += (KNOWN_DEVICE, KNOWN_DEVICE_ANY) if loop.known_devices else ()
@@ -611,7 +625,8 @@ def assess(
         limits = ForceLimits(None, "the forces of the environment are clipped before the shell")
     else:
         where = loop if environment is None else loop.at(network)
-        limits = _force_limits(where, coupling, requirements, limiter, limiter_proof, known)
+        covering = {own.name: requirements[own.name]} if own else requirements
+        limits = _force_limits(where, coupling, covering, limiter, limiter_proof, known)
     if plugged and energy_budget is None:
         energy_budget = 0.0 if callable(environment) else START_J
     if energy_budget is not None:
@@ -628,6 +643,7 @@ def assess(
         None,
         None,
         wanted_condition.name,
+        own,
     )
     guarantee, reason = _guarantee(assessment)
     # The search between the vertices does not evaluate the limiter's block, so the limiter is not proved for ranges.
@@ -701,14 +717,21 @@ BELOW_LIMITS = "while they stay below their limits"
 def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     """Return (the guarantee for the loop that runs or None, the reason why there is none)."""
     loop, requirements, limits = assessment.loop, assessment.requirements, assessment.force_limits
-    own = requirements[assessment.condition]
+    decisive, own = requirements[assessment.condition], assessment.own
     plugged = shelled(assessment.environment)
     if loop.latency and (plugged or limits.energy_budget is not None):
         return None, "latency: an energy account assumes forces that latch at ticks; add a sample to theta instead"
     if plugged:
         return _shell(assessment)
     if limits.energy_budget is not None:
+        if own:
+            return None, f"the condition {own.name}, which is your own, does not cover forces that an account scales"
         return _account(assessment, "whatever computes the forces"), None
+    if own and decisive.certified:
+        ranges = None if decisive.guarantee == ANY else _over_ranges(assessment)
+        return ranges or _stated(assessment, decisive, str(decisive.guarantee)), None
+    if own:
+        return None, f"{decisive.shortfall} ({own.name})"
     if loop.varying_delay:
         anywhere = () if any(loop.psi) else (ANY_ENVIRONMENT.name, KNOWN_DEVICE_ANY.name)
         here = [name for name in (SWITCHING.name, KNOWN_DEVICE.name) if name in requirements]
@@ -728,7 +751,7 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
         return ranges, None
     if held:
         return _stated(assessment, held[0], str(held[0].guarantee)), None
-    return None, f"{own.shortfall} ({own.condition})"
+    return None, f"{decisive.shortfall} ({decisive.condition})"
 
 
 def _over_ranges(assessment: Assessment) -> Guarantee | None:
@@ -751,10 +774,13 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
     longest = loop.T_max or loop.T
     unused = {"walls" if environments == ANY else "", "" if environments == RANGES else "ranges"}
     facts = tuple(fact for fact in assessment.facts if fact not in unused)
-    bounded = by.condition in KNOWN_CONDITIONS or (limits.rho is not None and limits.bounded)
+    own = assessment.own
+    known = by.condition in KNOWN_CONDITIONS or isinstance(own, KnownDevice)
+    bounded = known or (limits.rho is not None and limits.bounded)
     hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
     facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)
-    return Guarantee(by.condition, proof, facts, hands, environments, forces, loop.delays, longest)
+    origin = own.origin if own else None
+    return Guarantee(by.condition, proof, facts, hands, environments, forces, loop.delays, longest, own=origin)
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
@@ -762,13 +788,14 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
     The shell needs a coupling that is certified for any environment, psi = 0 and constant delays.
     """
-    loop, needs = assessment.loop, assessment.requirements[ANY_ENVIRONMENT.name]
+    loop, needs = assessment.loop, assessment.requirements[(assessment.own or ANY_ENVIRONMENT).name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
     if loop.varying_delay:
         return None, "the shell needs constant delays: its account is not proved for delays that switch"
     if not needs.certified or needs.guarantee != ANY:
-        return None, f"the coupling is not certified for any environment: {needs.shortfall}"
+        why = f"{needs.condition} holds in {needs.guarantee}" if needs.certified else needs.shortfall
+        return None, f"the coupling is not certified for any environment: {why}"
     world = not callable(assessment.environment)
     where = "and gravity and springs of the scene released, whatever the scene does" if world else None
     return _account(assessment, where or "whatever computes the force"), None
@@ -776,11 +803,11 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 def _account(assessment: Assessment, whatever: str) -> Guarantee:
     """Return the guarantee of an energy account, behind a certified coupling (shell) or at the devices (budget)."""
-    loop, plugged = assessment.loop, shelled(assessment.environment)
-    condition = ANY_ENVIRONMENT.name if plugged else "energy-budget"
-    proof = assessment.requirements[ANY_ENVIRONMENT.name].proof if plugged else "account"
+    loop, plugged, own = assessment.loop, shelled(assessment.environment), assessment.own
+    behind = (own or ANY_ENVIRONMENT).name
+    condition = behind if plugged else "energy-budget"
+    proof = assessment.requirements[behind].proof if plugged else "account"
     how = "scaled by the shell" if plugged else "scaled by the energy budget"
     longest, W0 = loop.T_max or loop.T, assessment.force_limits.energy_budget
-    return Guarantee(
-        condition, proof, assessment.facts, "no passive hand", whatever, how, loop.delays, longest, energy_J=W0
-    )
+    fixed = condition, proof, assessment.facts, "no passive hand", whatever, how, loop.delays, longest
+    return Guarantee(*fixed, energy_J=W0, own=own.origin if own else None)

@@ -127,7 +127,7 @@ def prove(
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
         )
     )
-    if _is_ours(resolved):
+    if is_ours(resolved):
         _made.add(certificate.seal)
     return certificate
 
@@ -345,7 +345,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
             _check(loop, coupling, resolved, certificate)
     except ValueError as refused:  # raised by a proof or by a user's own condition
         return Verdict(False, str(refused))
-    if _is_ours(resolved):
+    if is_ours(resolved):
         _made.add(certificate.seal)
     return Verdict(True)
 
@@ -443,7 +443,8 @@ _NAMED: dict[str, Condition] = {
 _PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # stored as facts of a base condition
 
 
-def _is_ours(condition: Condition) -> bool:
+def is_ours(condition: Condition) -> bool:
+    """Return whether the package, not the user, defines the condition."""
     return condition in _NAMED.values() or type(condition) in _PARTS
 
 
@@ -452,7 +453,7 @@ def named(condition: str | Condition) -> Condition:
     if not isinstance(condition, str):
         name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in reserved
-        if not (free or _is_ours(condition)):
+        if not (free or is_ours(condition)):
             own = f"condition {type(condition).__name__}: its name is {name!r}"
             raise ValueError(f"{own}, expected a name other than {', '.join(sorted(reserved))}")
         return condition

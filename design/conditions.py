@@ -29,10 +29,12 @@ any-environment applies Lemma 4 of the paper to any passive environment under ba
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -378,6 +380,12 @@ class Condition(ABC):
         """Return the beginning of a message on a matrix: the member of the ranges that it belongs to, or ""."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
+
+    @property
+    def origin(self) -> str:
+        """The name and the file of a user's own condition, in words: "joined-devices of joined.py"."""
+        file = getattr(sys.modules.get(type(self).__module__), "__file__", None)
+        return f"{self.name} of {Path(file).name}" if file else self.name
 
     @property
     def claim(self) -> str:

@@ -165,7 +165,7 @@ def design_by_kind(
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:
-        return replace(_with_less_damping(loop, make, own, made_for), condition=own.name, own=own, phi=None)
+        return _of_own(_with_less_damping(loop, make, own, made_for), own)
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
         return _with_less_damping(loop, make, made_for)
@@ -176,6 +176,12 @@ def design_by_kind(
     return _with_less_damping(loop, make, made_for)
 
 
+def _of_own(design: Design, own: Condition) -> Design:
+    """Return the design for the user's own condition, without proofs and multipliers of another condition."""
+    without = dict.fromkeys(("phi", "c", "certificate", "limiter", "switching", "searched"))
+    return replace(design, condition=own.name, own=own, **without)
+
+
 def _by_own_function(loop: Loop, kind: str, condition: str | Condition | None) -> Design:
     """Return the design of the user's own function, judged by the user's own condition if there is one."""
     name, own = name_and_own(condition)
@@ -184,7 +190,7 @@ def _by_own_function(loop: Loop, kind: str, condition: str | Condition | None) -
         raise ValueError(f"coupling {kind} is {design!r} for this loop, expected a design.result.Design")
     if own:
         needs = own.judge(loop.at(loop.environment), design.coupling)
-        return replace(design, condition=own.name, own=own, requirement=needs, phi=None)
+        return _of_own(replace(design, requirement=needs), own)
     if name not in (None, design.condition):
         raise ValueError(f"condition is {condition!r}, but {kind} is designed for {design.condition}")
     return design
@@ -303,7 +309,8 @@ def _with_less_damping(
     where = loop.delayed(loop.delays.hi) if constant else loop
     if condition is KNOWN_DEVICE and walls:
         where = where.at(held(loop.network))  # The search for gains has no multipliers of walls.
-    judged = loop if condition.extensible or condition is KNOWN_DEVICE else loop.at(loop.environment)
+    all_members = condition.extensible or condition is KNOWN_DEVICE or (made_for and not condition.beyond(loop))
+    judged = loop if all_members else loop.at(loop.environment)
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         design = make(msgspec.structs.replace(where, latency=None, ranges=None, **_scaled(loop, share)))
         needs = condition.judge(judged, design.coupling)

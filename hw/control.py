@@ -614,11 +614,13 @@ def certified_couplings(
 
     A reserve is softer at rest than the previous coupling on every channel whose delay is longer, and stiffer on none.
     It needs less damping than the previous coupling would need with these delays. It has the same kind or file; where
-    that is not certified or not softer, it is the spring-damper by Theorem 4, which has the strongest guarantee. If
-    neither is possible, the list ends. Raises SafetyStop where the first coupling is not certified.
+    that is not certified or not softer, it is the spring-damper by Theorem 4, which has the strongest guarantee, or by
+    the user's own condition. If neither is possible, the list ends. Raises SafetyStop where the first coupling is not
+    certified.
     """
     candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
-    wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
+    fallback = _FALLBACK if candidates[0].chosen.own is None else (_FALLBACK[0], condition)
+    wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), fallback]
     while len(candidates) <= spare and wanted:
         reserve = None
         with suppress(SafetyStop, InputError):

@@ -277,20 +277,20 @@ class EncoderSteps:
         steps: Sequence[float],
         friction: Sequence[float],
         friction_max: Sequence[float | None] | None = None,
-        condition: str | None = None,
+        beyond: str | None = None,
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `condition` is the name of the
-        condition that certifies the loop.
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `beyond` is the name of the condition
+        that certifies the loop, if no friction is proved to suffice with it.
         """
         if not any(steps):
             return None
         widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
         published = tuple(friction_max or [None] * len(steps))
         values = tuple(steps), tuple(friction), published
-        if loop.environment.walls or loop.environment.world or condition in KNOWN_CONDITIONS:
-            obstacle = "walls" if loop.environment.walls else "a world" if loop.environment.world else condition
+        if loop.environment.walls or loop.environment.world or beyond:
+            obstacle = "walls" if loop.environment.walls else "a world" if loop.environment.world else beyond
             return cls(
                 *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved to suffice"
             )
@@ -314,14 +314,15 @@ def encoder_steps(
 
     `steps` (m,) [m] replace those of the scenario. Returns None without steps, or for a singular loop.
     """
-    condition = assessment.guarantee and assessment.guarantee.condition
+    stated = assessment.guarantee
+    beyond = stated.condition if stated and (stated.own or stated.condition in KNOWN_CONDITIONS) else None
     fields = ("encoder_step", "friction", "friction_max")
     own, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
     loop, running = scenario.loop(case), assessment.environment
     loop = loop.at(running) if isinstance(running, Environment) else loop
     try:
-        return EncoderSteps.of(loop, assessment.coupling, steps or own, friction, most, condition)
+        return EncoderSteps.of(loop, assessment.coupling, steps or own, friction, most, beyond)
     except ValueError:  # The algebraic loop has no solution, which the conditions report.
         return None
 

@@ -93,8 +93,7 @@ class RunReport:
             needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"
             lines.append(f"{subject} coupling fails {condition}: {needs}.")
         if self.stability.contact:
-            making = [r.condition for r in certificates.values() if r.certified and r.guarantee == where]
-            covered = making[0] if making and where in (ANY, MAKING) else "no certificate"
+            covered = guarantee.condition if guarantee and where in (ANY, MAKING) else "no certificate"
             softer = ", at any gap, and every wall that is softer in stiffness and damping alike"
             softer = softer if where == MAKING else ""
             lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")

@@ -70,8 +70,8 @@ def test_friction_covers_no_steps_of_known_devices():
     area, square, slope = v0 * width / 2, v0**2 * width / 3, 4 * v0**2 / width  # integrals of |v|, v^2 and v'^2
     assert W * area + delta * square + beta * mass * slope < W * beta * 2 * v0
     coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
-    assert EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], condition="this-environment").covered
-    known = EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], condition="known-device")
+    assert EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26]).covered
+    known = EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26], beyond="known-device")
     assert not known.covered
     assert known.friction_needed is None
 

@@ -1,19 +1,29 @@
 """Tests of a user's own fact: no shortcut of a condition leaves it out, and the verdict names whose claim it is."""
 
+import re
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT
+from worlds import PAIR, SOFT, STIFF
 
-from haptic_loop import load
+from haptic_loop import certify, load
 from haptic_loop.cli import check
-from haptic_loop.controller.lti import numbers
+from haptic_loop.cli.verdict import verdict
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.lti import constant_like, numbers
+from haptic_loop.design.assessment import BELOW_LIMITS, assess
 from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import Stored, save, sealed
-from haptic_loop.design.environments import ANY_ENVIRONMENT, SwitchingDelays, ThisEnvironment
+from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, LimitedForces, SwitchingDelays, ThisEnvironment
 from haptic_loop.design.facts import Fact, Switching, Unknowns
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice
+from haptic_loop.design.result import ANY, HERE, RANGES
 from haptic_loop.design.robustness import robustness
+from haptic_loop.sim.couplings import encoder_steps
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
 change = msgspec.structs.replace
@@ -148,3 +158,93 @@ def test_equal_multiplier_names_are_refused():
 
 def _twice(self, loop):
     return Switching(), Switching()
+
+
+# What a verdict states if the user's own condition judges the loop.
+
+
+class Nothing(Condition):
+    name = "nothing"
+
+    def demand(self, loop, coupling, exact=False):
+        one = constant_like(loop.F(coupling, exact), np.eye(loop.channels, dtype=int))
+        return Demand(one, one)
+
+
+class Anything(Nothing):
+    name = "anything"
+
+    def guarantee(self, loop):
+        return ANY
+
+
+def test_the_first_line_names_an_own_condition():
+    """any-environment certifies SOFT, but it leaves out the fact, so that it gives neither guarantee nor limiter."""
+    for own, coupling in ((Twenty(), SOFT), (Nothing(), STIFF)):
+        assessment = assess(PAIR, coupling, condition=own, force_limit=(12.0, 12.0))
+        stated = assessment.guarantee
+        assert stated
+        assert (stated.condition, stated.environments, stated.forces) == (own.name, HERE, BELOW_LIMITS)
+        assert assessment.force_limits.rho is None
+        first = re.sub(r"\[.*?\]", "", verdict(assessment))
+        assert first.startswith(f"Stable by the condition {own.name} of {Path(__file__).name}, which is your own, for")
+        assert "Only while forces stay below their limits." in first
+        assert "your own" in stated.words
+    assert assess(PAIR, SOFT).guarantee.any_environment
+
+
+def test_only_an_own_condition_gives_its_guarantee():
+    fails = assess(PAIR, SOFT, condition=condition(ThisEnvironment, Less(1e6)))
+    assert fails.requirements["any-environment"].certified
+    assert (fails.guarantee, fails.holds) == (None, False)
+    assert str(fails.reason).endswith("(own)")
+
+
+def test_no_friction_covers_steps_with_own_facts():
+    scenario = load("omega-pair")
+    steps = [encoder_steps(scenario, "I", assess(PAIR, SOFT, condition=own), [1e-9] * 2) for own in (None, Twenty())]
+    assert [each is not None and each.friction_needed is None for each in steps] == [False, True]
+
+
+def test_accounts_need_an_own_condition_for_any_environment():
+    assert assess(PAIR, SOFT, energy_budget=1e-3).guarantee
+    assert assess(PAIR, SOFT, condition=Twenty(), energy_budget=1e-3).guarantee is None
+    assert assess(PAIR, SOFT, environment=lambda u: u).guarantee.own is None
+    here, anywhere = (assess(PAIR, SOFT, condition=own, environment=lambda u: u) for own in (Nothing(), Anything()))
+    assert "nothing holds in this environment" in here.reason
+    assert anywhere.guarantee.condition == "anything"
+
+
+@pytest.mark.slow
+def test_ranges_are_judged_by_an_own_condition():
+    loop = load("omega-pair-ranges").loop("I")
+    soft = SpringDamper([200.0] * 2, [0.5] * 2)
+    own = assess(loop, soft, condition=Twenty(), ranges_samples=2)
+    assert (own.guarantee.environments, own.guarantee.condition) == (RANGES, "twenty")
+    extra = 20.0 * loop.T / loop.delta[0]
+    assert own.ranges.worst[1].ratio == pytest.approx(
+        assess(loop, soft, ranges_samples=2).ranges.worst[1].ratio + extra
+    )
+    assert certify(loop, soft, Twenty())["twenty"].ratio == pytest.approx(own.ranges.worst_found[1].ratio, rel=1e-6)
+    other = assess(loop, soft, condition=Nothing(), ranges_samples=2)
+    assert not other.holds
+    assert "does not name in covers" in verdict(other)
+    assert not certify(loop, soft, Nothing())["nothing"].certified
+
+
+def test_certify_refuses_switching_for_an_own_condition():
+    loop = PAIR.switching(DelayRange(PAIR.theta, tuple(n + 1 for n in PAIR.theta)))
+    assert "varying_delay" in str(certify(loop, SOFT, Twenty())["twenty"].reason)
+
+
+def test_an_own_limiter_counts_if_its_block_is_proved():
+    own = condition(LimitedForces, Less(0.0))
+    assessment = assess(PAIR, SOFT, condition=own, force_limit=(12.0, 12.0))
+    assert assessment.force_limits.rho == LIMITER.rho(PAIR)
+    assert assessment.force_limits.words.startswith("proved, also while forces are limited")
+    assert assessment.decisive.ratio == pytest.approx(required_damping(PAIR, SOFT, LIMITER).ratio, rel=1e-6)
+    certificate = prove(PAIR, SOFT, own)
+    assert (certificate.condition, certificate.facts) == ("own", ("limiter",))
+    assert verify(Stored.of(PAIR, SOFT, certificate), own).proved
+    rho = certificate.multipliers | {"rho": tuple(2 * r for r in certificate.multipliers["rho"])}
+    assert not verify(Stored.of(PAIR, SOFT, sealed(change(certificate, multipliers=rho))), own).proved
