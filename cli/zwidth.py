@@ -200,7 +200,7 @@ def _designed_rows(fixed: FixedCoupling) -> render.Rows:
         ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in fixed.contact_springs),
     )
     yield (
-        "in that environment",
+        "in the scenario's environment",
         f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}",
     )
 

@@ -464,7 +464,10 @@ def timed(
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
     if most >= min((T_us, *ages.ticks)):
         instead = "use a longer T, or a microcontroller with --latch tick"
-        raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: {instead}")
+        raise SafetyStop(
+            f"answers come up to {most:.0f} us after their tick, guard included; "
+            f"T = {T_us:g} us and every tick must be longer: {instead}"
+        )
     return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
 
 

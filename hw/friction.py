@@ -74,12 +74,12 @@ class Friction:
 
     mass: float  # [kg]
     viscous: float  # b [N s/m]
-    coulomb: float  # [N]
+    coulomb: float  # c [N]
     stiffness: float  # [N/m] of a spring from the handle to ground
     constant: float  # [N] constant force
     drift: float  # [N/s] rate at which the constant force changes
     static: float  # [N] Stribeck part of dry friction, which vanishes at high speed
-    drag: float  # [N s2/m2]
+    drag: float  # q [N s2/m2]
     slip: float  # [m/s] v0 of the best law of dry friction; 0 where the best law is a bristle
     reach: float  # [m] distance over which a bristle's friction grows to its maximum; 0 where friction depends on speed
     periods: tuple[float, ...]  # [m] periods of the disturbances found

@@ -244,13 +244,13 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
         if e.viscous > (1 + _SUSPICIOUS) * said:
             causes.append(
                 f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is a hand "
-                "on it? No bound is offered; where the device really has more, declare it and take another record"
+                "on it? No bound is offered; if the device really has more damping, declare it and take another record"
             )
     return causes
 
 
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
-    """Return one estimate per axis from two or more recordings (sittings), and warnings if a hand damped some of them.
+    """Return one estimate per axis from two or more recordings (sittings), and warnings of recordings damped by a hand.
 
     Each axis gets the estimate of its least damped recording, and the least bound of all recordings. A passive hand
     only adds damping (docs/hardware.md), so no hand damped the least damped recording, unless a hand damped them all.
@@ -320,7 +320,7 @@ def estimate(
     scenario: Scenario,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> list[Estimate]:
-    """Return one estimate per axis of a recorded session. Raises ValueError naming an axis that gives none."""
+    """Return one estimate per axis of a recorded session. Raises ValueError naming an axis without an estimate."""
     estimates, records = [], records_of(recorder, session)
     for i, device in enumerate(scenario.axis_devices):
         progress(i, scenario.channels, f"estimating axis {i + 1}")
