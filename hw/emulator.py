@@ -93,7 +93,7 @@ _AXIS = {
     "motor": ("share of a force that its motor makes: 0 if dead, -1 if reversed", -10.0, 10.0, 0.0),
     "limit": ("newtons at which its motor saturates", 0.0, 12.0, 0.6),
     "oneway": ("share of a negative force that its motor makes", -10.0, 10.0, 0.0),
-    "zone": ("newtons below which its motor makes no force; of larger forces they are missing", 0.0, 12.0, 0.3),
+    "zone": ("newtons below which its motor makes no force, and by which larger forces are smaller", 0.0, 12.0, 0.3),
     "lose": ("share of the counts in negative direction that its encoder shows", -10.0, 10.0, 0.5),
     "own": ("newtons that its motor makes while armed, whatever FORCE says", -12.0, 12.0, 2.0),
 }

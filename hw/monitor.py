@@ -50,9 +50,9 @@ _CROSS = 0.25  # largest motion of another axis, as a share of the expected moti
 _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
-_ZONE = 0.8  # least ratio of the size of a motion to that under twice the force; without a dead zone it is 1
-_CLEAN, _RUBBED = 0.15, 0.25  # largest one-sided share of the former, and largest friction per force in the latter
-_BETTER = 8.0  # least ratio of squares that a fault in one direction explains to the rest; friction and weight: 6
+_ZONE = 0.8  # least ratio of a motion's relative size to that under twice the force; 1 without a dead zone
+_CLEAN, _RUBBED = 0.15, 0.25  # largest one-sided share of this motion; largest friction per force under twice its force
+_BETTER = 8.0  # least ratio of squares that a one-sided fault explains to the rest; friction and weight reach 6
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
@@ -568,16 +568,16 @@ class EncoderTest:
     """Test whether encoders answer a small force that acts on one axis after the other.
 
     Every 30 ms a pulse of 20 ms acts in the other direction, in blocks of 120 ms; each block is twice as strong as the
-    one before. After a block, a polynomial of degree 5 is subtracted from every position. It contains the intended
-    motion of a hand in this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the
-    expected motion in shape (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor
-    or encoder gives the wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another
-    shape. A motion that comes later than expected shows a hidden delay, because friction and hands advance its phase.
-    Dry friction makes weak motions small, so only with the strongest force is a small motion wrong. Coarse counts leave
-    the delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
-    (`remarks`). A fit of dry friction (`_Shares`) finds a motor that is weak in one direction and an encoder that loses
-    counts in one, because friction under a weight gives the motion other shapes. A dead zone of a motor makes a motion
-    smaller in relation to that under twice the force, which low friction does not.
+    last. After a block, a polynomial of degree 5 is subtracted from every position. It contains the intended motion of
+    a hand in this time, such as 50 mm at 2 Hz, and little of the answer. The remainder must match the expected motion
+    in shape (`_FIT` of its sum of squares), in sign, and in size within a factor of 2. A reversed motor or encoder
+    gives the wrong sign, a wrong scale the wrong size, and a dead encoder or a held or moved handle another shape. A
+    motion that comes later than expected shows a hidden delay, because friction and hands advance its phase. Dry
+    friction makes weak motions small, so only with the strongest force is a small motion wrong. Coarse counts leave the
+    delay uncertain, so a stronger force follows until its error is below the limit, or the delay is not tested
+    (`remarks`). A fit of dry friction (`_Shares`) finds a motor that is weak, or an encoder that loses counts, in one
+    direction, because friction under a weight gives the motion other shapes. A dead zone of a motor makes the relative
+    size of a motion smaller than that under twice the force; low friction does not.
 
     The test at the end of a session has the largest force that the session allows, and finds a motor that saturates: a
     motion may be 30 % smaller than at arming (`before`), whatever the mass. Unknown hands may hold the handles, except
@@ -602,7 +602,7 @@ class EncoderTest:
         """Test within the caps of `limits`; a motion within `still` (m,) [counts] is noise.
 
         A STATE reports the force that acts after it, or with `at_once` (theta = 0) the force that acted before it.
-        `before` has the sizes and one-sided shares of motions at arming, as the test at arming has them in `sizes`.
+        `before` has the sizes and one-sided shares of motions at arming, which the test at arming stores in `sizes`.
         """
         self._at_once, self._closing, self._before = at_once, before is not None, before
         self.sizes: list[tuple[float, float]] = []
@@ -623,7 +623,7 @@ class EncoderTest:
         self._pushed = 0.0  # [N] largest force on the axis in this block
         self._finding: str | None = None  # the fault that the last block found, "" for none; None without an answer
         self._swings = False  # whether the axis swung at the frequency of the force in a block
-        self._weaker = math.nan  # relative size of the motion in the last block without its friction, if it is clear
+        self._weaker = math.nan  # relative size of the last block's motion less its friction; nan if this is not clear
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` ticks after the last call; None once all encoders have answered.
@@ -660,11 +660,11 @@ class EncoderTest:
         return f"let go of the handle of axis {self._axis + 1}" if self._block > _BLOCKS else None
 
     def _compare(self) -> tuple[Array, Array, float, float, float, _Shares, _Shares, bool]:
-        """Compare all motions with the expected one.
+        """Compare all motions with the expected motion.
 
         Returns the relative size and the fit (m,) of all motions. For the tested axis, also returns the size at any
-        phase of the force, the delay and its error [ticks], the fits with a motor that is weak in one direction and
-        with an encoder that loses counts in one, and whether the shape is that of the expected handle but not that of a
+        phase of the force, the delay and its error [ticks], the fits with a motor that is weak, and with an encoder
+        that loses counts, in one direction, and whether the shape is that of the expected handle but not that of a
         handle in a heavy hand.
 
         The delay is -a/s if s x + a x' + e y fits the tested motion, where x is the expected motion and y the motion
@@ -696,7 +696,7 @@ class EncoderTest:
         free = bool(fit[self._axis] > _FIT > alike)
         slip, fitted = 0.1 * np.abs(np.gradient(expected, t)).max() or 1.0, shapes @ share
         fits: list[_Shares] = []
-        for _ in range(2):  # the second fit has friction and path of the motion that the first one fits
+        for _ in range(2):  # the second round has friction and path of the motion that the first round fits
             speed = np.gradient(fitted + slow[:, self._axis], t)
             rub = np.tanh(speed / slip).cumsum().cumsum() * -(self._T**2) / self._expected.mass[self._axis]
             rub, path = (a - smooth @ (smooth.T @ a) for a in (rub, np.abs(speed).cumsum()))
@@ -731,7 +731,7 @@ class EncoderTest:
         axis, name = self._axis, f"axis {self._axis + 1}"
         size, fit, swing, late, doubt, motor, encoder, free = self._compare()
         fits, wholes = (motor, encoder), (abs(float(motor.shares[0])) or 1.0, 1.0)
-        # differences of the two directions, and their errors
+        # differences of the motions in the two directions, and the errors of these differences
         uneven = [(abs(one.shares[3]) / whole, one.doubts[3] / whole) for one, whole in zip(fits, wholes, strict=True)]
         blamed = int(encoder.explains and 2 * encoder.rest < motor.rest)
         best, (sided, unsure) = fits[blamed], uneven[blamed]
@@ -824,7 +824,7 @@ class _Shares(NamedTuple):
 
     @classmethod
     def of(cls, shapes: Sequence[Array], motion: Array, noise: float) -> _Shares:
-        """Fit shapes (n,) to a `motion` (n,) [m] with noise of this standard deviation [m]."""
+        """Fit shapes (n,) to a `motion` (n,) [m] with a standard deviation of `noise` [m]."""
         columns = np.stack(shapes, axis=1)
         inverse = np.linalg.pinv(columns)
         shares, lengths, fitted = inverse @ motion, np.linalg.norm(inverse, axis=1), columns @ (inverse @ motion)
