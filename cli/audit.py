@@ -6,7 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 if TYPE_CHECKING:
     from haptic_loop.design.audit import Audit, Help, Margins
     from haptic_loop.design.coverage import SwitchingFigures
-    from haptic_loop.sim.couplings import EncoderSteps
 
 _EXAMPLES = (
     "python -m design.audit --K 2870,2320 --B 5.47,5.55",
@@ -47,7 +46,6 @@ class _Report:
     device: _CatalogueDevice | None
     gains: str | None  # source of the listed device's gains; None if they are not used
     audit: Audit = off_table("inlined")
-    encoder: EncoderSteps | None = off_table()
     notes: tuple[str, ...] = off_table()
     wall_s: float = off_table()
 
@@ -58,7 +56,7 @@ def main(argv: list[str]) -> int:
     from haptic_loop.design.audit import audit
     from haptic_loop.design.certificate import named
     from haptic_loop.design.designs import name_and_own
-    from haptic_loop.sim.couplings import encoder_steps, from_file, read_coupling
+    from haptic_loop.sim.couplings import from_file, qualified, read_coupling
 
     if args.devices:
         extra = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
@@ -88,6 +86,8 @@ def main(argv: list[str]) -> int:
         limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
         with options.refused():
             audited = audit(loop, coupling, condition, args.seed, limits, move)
+    if not args.rigid:  # CHAI3D's wall replaces the scenario's devices.
+        audited = replace(audited, assessment=qualified(scenario, args.case, audited.assessment))
     notes = ()
     if args.coupling and not _is_own(args):
         notes = from_file(read_coupling(args.coupling), loop, own=condition).notes
@@ -99,11 +99,10 @@ def main(argv: list[str]) -> int:
         _CatalogueDevice(args.device, CATALOGUE[args.device]) if args.device else None,
         args.source if args.device else None,
         audited,
-        None if args.rigid else encoder_steps(scenario, args.case, audited.assessment),
         notes,
         time.perf_counter() - begin,
     )
-    verdict = verdicts.verdict(audited.assessment, encoder=report.encoder)
+    verdict = verdicts.verdict(audited.assessment)
     if args.rigid and isinstance(coupling, SpringDamper):
         verdict = f"{verdict} {_stiffest_wall(audited, coupling)}"
     caveats = [audited.not_covered, *([audited.switching.not_covered or ""] if audited.switching else [])]
@@ -341,7 +340,7 @@ def _remarks(report: _Report) -> Iterator[str]:
         yield f"Held torques: {torques}."
     if left := audited.left_over:
         yield f"{left.words[0].upper()}{left.words[1:]}."
-    if part := report.encoder:
+    if part := audited.assessment.encoder:
         yield f"{part.words[0].upper()}{part.words[1:]}."
 
 

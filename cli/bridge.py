@@ -61,8 +61,8 @@ def main(argv: list[str]) -> int:
         choice = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
         steps = session.units.encoder_step
-        encoder = encoder_steps(programs[0].scenario, args.case, programs[0].assessment, steps)
-        render.console(args).print(verdict(programs[0].assessment, encoder=encoder), soft_wrap=True)
+        programs = [_counted(program, steps) for program in programs]
+        render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
             note = "· delta is a full matrix; a device states one lower bound per axis"
@@ -82,6 +82,12 @@ def main(argv: list[str]) -> int:
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
     return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
+
+
+def _counted(program: CertifiedCoupling, steps: Sequence[float]) -> CertifiedCoupling:
+    """Return the coupling with its assessment for the encoder steps (m,) [m] that the device reports."""
+    encoder = encoder_steps(program.scenario, program.case, program.assessment, steps)
+    return replace(program, assessment=replace(program.assessment, encoder=encoder))
 
 
 def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_boards: bool) -> None:

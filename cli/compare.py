@@ -82,7 +82,8 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
         files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, rows)
     tables = [_beside(rows, args.condition)]
-    render.publish(args, report, tables, _not_covered(scenario, args.case), out, files, _nearest(rows))
+    verdict = f"{_nearest(rows)}{_exact_positions(scenario)}"
+    render.publish(args, report, tables, _held(scenario, args.case), out, files, verdict)
     return options.exit_code(True)
 
 
@@ -144,11 +145,15 @@ def _share(value: float | None, absent: str) -> str:
     return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
-def _not_covered(scenario: Scenario, case: str) -> list[str]:
+def _held(scenario: Scenario, case: str) -> list[str]:
     torques = held_torques(scenario.loop(case))
+    return [f"Held torques: {torques}."] if torques else []
+
+
+def _exact_positions(scenario: Scenario) -> str:
+    """Return a sentence on the encoder steps of the devices, or ""."""
     steps = any(device.encoder_step for device in scenario.axis_devices)
-    said = [f"Held torques: {torques}."] if torques else []
-    return [*said, *(["Guarantees are for exact positions: sim.run judges the encoder steps."] if steps else [])]
+    return " Guarantees are for exact positions: sim.run judges the encoder steps." if steps else ""
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -160,9 +165,10 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     chosen, failed = _chosen(scenario, args, args.coupling)
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
-    lines = [*report.notes, *_not_covered(scenario, args.case)]
+    lines = [*report.notes, *_held(scenario, args.case)]
     tables = [_guarantees(report), _feel(report)]
-    render.publish(args, report, tables, lines, out, files, _guaranteed(report))
+    verdict = f"{_guaranteed(report)}{_exact_positions(scenario)}"
+    render.publish(args, report, tables, lines, out, files, verdict)
     return options.exit_code(not failed)
 
 

@@ -35,7 +35,6 @@ def main(argv: list[str]) -> int:
     """Design, prove and store a coupling. Return 0 if it is certified, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.design.api import store
-    from haptic_loop.sim.couplings import encoder_steps
 
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
@@ -53,12 +52,11 @@ def main(argv: list[str]) -> int:
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before the bound.
-    encoder = encoder_steps(scenario, args.case, assessment)
     if slow:
-        render.announce(args, verdicts.verdict(assessment, encoder=encoder))
+        render.announce(args, verdicts.verdict(assessment))
     report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
     nearby = report.robustness
-    verdict = verdicts.lost(assessment, nearby) if slow else verdicts.verdict(assessment, nearby, encoder)
+    verdict = verdicts.lost(assessment, nearby) if slow else verdicts.verdict(assessment, nearby)
     tables, lines = _tables(scenario, report)
     if report.interrupted:
         lines = ["Interrupted: the robustness is missing, and perhaps the bound.", *lines]
@@ -235,8 +233,10 @@ def _that_decays(
 
 def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
     """Assess the design in its loop, with the design's own proof and its own search between the vertices."""
+    from haptic_loop.sim.couplings import qualified
+
     with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
-        return assess(
+        assessment = assess(
             loop,
             design.coupling,
             certificate=design.certificate,
@@ -248,6 +248,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             band_hz=args.band_hz or BAND_HZ,
             progress=move,
         )
+    return qualified(scenario, args.case, assessment)
 
 
 def _bound_and_robustness(

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 def main(argv: list[str]) -> int:
     """Simulate and report. Return 0 for a completed run, stable or not, and 130 for an interrupted one."""
     args = _parser().parse_args(argv)
-    from haptic_loop.sim.couplings import encoder_steps
-
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError(
             "--error chooses MuJoCo's integrator and substeps: leave out --engine exact, --integrator and --substeps"
@@ -53,8 +51,7 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
-    encoder = encoder_steps(scenario, args.case, assessment)
-    render.announce(args, verdicts.verdict(assessment, encoder=encoder))
+    render.announce(args, verdicts.verdict(assessment))
     from haptic_loop.sim.run_report import run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance

@@ -24,7 +24,7 @@ from haptic_loop.design.result import ANY, KNOWN_CONDITIONS, PLAIN_CONDITIONS, R
 from haptic_loop.models.human import Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
-from haptic_loop.sim.couplings import NAMES, encoder_steps
+from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.crowds import ENGINES, Findings, Validation, validate
 from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays, friction_left_out
 from haptic_loop.sim.run import assemble, engine_name
@@ -79,8 +79,7 @@ def main(argv: list[str]) -> int:
         *friction_left_out(scenario.device),
     ]
     shown = [render.facts(title, rows)]
-    stated = verdicts_of.verdict(assessment, encoder=encoder_steps(scenario, args.case, assessment))
-    render.publish(args, report, shown, lines, out, files, stated)
+    render.publish(args, report, shown, lines, out, files, verdicts_of.verdict(assessment))
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)

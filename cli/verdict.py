@@ -13,7 +13,7 @@ from haptic_loop.design.gain_search import SOFTEST
 from haptic_loop.design.result import ANY, HERE, MAKING, RANGES, Chosen, finite, listed
 from haptic_loop.design.robustness import Robustness
 from haptic_loop.design.transparency import BAND_HZ
-from haptic_loop.sim.couplings import EncoderSteps, assessed, choose
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.scenario import Scenario
 
 
@@ -59,25 +59,20 @@ _OBJECTS = {
 }
 
 
-def verdict(
-    assessment: Assessment,
-    nearby: Robustness | None = None,
-    encoder: EncoderSteps | None = None,
-) -> str:
+def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     """Return the verdict in a few sentences: hands and objects of the guarantee, felt stiffness, restrictions.
 
     Args:
         assessment: The assessment of exactly the loop that the command runs or judges.
         nearby: The required damping in environments within ten percent, or None.
-        encoder: Whether friction covers the encoder steps of the devices; None without encoder steps.
     """
-    guarantee = assessment.guarantee
+    guarantee, encoder = assessment.guarantee, assessment.encoder
     if guarantee is None:
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
         swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
-        exact = encoder and guarantee.proof != "account"  # A shell requires exact positions, a budget does not.
-        steps = f" {_NO_STEPS}" if exact else ""
+        exact = guarantee.proof != "account"  # A shell requires exact positions, a budget does not.
+        steps = f" {encoder.sentence}" if encoder and exact else ""
         return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}{steps}"
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
@@ -90,14 +85,11 @@ def verdict(
         words.append("Only while forces stay below their limits.")
     if guarantee.proof != "rational":
         words.append("By a refined sweep, without an exact proof.")
-    if encoder and not encoder.covered:
-        words.append(_NO_STEPS)
-    elif encoder:
-        words.append("Encoder steps are covered with this object only, while forces stay below their limits.")
+    if encoder:
+        words.append(encoder.sentence)
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])
 
 
-_NO_STEPS = "Not covered: the encoder steps of the devices."
 SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
 _NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness is no better than no force
 

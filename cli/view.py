@@ -102,7 +102,9 @@ class _Event:
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         unknown = "a world" if isnan(self.exact_growth_rate_per_s) else "no growth"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else unknown
-        proved = f"certified ({', '.join(held)})" if held else "NOT certified"
+        encoder = self.assessment.encoder
+        exact = " for exact positions" if encoder and not encoder.covered else ""
+        proved = f"certified{exact} ({', '.join(held)})" if held else "NOT certified"
         loop = f"{self.coupling}, theta {list(self.theta)}, psi {list(self.psi)}: {grows}, {proved}"
         return f"{self.t_s:6.2f} s  {self.event:<10} {loop}"
 

@@ -193,7 +193,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 class _SwitchingFiled:
     """The guarantee for varying delays, and the kind of its proof or the reason why there is no proof."""
 
-    guarantee: str = off_table()
+    guarantee: str | None = off_table()  # None where the loop that runs has no guarantee, as with lost packets
     proof: str | None = off_table()
     reason: str | None = off_table()
 
@@ -246,7 +246,8 @@ def store(
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
         words = f"{switching_guarantee(loop.varying_delay)}, in {named(design.asked).guarantee(loop)}"
-        switching = _SwitchingFiled(words, proof, reason)
+        stated = words if assessment is None or assessment.guarantee else None
+        switching = _SwitchingFiled(stated, proof, reason)
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, limiter)

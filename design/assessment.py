@@ -37,7 +37,7 @@ from haptic_loop.design.certificate import (
     required_damping,
     requirements_of,
 )
-from haptic_loop.design.conditions import Condition
+from haptic_loop.design.conditions import Condition, encoder_friction
 from haptic_loop.design.coupling_file import Certificate, digest
 from haptic_loop.design.environments import (
     ANY_ENVIRONMENT,
@@ -386,6 +386,66 @@ def _rows(
 
 
 # ----------------------------------------------------------------------------------------------------
+# Comparison of the energy of encoder steps with the devices' Coulomb friction.
+
+
+@dataclass(frozen=True)
+class EncoderSteps:
+    """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
+
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, worlds or known devices: nothing is proved
+    covered: bool
+    words: str
+
+    @property
+    def sentence(self) -> str:
+        """The restriction of a guarantee by the encoder steps, for a verdict."""
+        if not self.covered:
+            return "Not covered: the encoder steps of the devices."
+        return "Encoder steps are covered with this object only, while forces stay below their limits."
+
+    @classmethod
+    def of(
+        cls,
+        loop: Loop,
+        coupling: Coupling,
+        steps: Sequence[float],
+        friction: Sequence[float],
+        friction_max: Sequence[float | None] | None = None,
+        beyond: str | None = None,
+    ) -> EncoderSteps | None:
+        """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
+
+        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `beyond` is the name of the condition
+        that certifies the loop, if no friction is proved to suffice with it.
+        """
+        if not any(steps):
+            return None
+        widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+        published = tuple(friction_max or [None] * len(steps))
+        values = tuple(steps), tuple(friction), published
+        if loop.environment.walls or loop.environment.world or beyond:
+            obstacle = "walls" if loop.environment.walls else "a world" if loop.environment.world else beyond
+            return cls(
+                *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved to suffice"
+            )
+        needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
+        covered = bool((needed <= np.asarray(friction)).all())
+        amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
+        verdict = "are covered with this object while forces stay below the limits" if covered else "are not covered"
+        if any(most is not None for most in published):
+            bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
+            has = f"at least {has} N (published: at most {bounds} N)"
+        else:
+            has += " N"
+        enough = f"friction of {amounts} N is enough for {widths} um, the axes have {has}"
+        return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
+
+
+# ----------------------------------------------------------------------------------------------------
 # The guarantee and the assessment.
 
 
@@ -472,6 +532,7 @@ class Assessment:
         condition: The name of the condition that must hold for `holds`; another condition of the package may give the
             guarantee, but a user's own must give it itself, because others leave out the user's facts.
         own: The user's own condition, or None.
+        encoder: Whether friction covers the devices' encoder steps; None without them, and where only a loop is given.
     """
 
     loop: Loop
@@ -486,6 +547,7 @@ class Assessment:
     reason: str | None
     condition: str
     own: Condition | None = None
+    encoder: EncoderSteps | None = None
 
     def __repr__(self) -> str:
         return f"Assessment({self.coupling!r}: {self.guarantee or f'no guarantee, {self.reason}'})"
@@ -538,6 +600,7 @@ class Assessment:
             "ranges": self.ranges,
             "force_limits": self.force_limits,
             "transparency": self.transparency,
+            "encoder": self.encoder,
         }
 
 
@@ -584,7 +647,8 @@ def assess(
 
     Returns:
         The assessment. Its guarantee is for the environment that runs. `holds` also requires `condition` and, with
-        ranges, a guarantee that covers them.
+        ranges, a guarantee that covers them. A loop has exact positions and loses no packets; `simulate` and the
+        commands qualify the assessment by the scenario's encoder steps and lost packets.
 
     Raises:
         TypeError: `loop` is no Loop, or `coupling` no coupling.

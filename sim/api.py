@@ -187,7 +187,7 @@ def simulate(
         "seed": seed,
         "assessment": plain(assessment),
         "stability": plain(stability_of(outcome.simulation, trace)) if linear else None,
-        "remarks": outcome.remarks,
+        "remarks": [*outcome.remarks, *([assessment.encoder.words] if assessment.encoder else [])],
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     if world and trace.net:

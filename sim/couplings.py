@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.api import COUPLING, bare, certified_for, fitting
-from haptic_loop.design.assessment import Assessment, PluggedEnvironment, assess, shelled
+from haptic_loop.design.assessment import Assessment, EncoderSteps, PluggedEnvironment, assess, shelled
 from haptic_loop.design.certificate import verify
-from haptic_loop.design.conditions import Condition, encoder_friction
+from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored, load
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from haptic_loop.design.environments import ANY_ENVIRONMENT, THIS_ENVIRONMENT
@@ -228,8 +226,7 @@ def assessed(
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. A shell gives no guarantee with encoder steps. With lost packets only an energy budget gives
-        a guarantee, because forces may become older than any certificate covers.
+        The assessment, qualified by the scenario's encoder steps and lost packets (`qualified`).
     """
     assessment = assess(
         scenario.loop(case),
@@ -245,66 +242,24 @@ def assessed(
         band_hz=band_hz,
         progress=progress,
     )
-    plugged = shelled(environment or scenario.environment)
+    return qualified(scenario, case, assessment)
+
+
+def qualified(scenario: Scenario, case: str, assessment: Assessment) -> Assessment:
+    """Return the assessment of a scenario's loop, qualified by the encoder steps and lost packets of the scenario.
+
+    `Assessment.encoder` compares the devices' friction with that needed for the encoder steps. A shell gives no
+    guarantee with encoder steps. With lost packets only an energy budget gives a guarantee, because forces may become
+    older than any certificate covers.
+    """
+    plugged = shelled(assessment.environment)
+    assessment = replace(assessment, encoder=None if plugged else encoder_steps(scenario, case, assessment))
     if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.axis_devices):
         return assessment.without_guarantee("the devices have encoder steps, and the shell requires exact positions")
-    budgeted = energy_budget is not None and not plugged
+    budgeted = assessment.force_limits.energy_budget is not None and not plugged
     if scenario.loses_packets and assessment.guarantee and not budgeted:
         return assessment.without_guarantee("a lost packet makes a force older than the range of delays")
     return assessment
-
-
-# ----------------------------------------------------------------------------------------------------
-# Comparison of the energy of encoder steps with the devices' Coulomb friction.
-
-
-@dataclass(frozen=True)
-class EncoderSteps:
-    """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
-
-    encoder_step: tuple[float, ...]  # (m,) [m]
-    friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
-    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, worlds or known devices: nothing is proved
-    covered: bool
-    words: str
-
-    @classmethod
-    def of(
-        cls,
-        loop: Loop,
-        coupling: Coupling,
-        steps: Sequence[float],
-        friction: Sequence[float],
-        friction_max: Sequence[float | None] | None = None,
-        beyond: str | None = None,
-    ) -> EncoderSteps | None:
-        """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
-
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `beyond` is the name of the condition
-        that certifies the loop, if no friction is proved to suffice with it.
-        """
-        if not any(steps):
-            return None
-        widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
-        published = tuple(friction_max or [None] * len(steps))
-        values = tuple(steps), tuple(friction), published
-        if loop.environment.walls or loop.environment.world or beyond:
-            obstacle = "walls" if loop.environment.walls else "a world" if loop.environment.world else beyond
-            return cls(
-                *values, None, False, f"encoder steps of {widths} um: with {obstacle} no friction is proved to suffice"
-            )
-        needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
-        covered = bool((needed <= np.asarray(friction)).all())
-        amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
-        verdict = "are covered with this object while forces stay below the limits" if covered else "are not covered"
-        if any(most is not None for most in published):
-            bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
-            has = f"at least {has} N (published: at most {bounds} N)"
-        else:
-            has += " N"
-        enough = f"friction of {amounts} N is enough for {widths} um, the axes have {has}"
-        return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
 
 
 def encoder_steps(

@@ -13,7 +13,6 @@ from haptic_loop.design.result import ANY, MAKING, Chosen
 from haptic_loop.design.robustness import Robustness
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun
-from haptic_loop.sim.couplings import EncoderSteps, encoder_steps
 from haptic_loop.sim.passivity_layer import idle
 from haptic_loop.sim.report import (
     PaperRow,
@@ -63,7 +62,6 @@ class RunReport:
     kind: str  # kind of the coupling
     chosen: Chosen = off_table("left out")
     assessment: Assessment
-    encoder: EncoderSteps | None
     stability: Stability
     ringing: Ringing | None
     varying_delay: VaryingDelays | None = off_table()
@@ -108,8 +106,8 @@ class RunReport:
         lines += [f"{name}: {reason}." for name, reason in reasons.items() if reason]
         if self.varying_delay:
             lines.append(f"Delays that vary: {self.varying_delay.certified.covers}.")
-        if self.encoder:
-            lines.append(f"{self.encoder.words[0].upper()}{self.encoder.words[1:]}.")
+        if encoder := self.assessment.encoder:
+            lines.append(f"{encoder.words[0].upper()}{encoder.words[1:]}.")
         return lines
 
 
@@ -140,7 +138,6 @@ def run_report(
         kind=chosen.kind,
         chosen=chosen,
         assessment=assessment,
-        encoder=encoder_steps(scenario, case, assessment),
         stability=stability,
         ringing=None if grows is not None else ringing(simulation),
         varying_delay=delays,

@@ -1,5 +1,7 @@
 """Tests of the Coulomb friction that covers encoder steps: its bound W, and the energy of quantised loops."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,24 +11,28 @@ from asked import this_environment
 from msgspec.structs import replace as change
 from worlds import FIGURE_4
 
+from haptic_loop.cli.audit import main as audit_command
 from haptic_loop.cli.bridge import main as bridge_command
 from haptic_loop.cli.compare import main as compare_command
 from haptic_loop.cli.design import main as design_command
+from haptic_loop.cli.run import main as run_command
 from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.cli.verdict import verdict
 from haptic_loop.cli.zwidth import main as zwidth_command
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.controller.delay import delay
+from haptic_loop.controller.delay import VaryingDelay, delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
-from haptic_loop.design.assessment import assess
+from haptic_loop.design.assessment import EncoderSteps, assess
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
 from haptic_loop.sim import scenario as scenario_module
-from haptic_loop.sim.couplings import EncoderSteps, encoder_steps
+from haptic_loop.sim.api import simulate
+from haptic_loop.sim.couplings import encoder_steps
 from haptic_loop.sim.scenario import load
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
+SOFT = SpringDamper([300.0, 300.0], [1.0, 1.0])
 F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
 
 
@@ -80,7 +86,7 @@ def test_steps_are_covered_with_one_object_only():
     """The friction needed depends on F of the nominal environment; the guarantee covers every passive environment."""
     coupling = SpringDamper([879.0, 552.0], [0.39, 0.52])
     covered = EncoderSteps.of(LOOP, coupling, [STEP, STEP], [0.26, 0.26])
-    words = verdict(assess(LOOP, coupling), encoder=covered)
+    words = verdict(replace(assess(LOOP, coupling), encoder=covered))
     assert "any passive object" in words
     assert "covered with this object only, while forces stay below their limits" in words
 
@@ -108,30 +114,85 @@ def test_friction_is_compared_in_the_running_environment():
     assert running.friction_needed == pytest.approx(needed, rel=1e-8)
 
 
+_LOST = "varying_delay = { lo = [1, 2], hi = [2, 3], loss = 0.2 }"
+_EXACT = "Guarantees are for exact positions"
+_SHORT = ["--duration", "0.05", "--no-plot"]
+
+
+def _first_line(command, scenario, options, tmp_path, capsys):
+    """Return (exit code, first line, JSON) of a command with a changed omega-pair."""
+    lines = {"lost": _LOST, "steps": "", "friction": ""}[scenario]
+    device = {"lost": "", "steps": "encoder_step = 2e-4\n", "friction": "encoder_step = 2e-4\nfriction = 2.0\n"}
+    source = (Path(scenario_module.__file__).parent / "scenarios" / "omega-pair.toml").read_text()
+    source = source.replace("force_limit = 12.0", f"{device[scenario]}force_limit = 12.0")
+    file, record = tmp_path / "s.toml", tmp_path / "report.json"
+    file.write_text(source.replace("[[device]]", f"{lines}\n[[device]]", 1))
+    code = command(["--scenario", str(file), "--json", str(record), *options])
+    return code, capsys.readouterr().out.splitlines()[0], json.loads(record.read_text())
+
+
+_COMMANDS = {
+    "run": (run_command, [*_SHORT, "--out", "out"]),
+    "audit": (audit_command, ["--K", "300", "--B", "1"]),
+    "design": (design_command, ["--out", "c.json"]),
+    "validate": (validate_command, ["--humans", "2", "--duration", "0", "--no-plot", "--out", "out"]),
+    "compare": (compare_command, ["--coupling", "spring-damper", "--no-plot", "--out", "out"]),
+}
+
+
 @pytest.mark.parametrize(
-    "run",
-    [
-        lambda out: design_command(["--delta", "1.37,1.37", "--out", f"{out}/c.json", "--scenario", f"{out}/s.toml"]),
-        lambda out: validate_command(
-            ["--humans", "2", "--duration", "0", "--no-plot", "--out", f"{out}/v", "--scenario", f"{out}/s.toml"]
-        ),
-        lambda out: bridge_command(["--rehearse", "--duration", "0.2", "--no-plot", "--out", f"{out}/b"]),
-        lambda out: compare_command(
-            ["--coupling", "none", "--no-plot", "--out", f"{out}/c", "--scenario", f"{out}/s.toml"]
-        ),
-        lambda out: zwidth_command(
-            ["--grid=4", "--points=0", "--humans=1", "--no-plot", "--out", f"{out}/z", "--scenario", f"{out}/s.toml"]
-        ),
-    ],
-    ids=["design", "validate", "bridge", "compare", "zwidth"],
+    ("name", "scenario"),
+    # sim.validate refuses friction.
+    [(name, s) for name in _COMMANDS for s in ("lost", "steps", "friction") if (name, s) != ("validate", "friction")],
 )
-def test_commands_say_that_steps_are_not_covered(run, tmp_path, capsys):
-    """A session's device always counts encoder steps, so bridge says so without a scenario that declares them."""
+def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, monkeypatch, capsys):
+    command, options = _COMMANDS[name]
+    monkeypatch.chdir(tmp_path)
+    code, line, record = _first_line(command, scenario, options, tmp_path, capsys)
+    if command is compare_command:
+        said = {"lost": "spring-damper (none)", "steps": _EXACT, "friction": _EXACT}
+        (coupling,) = record["couplings"]
+        assessment = coupling["assessment"]
+    else:
+        said = {
+            "lost": "Not certified: a lost packet makes a force older than the range of delays.",
+            "steps": "Not covered: the encoder steps of the devices.",
+            "friction": "Encoder steps are covered with this object only, while forces stay below their limits.",
+        }
+        assessment = record["assessment"]
+    assert said[scenario] in line
+    assert (assessment["guarantee"] is None) == (scenario == "lost")
+    if scenario != "lost":
+        assert assessment["encoder"]["covered"] == (scenario == "friction")
+    if command in (audit_command, design_command):
+        assert code == (scenario == "lost")
+    if command is design_command and scenario == "lost":
+        assert record["stored"]["switching"]["guarantee"] is None
+
+
+def test_traces_state_the_qualified_guarantee():
+    scenario = load("omega-pair").replace(duration=0.05)
+    lossy = scenario.replace(varying_delay=VaryingDelay(lo=(1, 2), hi=(2, 3), pattern="random", loss=0.2))
+    assert simulate(lossy, SOFT).meta["assessment"]["guarantee"] is None
+    for friction, words in (0.0, "are not covered"), (2.0, "are covered with this object while forces stay below"):
+        devices = tuple(change(d, encoder_step=2e-4, friction=friction) for d in scenario.device)
+        meta = simulate(scenario.replace(device=devices), SOFT).meta
+        assert meta["assessment"]["guarantee"]
+        assert any(f"encoder steps {words}" in remark for remark in meta["remarks"])
+
+
+def test_sessions_count_the_steps_of_the_device(tmp_path, capsys):
+    """A session's device always counts encoder steps, also if the scenario declares none."""
+    bridge_command(["--rehearse", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)])
+    assert "Not covered: the encoder steps" in " ".join(capsys.readouterr().out.split())
+
+
+def test_maps_say_their_guarantees_are_for_exact_positions(tmp_path, capsys):
     source = (Path(scenario_module.__file__).parent / "scenarios" / "omega-pair.toml").read_text()
     (tmp_path / "s.toml").write_text(source.replace("force_limit = 12.0", "encoder_step = 1e-5\nforce_limit = 12.0"))
-    run(tmp_path)
-    words = " ".join(capsys.readouterr().out.split())
-    assert "Not covered: the encoder steps" in words or "Guarantees are for exact positions" in words
+    options = ["--grid=4", "--points=0", "--humans=1", "--no-plot"]
+    zwidth_command([*options, "--out", str(tmp_path), "--scenario", str(tmp_path / "s.toml")])
+    assert "Guarantees are for exact positions" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_l1_gain_is_a_close_upper_bound():
