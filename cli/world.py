@@ -60,7 +60,7 @@ class _Report:
     peak_force_N: list[float] | None = None
     hands: int = 0
     worst_excess_J: float | None = None
-    interrupted: bool | None = off_table("if given", None)  # of a run
+    interrupted: bool | None = off_table("if given", None)  # whether Ctrl-C ended a run
     wall_s: float = 0.0
 
 

@@ -477,7 +477,7 @@ class Armable(Protocol):
     @property
     def link(self) -> int: ...  # ticks from a sample to the latch of its force
     @property
-    def certified(self) -> bool: ...  # whether it is certified for every passive human
+    def certified(self) -> bool: ...  # whether the program is certified for every passive human
     @property
     def name(self) -> str: ...  # name in the log
     @property

@@ -23,7 +23,7 @@ from haptic_loop.sim.scenario import InputError, Scenario
 FORCE_DIMENSION = "force-dimension"  # value of --port for these devices
 _PACKAGE = "forcedimension_core"
 _SATURATED = 2  # setForce returns this code when the motors cannot give the force
-_WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new one comes within this time
+_WATCHDOG = 160  # [125 us] 20 ms: a device with a watchdog drops a force if no new force comes in this time
 _SPIN = 2e-4  # [s] last part of a wait, in which the host does not sleep, because a sleep ends late
 _SHORTEST = 0.75  # after a late tick, the next tick comes no earlier than this share of T
 

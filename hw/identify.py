@@ -162,7 +162,7 @@ class Estimate:
     """The estimated friction and transmission of one axis, and how its damping varies."""
 
     friction: Friction
-    transmission: _Transmission | None  # None for a rigid device, or if none explains the record
+    transmission: _Transmission | None  # None for a rigid device, or if no transmission explains the record
     viscosity: Viscosity
 
     @property

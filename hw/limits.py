@@ -34,7 +34,7 @@ _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the
 _COARSEST = 0.1  # coarsest encoder step, as a share of the displacement `jump` that a hand can make in a tick
 _LARGEST_MARGIN_US = 30_000  # longest time from a FORCE to its latch in a measurement; an i16 carries 32767 us
 _ROUNDED = 1e-12  # largest relative rounding error of the length of a limited vector
-_HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last one; its ramp to zero [us]
+_HOLD, _RAMP_US = 4, 5000  # ticks for which a device without new forces holds the last force; then a ramp [us]
 
 
 class Stage(StrEnum):

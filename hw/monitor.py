@@ -51,7 +51,7 @@ _ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m
 _PUSHED = 0.5  # share of the strongest test force below which the energy budget is blamed for a missing answer
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
 _ZONE = 0.8  # least ratio of a motion's relative size to that under twice the force; 1 without a dead zone
-_CLEAN, _RUBBED = 0.15, 0.25  # largest one-sided share of this motion; largest friction per force under twice its force
+_CLEAN, _RUBBED = 0.15, 0.25  # for _ZONE: largest one-sided share, largest friction as a share of the force
 _BETTER = 8.0  # least ratio of squares that a one-sided fault explains to the rest; friction and weight reach 6
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
@@ -65,7 +65,7 @@ _FORGETTING = 8  # right ticks that cancel one wrong tick; a session also stops 
 class LinkSettings:
     """Settings by which a session judges its link and arms."""
 
-    baud: int | None = None  # baud rate of a UART; None for a link without one (USB, pseudo-terminal)
+    baud: int | None = None  # baud rate of a UART; None for a link without UART (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
     window: int = 200  # ticks over which misses are judged
     late: float = 0.1  # largest share of late answers; above it the link is slower than the coupling is certified for
@@ -295,7 +295,7 @@ class LinkMonitor:
     def restart(self) -> None:
         """Clear the window after a new delay was configured."""
         self.last: State | None = None
-        self.margin: int | None = None  # [us] margin in the last new STATE; None: it reports none
+        self.margin: int | None = None  # [us] margin in the last new STATE; None if that STATE has no margin
         self.missed = 0  # missed ticks that the last new STATE reports
         self._window: deque[_Tick] = deque()
         self._late = self._missed = self._untold = self._gaps = 0  # sums over the window, updated tick by tick
