@@ -73,7 +73,7 @@ _DEVICE = {
     "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
-    "cross": ("share of motor 1's force that motor 2 adds to its own", -1.0, 1.0, 1.0),
+    "cross": ("share of motor 1's force that motor 2 adds to its own force", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: faults of one axis of the device: kind -> (meaning, minimum, maximum and default of VALUE)

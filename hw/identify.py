@@ -274,7 +274,7 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
 
 
 def unbounded(estimates: Sequence[Estimate]) -> str:
-    """Return why the first axis without a bound has none, or "" if all have one."""
+    """Return why the first axis without a bound has no bound, or "" if all axes have bounds."""
     for i, e in enumerate(estimates, start=1):
         if e.delta <= 0:
             return (

@@ -753,7 +753,7 @@ class EncoderTest:
                 raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
             return False
         if not weak and best.explains and sided - unsure > most_uneven:
-            what = "its encoder loses counts in one" if blamed else "its motor is weak in one"
+            what = "its encoder loses counts in one direction" if blamed else "its motor is weak in one direction"
             raise SafetyStop(f"{name} moves much farther in one direction than in the other: {what}")
         if held and (abs(size[axis]) < max(least, 1 / _TEST_RATIO) or (doubt < _LATE and late > most)):
             return False

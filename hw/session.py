@@ -116,7 +116,7 @@ class Session:
         self._enter(Stage.CONNECTING, "HELLO")
 
     def load(self, programs: Sequence[Armable], now: int) -> Said:
-        """Take the couplings for the measured delay, sorted by delay, and configure the device for the first one."""
+        """Take couplings for the measured delay, sorted by delay, and configure the device for the first coupling."""
         self.now = now
         if self.stage != Stage.MEASURED:
             return ()
@@ -187,7 +187,7 @@ class Session:
         self._enter(Stage.STOPPED, f"{self.cause}, but {doubt}")
 
     def estop(self, cause: str, now: int) -> Said:
-        """Latch zero force on both sides at once, also after the session has ended."""
+        """Latch zero force in host and device at once, also after the session has ended."""
         self.now = now
         if self.stage == Stage.ESTOP:
             return ()
@@ -332,7 +332,7 @@ class Session:
     def _answer(
         self, state: wire.State, command: wire.Command, steps: tuple[int, ...] = (), theta: int | None = None
     ) -> Said:
-        """Return the FORCE that answers a STATE. By default it is zero, and its delay the configured one."""
+        """Return the FORCE that answers a STATE. By default the force is zero, with the configured delay."""
         assert self.config
         apply_at = (state.tick + (self.config.theta if theta is None else theta)) & 0xFFFF
         return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)

@@ -228,7 +228,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
 
 
 def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
-    """Return the ages [us] of all answers, skipped ones (`AnswerAges`) too; `dues` has a delay [ticks] per arming."""
+    """Return the ages [us] of answers and skipped answers (`AnswerAges`); `dues` has a delay [ticks] per arming."""
     ages: list[int] = []
     for i, due in enumerate(dues):
         rows = link["arming"] == i
