@@ -110,7 +110,7 @@ def _check(args: argparse.Namespace, scenario: Scenario, at_once: bool, several_
     counted = ("--latch arrival", args.latch == "arrival"), ("a world", is_world(scenario))
     for feature, present in (*counted, ("--energy-budget", args.energy_budget)):
         if several_boards and present:
-            by_one = f"{feature} counts forces by one clock, but each board has its own"
+            by_one = f"{feature} counts forces by one clock, but each board has its own clock"
             raise InputError(f"--port is {args.port}: {by_one}")
 
 

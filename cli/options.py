@@ -337,7 +337,7 @@ def _energy_budget(text: str) -> tuple[float, float]:
 
 
 def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
-    """Parse '1,2' as one range [samples] for all channels, '1-2,0-3' as one for each channel or device."""
+    """Parse '1,2' as one range [samples] for all channels, '1-2,0-3' as one range for each channel or device."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
         parts = [(parts[0][0], parts[1][0])]
@@ -351,7 +351,7 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
-    """Parse '130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range [s]; one for all devices or one for each."""
+    """Parse '130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range [s]; one range for all devices or one for each."""
     parts = _parts(text, float, expected := "S or LO:HI in seconds, one for all or one per device", ":")
     if any(len(part) > 2 for part in parts):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")

@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
     verdict = f"All {report.ticks} ticks give the recorded forces, bit by bit."
     if not compared.identical:
         verdict = (
-            f"Not identical: forces of {int(different.sum())} of {report.ticks} ticks differ from the recorded ones."
+            f"Not identical: forces of {int(different.sum())} of {report.ticks} ticks differ from the recorded forces."
         )
     render.publish(args, report, [render.facts(args.trace, render.rows_of(report))], verdict=verdict)
     return options.exit_code(compared.identical)

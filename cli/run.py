@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    """Simulate and report. Return 0 for a completed run, stable or not, and 130 for an interrupted one."""
+    """Simulate and report. Return 0 for a completed run, stable or not, and 130 for an interrupted run."""
     args = _parser().parse_args(argv)
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError(

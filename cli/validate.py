@@ -88,7 +88,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.validate",
-        "Test a loop with random passive humans in both engines, and search for the worst one.",
+        "Test a loop with random passive humans in both engines, and search for the worst human.",
         "python -m sim.validate --humans 200 --adversary",
         "python -m sim.validate --coupling none --humans 200 --duration 0",
         first="scenario coupling condition humans adversary json",
