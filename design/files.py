@@ -326,7 +326,7 @@ def remove(path: Path) -> None:
 
 
 def _spare(path: Path) -> None:
-    """Raise InputError if a file was read, or written and named by an option."""
+    """Record that a file is replaced or removed. Raises InputError if it was read, or if it is an option's output."""
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):

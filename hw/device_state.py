@@ -22,7 +22,7 @@ class Device:
         self.info = info
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
-        self.unexpected = 0  # well-formed frames that this device cannot use
+        self.unexpected = 0  # well-formed frames of a wrong type, number of axes or command; they count as errors
         self.deadman = False  # whether a hand holds the deadman; set by the caller if the device has one
         self.phase, self.cause = wire.Phase.SILENT, wire.Cause.NONE
         self.config: wire.Config | None = None
@@ -33,10 +33,11 @@ class Device:
         self.misses = 0
 
     def clear(self) -> None:
-        """Forget every force."""
+        """Apply zero force, and forget all forces that wait."""
         self.slots: list[wire.Force | None] = [None] * _SLOTS
         self.applied = self.ramp_from = self.zero
         self.held = self.ramp_left = self.run = 0
+        # the source tick of the last FORCE, and how long [us] before its latch it came
         self.echo, self.margin = 0, wire.NO_MARGIN
 
     @property
@@ -47,7 +48,8 @@ class Device:
         """Begin a period: return the forces that act from now on, and the bytes to send. `counts` was just sampled."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
         at_once = self.config is not None and not self.config.theta
-        slot = (self.k - at_once) % _SLOTS  # with theta = 0, a force of the last tick was latched when it came
+        # With theta = 0, an empty slot of the last tick means that its force did not come.
+        slot = (self.k - at_once) % _SLOTS
         frame, self.slots[slot] = self.slots[slot], None
         if self.phase in (wire.Phase.DISARMED, wire.Phase.ARMED, wire.Phase.HOLDING):
             self.misses += frame is None

@@ -128,8 +128,8 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
     """Build one scene of devices, each held by its human. `persons` hold several devices.
 
     Raises:
-        ValueError: There is not one human with the same axes for each device, or a person holds a device that does not
-            exist or that another person holds.
+        ValueError: There are more or fewer humans than devices, a human has other axes than the device, or a person
+            holds a device that does not exist or that another person holds.
     """
     held = tuple((person.holds, person.port()) for person in persons)
     return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
@@ -629,7 +629,7 @@ def _motors(model: mujoco.MjModel) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Sets of humans, one per device, all with the same number of links and without voluntary motion.
+    """Sets of humans without voluntary motion, all with the same number of links; a set has one human per device.
 
     `holds` lists the devices of each person with several devices, and `bodies` the bodies and cross springs of these
     persons. A link with three numbers is the same in every direction. On a device with several axes a link may have a
@@ -640,7 +640,7 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes; () if links have three numbers, else 1 + 2 axes^2
+    axes: tuple[int, ...] = ()  # (devices,) of free axes if links have 1 + 2 max(axes)^2 numbers; () if they have three
     mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:
@@ -773,7 +773,7 @@ def _draw_bodies(population: Population, persons: int, seed: int, index: int) ->
 
 @dataclass(frozen=True, eq=False)
 class HumanSets:
-    """Sets of any humans, one per device, that differ in their parameters only. All sets have the same persons."""
+    """Sets of any humans, with one human per device. The sets differ in parameters only, and have the same persons."""
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, devices)
     people: tuple[Person, ...] = ()

@@ -64,9 +64,9 @@ def position_error(
         relative, largest = _rms(own - true) / size, float(np.abs(own - true).max())
     if linear == n:
         return PositionError(relative, largest)
-    until = f"the unstable run first clips at t = {linear * simulation.scenario.T:.3f} s"
-    before = f"; the relative rms until then is {relative:.1e}" if relative is not None else ""
-    return PositionError(reason=f"{until}{before}, and growth multiplies any difference")
+    until = f"the unstable run clips from t = {linear * simulation.scenario.T:.3f} s on, and growth multiplies errors"
+    before = f" (relative rms error until then: {relative:.1e})" if relative is not None else ""
+    return PositionError(reason=until + before)
 
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
@@ -223,7 +223,7 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """When a run first leaves the limits of the devices' linear model, its peak forces and speeds, and the limits.
+    """When a run leaves the range of the devices' linear model, with peak forces and speeds, and their limits.
 
     Each list has one entry per channel; the transmission force of a rigid device is None.
     """
@@ -239,8 +239,8 @@ class Credible:
 def credible(simulation: Simulation, trace: Trace) -> Credible:
     """Check whether a run stays within the forces and speeds for which the devices' linear model is credible.
 
-    `until_s` is the first time at which a transmission carries more than `credible_force` or a motor moves faster than
-    `credible_speed`. It is None if neither happens.
+    `until_s` is the first time at which a transmission carries more than `most_credible_force`, or a motor moves faster
+    than `credible_speed`. It is None if neither happens.
     """
     n, devices = simulation.scene.model.nq, simulation.scenario.axis_devices
     forces: list[float | None] = []
@@ -307,7 +307,7 @@ class ForceError:
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
     """Compare the run's forces before clipping with those of Lambda E for the measured displacements.
 
-    With switching delays or a limiter, the forces that the devices received, within their limits, are compared instead.
+    With switching delays, a limiter or a passivity layer, the forces that the devices received are compared instead.
     With walls there is no comparison, because walls have no linear ideal.
     """
     process = simulation.process
@@ -377,8 +377,8 @@ def compare_engines(
     """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
 
     Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
-    constant delays without the layer. With friction, the reference is refined until its error is at most `error`. Every
-    run calls `progress`.
+    constant delays without the layer. With friction, RK4 is refined until the run with half of the reference's substeps
+    has an error of at most `error`. Every run calls `progress`.
 
     Raises InputError if `error` is not positive, if 256 substeps or 60 million evaluations of the dynamics do not
     suffice, or if nothing moves.
@@ -412,11 +412,14 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     right = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if right:
         return min(right, key=lambda choice: choice.cost)
-    best = min(choices, key=lambda choice: choice.position_relative_rms)
-    raise InputError(
-        f"--error {error:g}: the nearest setting, {best.name}, has error "
-        f"{best.position_relative_rms:.1g} or a wrong verdict"
+    able = [choice for choice in choices if choice.verdict_correct]
+    if not able:
+        raise InputError(f"--error {error:g}: no setting has the right verdict")
+    best = min(able, key=lambda choice: choice.position_relative_rms)
+    nearest = (
+        f"the most accurate setting with the right verdict, {best.name}, has error {best.position_relative_rms:.1g}"
     )
+    raise InputError(f"--error {error:g}: {nearest}")
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ that are fed back. A step lasts h seconds.
                   scenes at any stiffness and h
     RK4, ..       MuJoCo's own integrators; sim.accuracy compares numbers of steps per period
 
-The exponential and the exact engine use the same J. Comparing them checks MuJoCo's forces and the assembly of the
-scene, but not the time stepping. A comparison with RK4 checks the time stepping.
+The exponential and the exact engine use the same J, read from the compiled model. Comparing them checks the plant's
+matrices against MuJoCo's forces, but neither the model's parameters nor the time stepping. A comparison with RK4 checks
+the time stepping.
 
 MuJoCo has no body for a hand's impedance (A, B, C, D). The exponential step includes the impedance and stays exact.
 MuJoCo's own integrators step between two exact half steps, in which impedance and masses interact while the positions
@@ -50,9 +51,9 @@ if TYPE_CHECKING:
     import mujoco
 
 
-_MOST_MAPS = 256  # largest number of held plants, and of kinds of ticks, that an engine caches
-#: least number of calls of mj_forward in a tick for which MuJoCo's threads save more than they cost: 36 calls take
-#: 0.13 ms in one thread and 0.23 ms of computing time in two
+_MOST_MAPS = 256  # largest number of held plants, and of (period, latch times), that an engine caches
+#: A batch with fewer calls of mj_forward in a tick uses one thread. For example, 36 calls take 0.13 ms of CPU time in
+#: one thread, and 0.23 ms in two.
 _CALLS_FOR_THREADS = 128
 
 
@@ -187,7 +188,7 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad] and largest decay per step of a plant that RK4 resolves
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad] and decay (rate times step) in a step that RK4 resolves
 
 
 def least_substeps(integrator: str) -> int:
@@ -213,8 +214,8 @@ class _Access:
     """Arrays and functions of MuJoCo that a tick reads, writes and calls.
 
     Arrays are (n,) for one simulation and (n, nsim) for many. `ticks` returns closures, because attribute lookups would
-    take longer than the step. An engine that stored its own bound method would form a reference cycle, which would keep
-    a batch's memory allocated.
+    take longer than the step. They refer to this object and not to the engine, because a reference to the engine would
+    form a cycle, which would keep a batch's memory allocated.
     """
 
     T: float  # [s]
@@ -226,15 +227,15 @@ class _Access:
     forward: Callable[[], object]
     step: Callable[[int], object]  # makes a number of steps
     pace: Callable[[float], object]  # sets the length of a step [s]
-    move: Callable[[float], Product] | None  # seconds -> exponential step from [state; qacc] to the next state
-    kick: Callable[[float], Product] | None  # seconds -> step of the impedances alone, from state to state
+    move: Callable[[float], Product] | None  # seconds -> exponential step from [s; qacc] to s+
+    kick: Callable[[float], Product] | None  # seconds -> step of the impedances alone, from s to s
 
     def put(self, buffer: StepBuffer, k: int) -> None:
         """Put the plant into the state of row k."""
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
 
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
-        """Return a function that advances the plant from its present state through tick k of the buffer."""
+        """Return a function of k that advances the plant by one tick, with the inputs of row k of the buffer."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
         states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])

@@ -1,4 +1,4 @@
-"""Check the paper's Theorem 4 (docs/theory.md) for a given coupling by a feasibility problem with a signed margin.
+"""Check the paper's Theorem 4, (c) in docs/theory.md, for a given coupling by a feasibility problem with a margin.
 
 Numbers in parentheses are the paper's equations.
 """
@@ -26,7 +26,10 @@ from haptic_loop.design.lmi import (
 
 
 def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
-    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T. The eigenvalues of E V stay the same."""
+    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T.
+
+    E V keeps its eigenvalues if E is scaled by `unit_environment`.
+    """
     root = np.sqrt(np.asarray(delta))
     return Lti(V.A, V.B * root, root[:, None] / V.T * V.C, root[:, None] / V.T * V.D * root, 1.0)
 
@@ -45,7 +48,8 @@ def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
     """Return V-hat without its zero at z = 1, with the paper's two outputs; V(1) must be symmetric.
 
     With H = V - Theta-hat the outputs are y1 = H u and y2 = H(1)/2 u - (H - H(1))/(z - 1) u. V-hat is output strictly
-    passive with level Delta iff He y2/u >= (y1/u)* Delta (y1/u). The result has one state per channel fewer than (16).
+    passive with level Delta iff He G2 >= G1* Delta G1 for the transfer matrices G1, G2 from u to y1, y2. The result has
+    m states fewer than (16), one per channel.
     """
     H = V - theta_hat(theta)
     R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
@@ -61,9 +65,11 @@ def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
 class Analysis:
     """The result of `analysis`, in units T = 1, Delta_D = I; matrices are None if V was refused without an LMI."""
 
-    margin: float  # > 0: Theorem 4 holds with this room in every inequality; < 0: it does not; -inf: V was refused
-    Phi: Array | None = None  # (N, N) shortage of passivity of E-hat
-    Delta_V: Array | None = None  # (N, N) excess of passivity of V-hat
+    margin: (
+        float  # > 0: Theorem 4 holds with this margin in (14), Delta_V and V-hat; < 0: it does not; -inf: V was refused
+    )
+    Phi: Array | None = None  # (m, m) shortage of passivity of E-hat
+    Delta_V: Array | None = None  # (m, m) excess of passivity of V-hat
     P_E: Array | None = None  # storage of E-hat's regular part, in balanced coordinates
     P_V: Array | None = None  # storage of V-hat, in balanced coordinates
     reason: str | None = None

@@ -1,10 +1,10 @@
-"""PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure a tick of the host, beside the bare loop.
+"""PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure the CPU time of a tick of the host.
 
-A whole tick is a tick of the bridge's loop at full gain over a pseudo-terminal: from the waiting STATE, through every
-check and record, to the written FORCE and the next wait. A bare tick decodes a STATE, steps the controller, and encodes
-a FORCE. Blocks of 200 whole and 200 bare ticks alternate. Times are CPU times of this thread with its system calls; the
-time of writing is also printed. The emulated device ticks while the host waits, and so leaves caches as cold as another
-process would.
+A whole tick is one pass of the armed bridge's loop over a pseudo-terminal. It begins when a STATE can be read, and ends
+at the next wait, after all checks and records and after writing FORCE. A bare tick decodes a STATE, steps the
+controller, and encodes a FORCE. Every tick runs the whole loop. Blocks of 200 ticks alternate: in one the whole tick is
+timed, in the next an added bare tick and the writing of FORCE. Times are CPU times of this thread with its system
+calls. The emulated device runs in this thread while the host waits, and leaves the caches as cold as another process.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.checks.faults import _lively
 from tests.pseudo_terminal import Terminal
 
 BLOCK = 200
-PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a kernel thread moves
+PATIENCE = 5.0  # [s] longest wait for bytes to pass the pseudo-terminal; a kernel thread moves them
 
 
 class _Bench(SerialPort):

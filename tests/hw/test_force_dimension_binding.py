@@ -53,16 +53,17 @@ for index, value in ((3, 1), (9, 7), (0, 0), (1, 0), (5, 0), (5, 99)):
         for command, force in ((Command.ARM, (0, 0)), (Command.RUN, (1000, -500))):
             state = device.exchange(Force(command, state.tick, state.tick, force))
         pushed = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
-        stub.stub_status(1, index, value % 99)  # 99: no known cause
+        stub.stub_status(1, index, value % 99)  # 5: forces are off; `value` is the cause, and 99 has no name
         stub.stub_status(1, 14, value if index == 5 else 0)
         try:
             device.exchange(Force(Command.RUN, state.tick, state.tick, (1000, -500)))
             trouble = None
         except SafetyStop as fault:
             trouble = str(fault)
+        at_once = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
         stub.stub_status(1, index, int(index in (0, 1, 5)))
         device.exchange(Force(Command.RUN, state.tick, state.tick, (1000, -500)))
-        said[f"{index}={value}"] = [trouble, pushed, [stub.stub_force(1, 0), stub.stub_force(0, 1)]]
+        said[f"{index}={value}"] = [trouble, pushed, at_once, [stub.stub_force(1, 0), stub.stub_force(0, 1)]]
 said["after"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
 with ForceDimension(load(), "sn4711x,sn4712x", sdk, clock, sleep) as device:
     device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
@@ -103,7 +104,7 @@ def session(tmp_path_factory):
     return json.loads(done.stdout)
 
 
-def test_devices_are_opened_by_serial_number_or_index(session):
+def test_a_device_is_opened_by_serial_number(session):
     assert (session["serial"], session["name"]) == (4712, "omega.3")
 
 
@@ -129,7 +130,7 @@ def test_forces_reach_the_axes_they_are_for(session):
 def test_three_axes_of_a_device_share_a_limit(session):
     assert session["held"] == []
     assert session["space"] == pytest.approx([0.4, -0.2, 0.1, 0.04, 0.08, -0.12])
-    assert session["vectors"] == pytest.approx([2.02, 1.01])  # 1 % above the lengths of 2 and 1 N
+    assert session["vectors"] == pytest.approx([2.02, 1.01])  # 1 % above 2 and 1 N, the caps of the force vectors
 
 
 @pytest.mark.parametrize(
@@ -144,11 +145,11 @@ def test_three_axes_of_a_device_share_a_limit(session):
     ],
 )
 def test_bad_status_removes_every_force_at_once(session, index, words):
-    trouble, pushed, then = session[index]
+    trouble, pushed, *then = session[index]
     assert trouble.startswith(f"device sn4712 {words}")
     assert pushed == pytest.approx([0.4, -0.2])
-    assert then == [0.0, 0.0]  # also at the other device, and at the next tick
+    assert then == [[0.0, 0.0]] * 2  # of both devices, at once and at the next tick
 
 
-def test_no_force_is_left_behind(session):
+def test_closed_devices_have_no_force(session):
     assert session["after"] == [0.0, 0.0]

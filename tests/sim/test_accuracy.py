@@ -96,7 +96,7 @@ def test_a_run_clipping_at_once_has_no_error():
     trace = run(simulation)
     error = position_error(trace, trace, simulation, grows=True)
     assert error.position_relative_rms is None
-    assert error.reason.startswith("the unstable run first clips at t = 0.000 s, and growth")
+    assert error.reason.startswith("the unstable run clips from t = 0.000 s on, and growth")
 
 
 def test_dominant_frequency_is_independent_of_the_start_time():

@@ -368,7 +368,11 @@ def test_gaps_between_runs_bound_the_finest_error():
         (RESTING, 1e-3, "nothing moves: add a tap or a voluntary motion"),
         (RESTING.replace(device=RUBBING.device), 1e-3, "nothing moves: add"),
         (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
-        (SCENARIO, 1e-18, "--error 1e-18: the nearest setting, exponential x 1, has error"),
+        (
+            SCENARIO,
+            1e-18,
+            "--error 1e-18: the most accurate setting with the right verdict, exponential x 1, has error",
+        ),
         (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
     ],
 )

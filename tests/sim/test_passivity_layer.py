@@ -52,7 +52,7 @@ def test_budgets_are_idle_with_damping_to_spare():
 
 
 def limited_and_idle(scenario, coupling, condition):
-    """Return the number of ticks that a budget of 0.1 mJ limits, and the reported reason why it never acts, or None.
+    """Return how many ticks a budget of 0.1 mJ limits, and what `idle` returns for the loop.
 
     `condition` must be met with 95 % of the damping.
     """
@@ -66,7 +66,7 @@ def limited_and_idle(scenario, coupling, condition):
 
 
 def test_budgets_act_on_couplings_for_known_devices():
-    """The budget counts the devices' damping only, known-device-any also their motors: it acts at stiff springs."""
+    """known-device-any also uses the motors' mass, so stiff springs that it certifies are limited by the budget."""
     scenario = load("omega-pair-known")
     ends = scenario.environment.contacts
     network = Network(ends, tuple(Spring((end, "ground"), 1e6) for end in ends))
@@ -155,7 +155,7 @@ def test_budgets_bound_loops_with_walls():
     assert given(simulation, poor) <= 1e-9
 
 
-def test_the_shell_bounds_own_environments():
+def test_the_shell_bounds_a_users_environment():
     """A force along the motion gives at most W0 = 2 mJ through the shell, and far more with a huge W0."""
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
     V, energies = coupling.compliance(SHORT.T), {}

@@ -493,7 +493,7 @@ def test_bad_human_files_are_refused(text, message, tmp_path):
 
 
 def test_impossible_crowds_cannot_be_built():
-    with pytest.raises(ValueError, match="not passive"):
+    with pytest.raises(ValueError, match="negative or infinite entry"):
         Crowd(-np.ones((1, 2, 1, 3)))
     with pytest.raises(ValueError, match="expected \\(sets, devices, links, 3\\)"):
         Crowd(np.ones((2, 3)))
