@@ -143,7 +143,12 @@ _COMMANDS = {
 @pytest.mark.parametrize(
     ("name", "scenario"),
     # sim.validate refuses friction.
-    [(name, s) for name in _COMMANDS for s in ("lost", "steps", "friction") if (name, s) != ("validate", "friction")],
+    [
+        pytest.param(name, s, marks=[pytest.mark.slow] if name in ("run", "compare") else [])
+        for name in _COMMANDS
+        for s in ("lost", "steps", "friction")
+        if (name, s) != ("validate", "friction")
+    ],
 )
 def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, monkeypatch, capsys):
     command, options = _COMMANDS[name]
