@@ -462,11 +462,11 @@ def timed(
     if not at_once:
         return scenario, ages.link_delay(T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
-    if most >= min((T_us, *ages.ticks)):
+    if most >= (least_tick := min((T_us, *ages.ticks))):
         instead = "use a longer T, or a microcontroller with --latch tick"
         raise SafetyStop(
             f"answers come up to {most:.0f} us after their tick, guard included; "
-            f"T = {T_us:g} us and every tick must be longer: {instead}"
+            f"the shortest tick is {least_tick:.0f} us, which must be longer: {instead}"
         )
     return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
 
@@ -587,7 +587,7 @@ def certified_coupling(
     try:
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
-        raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
+        raise SafetyStop(f"no coupling for a link of {link} tick{'s' * (link != 1)}: {error}") from None
     alone = slower.replace(ranges=None) if slower.ranges else slower  # only the nominal environment is rendered
     if is_world(alone):
         assessment = assessed(alone, case, chosen, energy_budget=start, limiter=False)

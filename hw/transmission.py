@@ -135,9 +135,9 @@ def transmission_bounds(
     if most[3] > _LATE * T:
         raise ValueError(f"forces are up to {1e6 * most[3]:.0f} us late, at most {1e6 * _LATE * T:.0f} us are allowed")
     if not (least[0] > 0 and least[2] > 0):
-        shown, lowest = lever**2 * b, lever**2 * least[2]
-        mass = f"motor mass {m1:.3g} kg has the lower bound {least[0]:.2g}"
-        damping = f"transmission damping {shown:.3g} N s/m has the lower bound {lowest:.2g}"
+        shown = lever**2 * np.array([m1, least[0], b, least[2]])
+        mass = f"motor mass {shown[0]:.3g} kg has the lower bound {shown[1]:.2g}"
+        damping = f"transmission damping {shown[2]:.3g} N s/m has the lower bound {shown[3]:.2g}"
         raise ValueError(f"{mass if least[0] <= 0 else damping}, which is not above 0")
     figures = least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0)
     return at_radius(TransmissionBounds(*figures), lever)

@@ -85,7 +85,7 @@ def test_coupled_motors_are_found_at_arming():
 
 def test_a_link_slower_than_a_period_is_refused():
     with pytest.raises(
-        SafetyStop, match="answers come up to 1250 us after their tick, guard included; T = 1200 us and every"
+        SafetyStop, match="answers come up to 1250 us after their tick, guard included; the shortest tick is 1200"
     ):
         timed(LAB, Ages((1150,) * 100), 0.99, 100.0, at_once=True)
 

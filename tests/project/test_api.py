@@ -127,7 +127,7 @@ def test_a_session_that_is_refused_says_why():
 def test_a_rehearsal_at_its_force_limit_is_stopped():
     """A session does not count as finished if more than half of its forces were cut in some second."""
     weak = tuple(replace(device, force_limit=0.03) for device in load().device)
-    session = rehearse(load().replace(T=1e-3, theta=(1, 1), device=weak), seconds=1.5)
+    session = rehearse(load().replace(T=1e-3, theta=(1, 1), device=weak), seconds=2.2)
     assert session.stage == "stopped"
     assert re.search(r"requested, but \d+ % of the forces were cut in a second", session.cause)
 
