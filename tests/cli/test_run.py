@@ -47,7 +47,7 @@ def test_case_none_is_figure_5(tmp_path):
     assert stability["frequency_hz"] == pytest.approx(83.9, abs=0.2)
     assert stability["clipped_ticks"] > 1000
     assert report["error"]["position_relative_rms"] is None
-    assert "first clips" in report["error"]["reason"]
+    assert "clips from" in report["error"]["reason"]
     trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     assert np.abs(trace.f).max() == 12.0
 

@@ -43,7 +43,7 @@ BAD = [
     ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000, allowed are 0 to 1000 kg"),
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
-    ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed are 0 and"),
+    ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed in"),
     ("mass = 1.0 }", "mas = 1.0 }", "masses lists 'mas', which no spring or wall reaches"),
     ("channel = 1", "channel = 3", "tap.channel is 3, allowed are 1 to 2"),
     ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
@@ -354,7 +354,7 @@ def test_too_long_hands_are_refused():
 
 def test_the_stiffest_spring_has_no_stiffer_vertex():
     network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 1e12),))
-    with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed are"):
+    with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed"):
         vertices(network)
     stiffest = load("one-wall").replace(environment=network)
     assert robustness_nearby(stiffest.loop("I"), SpringDamper([2000.0], [2.0])) is None
