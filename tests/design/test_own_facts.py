@@ -215,7 +215,7 @@ def test_accounts_need_an_own_condition_for_any_environment():
     assert anywhere.guarantee.condition == "anything"
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_ranges_are_judged_by_an_own_condition():
     loop = load("omega-pair-ranges").loop("I")
     soft = SpringDamper([200.0] * 2, [0.5] * 2)

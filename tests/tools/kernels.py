@@ -5,7 +5,7 @@ tests must pass with all of them. Two more settings round differently: NumPy wit
 chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
-    python tests/tools/kernels.py --one           one foreign kernel, chosen by the commit (for CI)
+    python tests/tools/kernels.py --one           one foreign kernel, chosen by the commit, without slow tests (for CI)
     python tests/tools/kernels.py --only HASWELL  only this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
@@ -88,12 +88,16 @@ def foreign(every: dict[str, dict[str, str]]) -> str:
     return others[int(commit or "0", 16) % len(others)] if others else "native"
 
 
-def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int, int, float]:
-    """Run the numerical tests under a setting, print failures, and return (passed, failed, skipped, seconds)."""
+def tested(name: str, variables: dict[str, str], workers: int, quick: bool) -> tuple[int, int, int, float]:
+    """Run the numerical tests under a setting, print failures, and return (passed, failed, skipped, seconds).
+
+    `quick` leaves out the slow tests.
+    """
     OUT.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     parallel = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"]
-    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *TESTS]
+    chosen = ["-m", "not slow and not validate and not firmware"] if quick else []
+    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *chosen, *TESTS]
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, **variables}
     path = OUT / f"{name.replace(' ', '-')}.txt"
     with path.open("w") as file:
@@ -117,7 +121,7 @@ def main() -> int:
         os.environ.pop(name, None)  # in the native setting OpenBLAS and NumPy choose, whatever the caller has set
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="SETTING")
-    parser.add_argument("--one", action="store_true", help="one foreign kernel")
+    parser.add_argument("--one", action="store_true", help="one foreign kernel, without slow tests")
     parser.add_argument("--list", action="store_true", help="name the settings, run nothing")
     parser.add_argument("-n", type=int, default=os.cpu_count() or 1, help="tests at a time (default: one per core)")
     args = parser.parse_args()
@@ -128,7 +132,7 @@ def main() -> int:
     if args.list:
         print(*names, sep="\n")
         return 0
-    rows = [(name, *tested(name, every[name], args.n)) for name in names]
+    rows = [(name, *tested(name, every[name], args.n, args.one)) for name in names]
     print(f"\n{'setting':16}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
     for name, passed, failed, skipped, seconds in rows:
         print(f"{name:16}{passed:8}{failed:8}{skipped:9}{seconds:9.0f}")
