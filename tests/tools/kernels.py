@@ -5,7 +5,8 @@ tests must pass with all of them. Two more settings round differently: NumPy wit
 chooses at run time, and OpenBLAS with eight threads instead of one.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
-    python tests/tools/kernels.py --one           one foreign kernel, chosen by the commit, without slow tests (for CI)
+    python tests/tools/kernels.py --one           one foreign kernel, without slow tests (for CI); the commit chooses
+                                                  the kernel, and tests/design or the other folders
     python tests/tools/kernels.py --only HASWELL  only this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
@@ -84,20 +85,26 @@ def foreign(every: dict[str, dict[str, str]]) -> str:
     2008, takes a fifth longer and is left to the run of every setting.
     """
     others = [name for name in every if name in NEEDS and name != "PRESCOTT"]
+    return others[_commit() % len(others)] if others else "native"
+
+
+def _commit() -> int:
+    """Return the hash of the commit as a number, or 0 without a repository."""
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    return others[int(commit or "0", 16) % len(others)] if others else "native"
+    return int(commit or "0", 16)
 
 
 def tested(name: str, variables: dict[str, str], workers: int, quick: bool) -> tuple[int, int, int, float]:
     """Run the numerical tests under a setting, print failures, and return (passed, failed, skipped, seconds).
 
-    `quick` leaves out the slow tests.
+    `quick` leaves out the slow tests, and those of tests/design or of the other folders.
     """
     OUT.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     parallel = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"]
     chosen = ["-m", "not slow and not validate and not firmware"] if quick else []
-    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *chosen, *TESTS]
+    half = [folder for folder in TESTS if (folder == "tests/design") == (_commit() >> 8) % 2]
+    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *chosen, *(half if quick else TESTS)]
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, **variables}
     path = OUT / f"{name.replace(' ', '-')}.txt"
     with path.open("w") as file:
