@@ -49,7 +49,8 @@ def reference_any_environment(loop):
     if BEYOND & set(loop) or any(loop.get("psi", [])):
         return None
     w = np.angle(Z)
-    V = [1 / (1 / 2 + (1 - 1 / Z) / 4) for _ in loop["theta"]]  # V in units of T/delta
+    # the reference coupling's compliance V of each channel, divided by T/delta
+    V = [1 / (1 / 2 + (1 - 1 / Z) / 4) for _ in loop["theta"]]
     shares = [(1 - np.cos((n + 1) * w)) / (2 * ((1 - 1 / Z) * v).real) for n, v in zip(loop["theta"], V, strict=True)]
     return max(map(np.max, shares))
 

@@ -359,7 +359,7 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """Parse the name of a condition, or FILE.py:NAME of the user's own condition."""
+    """Return the text if it names a condition, or a user's own condition as FILE.py:NAME."""
     if text not in CONDITIONS and ":" not in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return text

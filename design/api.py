@@ -89,7 +89,7 @@ def certified_for(loop: Loop, certified: bool) -> str:
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: Quick designs that `instead` tries. `seconds` = 0 limits the optimal coupling to its smallest basis.
+#: the quick designs that `instead` tries; with 0 seconds an optimal coupling has only its smallest basis
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),

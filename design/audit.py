@@ -105,7 +105,7 @@ _NOT_CERTIFIED = "not certified, so there are no margins"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest stiffnesses [N/m] that are certified together, by channel; None, with a reason, if none is known."""
+    """The largest stiffness [N/m] of each channel, all certified together. If none is known, `reason` says why."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)

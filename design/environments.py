@@ -89,7 +89,7 @@ from haptic_loop.design.result import (
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers, and their search. A subclass adds `map` and `block`."""
+    """A condition whose block is affine in its multipliers, which it searches. A subclass adds `map` and `block`."""
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""

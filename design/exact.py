@@ -165,7 +165,7 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A proof that a symmetric rational matrix S is positive definite, at the cost of a few matrix products.
+# These functions prove that a symmetric rational matrix S is positive definite. A proof takes a few matrix products.
 #
 # For any square matrix R, R'SR > 0 implies S > 0: x = R y reaches every x, because R'SR could not be definite with a
 # singular R. R is the inverse of the Cholesky factor of S in floating point, rounded to binary fractions. R'SR is then

@@ -203,7 +203,8 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
     g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # slopes of g: diagonals (2N, k, N)
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
-    scale = 1 / np.abs(g0)  # Columns are divided by |g0|, and W1 L g W2 also by the norm.
+    # Each column is divided by its |g0|. The blocks with W1 L g W2 are also divided by the norm.
+    scale = 1 / np.abs(g0)
     rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
     row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
     tangent = 2 * (np.conj(g0) * g).real * scale**2

@@ -336,11 +336,12 @@ def _rms(values: Array) -> float:
 
 # ---- the cheapest engine and step for a given error
 #
-# The error is the relative rms error of the encoders' positions over the run. Without friction the exact loop is the
-# reference. With friction there is no exact loop: runs of RK4 with n and 2 n substeps are compared, and n is doubled
-# until the difference is small enough. If every doubling multiplies the difference by q, the error of the finest run is
-# q/(1 - q) times the last difference; a method of first order has q = 1/2. One pair of runs may agree by chance, so q
-# is the larger ratio of the last two doublings. It is at least _EVEN, because friction makes the ratio jump.
+# The error is the relative rms error of the encoders' positions over the run. Without friction the reference is a run
+# with the exact engine. With friction that engine cannot run. Then two runs of RK4 are compared, one with n and one
+# with 2 n substeps, and n is doubled until their difference is small enough. If every doubling multiplies the
+# difference by q, the error of the finest run is q/(1 - q) times the last difference; a method of first order has q =
+# 1/2. One pair of runs may agree by chance, so q is the larger ratio of the last two doublings. It is at least _EVEN,
+# because friction makes the ratio jump.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference

@@ -143,9 +143,10 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating. Plant and process start in that human's mode, in which the
-# motor or handle that moves most is displaced by _START; a process with walls or a limiter starts at rest. Each hand
-# presses with a force that starts smoothly and then stays constant. The second half of the trace gives the verdict.
+# whose exact linear loop is nearest to oscillating. Plant and process start in the dominant fast mode of that loop,
+# scaled so that the motor or handle that moves most is displaced by _START. With walls or a limiter only the plant
+# starts in it, and the process at rest. Each hand presses with a force that starts smoothly and then stays constant.
+# The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have

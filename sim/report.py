@@ -62,7 +62,7 @@ class PaperRow:
 
 
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Return the paper's numbers with those computed here; () for any loop but the paper's."""
+    """Return a row for each figure of the paper, beside the figure computed here. Other loops have no rows."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)

@@ -303,7 +303,7 @@ def test_the_exact_test_refuses_alone(monkeypatch):
 
 
 def test_floating_point_refuses_no_definite_matrix():
-    """P - A'PA = (1 - r^2) P is definite, but 1 - r^2 is near the rounding unit: computed in floats it often is not."""
+    """The exact P - A'PA = (1 - r^2) P is definite. Computed in floats it often is not, because 1 - r^2 is tiny."""
     rng, indefinite = np.random.default_rng(7), 0
     for _ in range(60):
         n = int(rng.integers(2, 6))

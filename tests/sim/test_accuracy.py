@@ -18,7 +18,7 @@ from haptic_loop.sim.trace import Trace
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """Return the command's exit code and report; each setting runs once, as no test needs precise wall times."""
+    """Return the exit code and the report of the command. Each setting runs once, because no test needs exact times."""
     place = tmp_path_factory.mktemp("accuracy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yardstick, "_REPEATS", 1)

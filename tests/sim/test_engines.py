@@ -97,7 +97,7 @@ def test_discrete_integrator_loses_the_unstable_mode():
 
 
 def test_batches_equal_single_engines_up_to_rounding(simulation):
-    """A batch of one equals a single engine bit for bit; a batch of three equals it up to rounding."""
+    """A batch of one run equals a single engine bit for bit. A batch of three runs equals three engines to rounding."""
     scenario, scene = simulation.scenario, simulation.scene
     rng = np.random.default_rng(0)
     start = 1e-3 * rng.normal(size=(simulation.plant.A.shape[0], 3))
