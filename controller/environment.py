@@ -348,6 +348,7 @@ class Network(
     world: SceneFile | None = None  # a MuJoCo scene in place of springs, masses, walls and block
     points: dict[str, tuple[str, ...]] = {}  # the nodes of each point's coordinates; ground for a fixed coordinate
     linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model
+    scene_digest: str = ""  # SceneFile.digest of that scene
 
     def __post_init__(self) -> None:
         if self.world:

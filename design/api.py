@@ -10,6 +10,7 @@ from typing import Literal, TypedDict, Unpack
 
 from haptic_loop.controller.arithmetic import one_blas_thread
 from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.arguments import known, of_kind, one_of, shown
@@ -83,10 +84,10 @@ def design_coupling(
     return replace(design, certified_for=certified_for(loop, design.requirement.certified))
 
 
-def certified_for(loop: Loop, certified: bool) -> str:
-    """Return "the linear network of SCENE" if this is the loop's environment and `certified` is True, else ""."""
-    scene = getattr(loop.environment, "linear_model_of", "")
-    return f"the linear network of {scene}" if scene and certified else ""
+def certified_for(loop: Loop, certified: bool) -> Network | None:
+    """Return the loop's environment if it is the linear network of a scene and `certified` is True, else None."""
+    network = loop.environment
+    return network if certified and isinstance(network, Network) and network.linear_model_of else None
 
 
 #: the quick designs that `instead` tries; with 0 seconds an optimal coupling has only its smallest basis

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 
@@ -215,7 +216,7 @@ class Chosen:
         own: The user's own condition (design.conditions.Condition), or None.
         switching: The range of delays [samples] in which the coupling's file proves any switching, or None.
         notes: Remarks on the origin of the coupling, for reports.
-        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
+        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, or None.
     """
 
     coupling: Coupling
@@ -227,7 +228,7 @@ class Chosen:
     own: Any = field(kw_only=True, default=None)
     switching: DelayRange | None = field(kw_only=True, default=None)
     notes: tuple[str, ...] = field(kw_only=True, default=())
-    certified_for: str = field(kw_only=True, default="")
+    certified_for: Network | None = field(kw_only=True, default=None)
 
     @property
     def asked(self) -> Any:
@@ -265,7 +266,7 @@ class Design(Chosen):
         own: The user's own condition (design.conditions.Condition), or None.
         switching: The range of delays [samples] in which any switching is proved, or None.
         notes: Remarks on the origin of the coupling, for reports.
-        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, in words.
+        certified_for: The linear network of a MuJoCo scene for which the coupling is certified, or None.
     """
 
     figure: str

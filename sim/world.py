@@ -21,7 +21,7 @@ import numpy as np
 
 from haptic_loop.controller.budget import START_J, Shell, ShellFigures
 from haptic_loop.controller.coupling import Coupling
-from haptic_loop.controller.environment import Block, Network
+from haptic_loop.controller.environment import Block, Network, SceneFile
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process
 from haptic_loop.design.assessment import Assessment
@@ -98,15 +98,15 @@ class Claim:
     words: str
 
     @classmethod
-    def of(cls, assessment: Assessment, certified_for: str = "") -> Claim:
+    def of(cls, assessment: Assessment, certified_for: Network | None = None) -> Claim:
         """Return the claim of a run in a world, from the assessment of exactly this run.
 
-        Without a guarantee the claim names the linear network that the coupling is `certified_for`, if there is one.
+        Without a guarantee the claim names the linear network that the coupling is `certified_for`, if there is one,
+        and says whether the scene that runs has other contents than the scene of that network.
         """
         guarantee = assessment.guarantee
         if guarantee is None or guarantee.energy_J is None:
-            elsewhere = f" The coupling is certified for {certified_for} only." if certified_for else ""
-            return cls(False, f"No guarantee: {assessment.reason}.{elsewhere}")
+            return cls(False, f"No guarantee: {assessment.reason}.{_elsewhere(assessment, certified_for)}")
         energy = f"W0 = {_energy(guarantee.energy_J)}"
         swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
         return cls(
@@ -114,6 +114,16 @@ class Claim:
             f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
             f"released.{swept}",
         )
+
+
+def _elsewhere(assessment: Assessment, network: Network | None) -> str:
+    """Return a sentence on the linear network for which the coupling is certified, or "" without one."""
+    if network is None:
+        return ""
+    scene = getattr(assessment.environment, "world", None)
+    stale = scene is None or network.scene_digest != scene.digest
+    changed = ", of a scene with other contents than this one: call linearise again" if stale else ""
+    return f" The coupling is certified for the linear network of {network.linear_model_of} only{changed}."
 
 
 def _energy(joules: float) -> str:
@@ -135,15 +145,22 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
     V = coupling.compliance(scenario.T)
     if V is None or not V.D.any():
         raise InputError(f"environment.world needs a coupling: {_no_spring(coupling)}")
-    from haptic_loop.models.world import World, digest_of
+    from haptic_loop.models.world import World
 
     contacts = _contacts_of(scenario.environment)
     try:
-        if digest_of(Path(world.file)) != world.digest:
-            raise ValueError(f"world {world.file} has changed since the scenario was loaded; load it again")
+        _check_unchanged(world)
         return World(world.file, contacts, _springs(V, contacts), scenario.T, world.every, gravity)
     except ValueError as error:
         raise InputError(f"environment: {error}") from None
+
+
+def _check_unchanged(world: SceneFile) -> None:
+    """Raise ValueError if the files of the scene have changed since the scenario was loaded."""
+    from haptic_loop.models.world import digest_of
+
+    if digest_of(Path(world.file)) != world.digest:
+        raise ValueError(f"world {world.file} has changed since the scenario was loaded; load it again")
 
 
 def _no_spring(coupling: Coupling) -> str:
@@ -406,9 +423,10 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
         The network, whose `block` is the linear model.
 
     Raises:
-        InputError: The scene or the pose is invalid, or the model is not a passive environment.
+        InputError: The scene or the pose is invalid, the scene has changed since the scenario was loaded, or the model
+            is not a passive environment.
     """
-    from haptic_loop.models.world import Contact, World
+    from haptic_loop.models.world import Contact, World, digest_of
 
     if isinstance(world, Scenario):
         file = world.environment.world
@@ -419,9 +437,13 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
         path, touched = str(world), [Contact(name) for name in contacts]
     unit = [np.eye(len(contact.along)) for contact in touched]
     try:
+        if isinstance(world, Scenario) and world.environment.world:
+            _check_unchanged(world.environment.world)
+        digest = digest_of(Path(path))
         E = _joined(Lti(*World(path, touched, unit, T).linear(pose), T)).inverse()
         model = f"{Path(path).name} near {_pose_words(pose)}"
-        return Network(tuple(contact.body for contact in touched), block=Block.of(E), linear_model_of=model)
+        contacts = tuple(contact.body for contact in touched)
+        return Network(contacts, block=Block.of(E), linear_model_of=model, scene_digest=digest)
     except ValueError as error:
         raise InputError(f"linearise: {error}") from None
 

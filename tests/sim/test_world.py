@@ -21,7 +21,8 @@ from haptic_loop.design.api import store
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.models import world as world_of
-from haptic_loop.sim.couplings import choose, read_coupling
+from haptic_loop.sim.couplings import assessed, choose, read_coupling
+from haptic_loop.sim.couplings import given as choose_given
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
 from haptic_loop.sim.world import (
@@ -433,6 +434,28 @@ def test_digests_depend_on_contents_not_on_places(tmp_path):
 
 
 # ---- a linear model
+
+
+@pytest.fixture
+def linear_tray(tmp_path):
+    """Return a scenario with a world, and a design that is certified for the linear network of its scene."""
+    loop = scenario(tmp_path, TRAY)
+    linear = loop.replace(environment=linearise(loop))
+    return loop, design_coupling(linear.loop("I"), "spring-damper", "this-environment")
+
+
+@pytest.mark.parametrize("change", [TRAY.replace("0.3", "0.4"), TRAY])
+def test_scenes_that_changed_void_their_linear_network(tmp_path, linear_tray, change):
+    """After a change of the scene the claim names the network as stale, and a loaded scenario is refused."""
+    before, design = linear_tray
+    after = scenario(tmp_path, change)
+    said = Claim.of(assessed(after, "I", choose_given(design), energy_budget=START_J), design.certified_for)
+    assert not said.guaranteed
+    assert "near its initial pose only" in said.words
+    assert ("call linearise again" in said.words) == (change != TRAY)
+    if change != TRAY:
+        with pytest.raises(InputError, match="has changed since the scenario was loaded"):
+            linearise(before)
 
 
 @pytest.mark.slow
