@@ -44,7 +44,7 @@ from haptic_loop.design.exact import (
 )
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
-from haptic_loop.design.result import KNOWN_CONDITIONS, NotProved, Requirement, refusal, switching_guarantee
+from haptic_loop.design.result import NotProved, Requirement, refusal, switching_guarantee
 
 #: allowed error of figures on file: of required damping relative to the largest available one, of the margin relative
 #: to itself; repeated sweeps agree to 1e-9
@@ -281,7 +281,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 
 def covered(loop: Loop, claim: Certificate) -> Iterator[str]:
     """Yield what a certificate covers in words: switching delays, periods, latencies, and devices within bounds."""
-    known = claim.condition in KNOWN_CONDITIONS
+    known = "q_below" in claim.multipliers  # also for a user's condition that is derived from KnownDevice
     if loop.varying_delay:
         yield switching_guarantee(loop.varying_delay)
     if loop.T_max or (known and loop.T_min):
@@ -306,20 +306,25 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
     return verify(Stored(loop, coupling.form(), certificate), condition).proved
 
 
-def condition_of(certificate: Certificate, own: Condition | None = None) -> Condition:
-    """Return the condition that a certificate proves. Raises ValueError for an unknown name or wrong multipliers."""
-    base = named(own or certificate.condition)
-    limits = isinstance(base, LimitedForces)
+def condition_of(certificate: Certificate, condition: Condition | None = None) -> Condition:
+    """Return the condition that a certificate proves. Raises ValueError for an unknown name or wrong multipliers.
+
+    A certificate of a user's own condition needs this `condition`.
+    """
+    base = named(condition or certificate.condition)
     if not certificate.limiter:
         return base
-    if not (limits or base.extensible or base is KNOWN_DEVICE):
+    own = base.limiter if isinstance(base, LimitedKnownDevice) else base if isinstance(base, LimitedForces) else None
+    if not (own or base.extensible or base is KNOWN_DEVICE):
         raise ValueError(f"facts: the file lists the limiter, but {certificate.condition} covers no limited forces")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(
             f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected c to have equally many per rho"
         )
-    limiter = replace(base if limits else LIMITER, lags=len(c) // len(rho), held=rho)
+    limiter = replace(own or LIMITER, lags=len(c) // len(rho), held=rho)
+    if isinstance(base, LimitedKnownDevice):
+        return base.behind(limiter)
     return LimitedKnownDevice(limiter) if base is KNOWN_DEVICE else limiter
 
 

@@ -877,9 +877,18 @@ class LimitedKnownDevice(KnownDevice):
     def __init__(self, limiter: LimitedForces = LIMITER) -> None:
         self.plain = self.limiter = limiter
 
+    def behind(self, limiter: LimitedForces) -> LimitedKnownDevice:
+        """Return the same condition, or the same user's subclass, with another limiter."""
+        other = copy(self)
+        other.plain = other.limiter = limiter
+        return other
+
     @property
     def base(self) -> str:
-        return KnownDevice.name
+        return KnownDevice.name if self.name == LimitedKnownDevice.name else self.name
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return self.limiter.lag(loop)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
         return self.limiter.parameters(loop)

@@ -15,12 +15,12 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import constant_like, numbers
 from haptic_loop.design.assessment import BELOW_LIMITS, assess
-from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.certificate import covered, prove, required_damping, verify
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import Stored, save, sealed
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, LimitedForces, SwitchingDelays, ThisEnvironment
 from haptic_loop.design.facts import Fact, Switching, Unknowns
-from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice, LimitedKnownDevice
 from haptic_loop.design.result import ANY, HERE, RANGES
 from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.couplings import encoder_steps
@@ -81,6 +81,14 @@ def test_an_own_fact_adds_its_damping(base, shipped, fact):
     own, plain = required_damping(PAIR, SOFT, condition(base, fact)), required_damping(PAIR, SOFT, shipped)
     assert own.condition == "own"
     assert own.required == pytest.approx([d + fact.less * PAIR.T for d in plain.required], rel=1e-8)
+
+
+def test_files_name_the_bounds_of_own_known_devices():
+    """Theorem B bounds the period from below, too, so that a certificate names T_min and the devices' bounds."""
+    loop = change(KNOWN, T_max=1.2e-3, T_min=0.8e-3)
+    own = [*covered(loop, prove(loop, SOFT, condition(KnownDevice, Less(0.0))))]
+    assert own == [*covered(loop, prove(loop, SOFT, KNOWN_DEVICE))]
+    assert "from 0.8 to 1.2 ms" in own[0]
 
 
 @pytest.mark.parametrize("fact", FACTS)
@@ -237,14 +245,19 @@ def test_certify_refuses_switching_for_an_own_condition():
     assert "varying_delay" in str(certify(loop, SOFT, Twenty())["twenty"].reason)
 
 
-def test_an_own_limiter_counts_if_its_block_is_proved():
-    own = condition(LimitedForces, Less(0.0))
-    assessment = assess(PAIR, SOFT, condition=own, force_limit=(12.0, 12.0))
-    assert assessment.force_limits.rho == LIMITER.rho(PAIR)
-    assert assessment.force_limits.words.startswith("proved, also while forces are limited")
-    assert assessment.decisive.ratio == pytest.approx(required_damping(PAIR, SOFT, LIMITER).ratio, rel=1e-6)
-    certificate = prove(PAIR, SOFT, own)
+@pytest.mark.parametrize(
+    ("loop", "base", "shipped"),
+    [(PAIR, LimitedForces, LIMITER), (KNOWN, LimitedKnownDevice, LimitedKnownDevice())],
+    ids=["plain", "known-device"],
+)
+def test_an_own_limiter_counts_if_its_block_is_proved(loop, base, shipped):
+    own = condition(base, Less(0.0))
+    assessment = assess(loop, SOFT, condition=own, force_limit=(12.0, 12.0))
+    assert assessment.force_limits.rho == LIMITER.rho(loop)
+    assert assessment.force_limits.proved
+    assert assessment.decisive.ratio == pytest.approx(required_damping(loop, SOFT, shipped).ratio, rel=1e-6)
+    certificate = prove(loop, SOFT, own)
     assert (certificate.condition, certificate.facts) == ("own", ("limiter",))
-    assert verify(Stored.of(PAIR, SOFT, certificate), own).proved
+    assert verify(Stored.of(loop, SOFT, certificate), own).proved
     rho = certificate.multipliers | {"rho": tuple(2 * r for r in certificate.multipliers["rho"])}
-    assert not verify(Stored.of(PAIR, SOFT, sealed(change(certificate, multipliers=rho))), own).proved
+    assert not verify(Stored.of(loop, SOFT, sealed(change(certificate, multipliers=rho))), own).proved
