@@ -244,6 +244,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             ranges_seed=args.seed,
             searched=design.searched,
             limiter=args.limiter,
+            limiter_c=design.c,
             force_limit=tuple(device.force_limit for device in scenario.axis_devices),
             band_hz=args.band_hz or BAND_HZ,
             progress=move,

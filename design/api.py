@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
@@ -19,7 +20,7 @@ from haptic_loop.design.certificate import judged, lag, named, prove, requiremen
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
-from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT, LimitedForces
+from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import (
@@ -273,10 +274,10 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
 
 def _certificate(loop: Loop, design: Design) -> Certificate:
-    """Return the certificate of a design; it covers limited forces if Design.c has multipliers. Raises NotProved."""
+    """Return the certificate of a design, for limited forces if its multipliers c prove them. Raises NotProved."""
     if design.c:
-        limiter = LimitedForces(lags=len(design.c[0]))
-        return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])
+        with suppress(NotProved):
+            return prove(loop, design.coupling, LIMITER, [v for row in design.c for v in row])
     return prove(loop, design.coupling, design.asked, None if design.phi is None else design.phi.tolist())
 
 

@@ -323,12 +323,14 @@ def _covered_limits(
     requirements: Mapping[str, Requirement],
     proof: Certificate | None = None,
     known: Certificate | None = None,
+    c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
     """Return the limiter that a certified condition covers, or clipping with the reason.
 
     A condition that covers a limiter without a further proof is preferred. Otherwise this-environment or known-device
-    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop; otherwise multipliers
-    are searched for a limiter of the same beta (LimitedForces). `known` is a certificate that has been verified.
+    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop. Otherwise the
+    multipliers `c` are tried, and then others are searched for a limiter of the same beta (LimitedForces). `known` is a
+    certificate that has been verified.
     """
     covering = [each for each in requirements.values() if each.certified and each.lag is not None]
     for each in sorted(covering, key=lambda each: each.proof != "rational"):
@@ -338,7 +340,7 @@ def _covered_limits(
     if not extended:
         return ForceLimits(None, "no certified condition that extends to limited forces")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
-    candidates = [_by_its_own_block(loop, coupling, proof, known, extended[0])]
+    candidates = [_by_its_own_block(loop, coupling, proof, known, extended[0], c)]
     if candidates[0].rho is None and len(extended) > 1:
         candidates.insert(0, _by_its_own_block(loop, coupling, None, known, extended[1]))
     covered = next((each for each in candidates if each.rho is not None), candidates[-1])
@@ -349,26 +351,36 @@ _EXTENDED = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name  # conditions that have a b
 
 
 def _by_its_own_block(
-    loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None, base: str
+    loop: Loop,
+    coupling: Coupling,
+    proof: Certificate | None,
+    known: Certificate | None,
+    base: str,
+    c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
     """Return the limiter that the condition `base` covers after its extension, or clipping with the reason."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
             assert isinstance(condition, LimitedForces | LimitedKnownDevice)
-            c, bounded = _rows(condition, loop, requirement), isinstance(condition, LimitedKnownDevice)
-            covered = ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof, proof=requirement.proof)
+            rows, bounded = _rows(condition, loop, requirement), isinstance(condition, LimitedKnownDevice)
+            covered = ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, rows, proof, proof=requirement.proof)
             return replace(covered, bounded=bounded)
         except NotProved:  # The proof does not hold in this loop, or would take long.
             pass
     plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
     limiter = LimitedKnownDevice(plain) if base == KNOWN_DEVICE.name else plain
-    requirement = required_damping(loop, coupling, limiter)
-    c = _rows(limiter, loop, requirement)
+    found = [v for row in c for v in row] if c and limiter is LIMITER else None
+    requirement = required_damping(loop, coupling, limiter, found)
+    if found and not requirement.certified:
+        requirement = required_damping(loop, coupling, limiter)
+    rows = _rows(limiter, loop, requirement)
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
-        return ForceLimits(None, requirement.reason or needs, requirement, c)
-    covered = ForceLimits(loop.per_channel(plain.rho(loop)), _OWN_PROOF, requirement, c, bounded=limiter is not plain)
+        return ForceLimits(None, requirement.reason or needs, requirement, rows)
+    covered = ForceLimits(
+        loop.per_channel(plain.rho(loop)), _OWN_PROOF, requirement, rows, bounded=limiter is not plain
+    )
     try:
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
@@ -618,6 +630,7 @@ def assess(
     searched: Searched | None = None,
     limiter: bool | None = None,
     limiter_proof: Certificate | None = None,
+    limiter_c: Sequence[Sequence[float]] | None = None,
     force_limit: Sequence[float] = (),
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
@@ -626,7 +639,7 @@ def assess(
 
     Args:
         loop: The loop, with its ranges, switching delays, latency and longest period.
-        coupling: The coupling as it runs; a Design also supplies its condition, certificate and search.
+        coupling: The coupling as it runs; a Design also supplies its condition, certificate, search and limiter_c.
         environment: The environment that runs, if it is not the loop's: a network, or a function. A function
             or a MuJoCo world acts on the coupling through a shell that makes it passive.
         energy_budget: Start W0 [J] of the shell's energy account; the default is 0 for a function and 2 mJ for a MuJoCo
@@ -641,6 +654,8 @@ def assess(
         searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
+        limiter_c: Multipliers of the limiter, one row per device, which a design has found. They are tried first;
+            others are searched only if these certify no limiter.
         force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
         progress: Called with (points done, number of points) of the search over ranges.
@@ -659,7 +674,7 @@ def assess(
         certificate, condition = certificate or coupling.certificate, condition or coupling.asked
         made = coupling.certificate  # The design's search is of this loop's ranges only if its proof is.
         own_search = coupling.searched if made and made.scenario == digest(loop, coupling.coupling.form()) else None
-        searched, coupling = searched or own_search, coupling.coupling
+        searched, limiter_c, coupling = searched or own_search, limiter_c or coupling.c, coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
     wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
@@ -690,7 +705,7 @@ def assess(
     else:
         where = loop if environment is None else loop.at(network)
         covering = {own.name: requirements[own.name]} if own else requirements
-        limits = _force_limits(where, coupling, covering, limiter, limiter_proof, known)
+        limits = _force_limits(where, coupling, covering, limiter, limiter_proof, known, limiter_c)
     if plugged and energy_budget is None:
         energy_budget = 0.0 if callable(environment) else START_J
     if energy_budget is not None:
@@ -727,11 +742,12 @@ def _force_limits(
     limiter: bool | None,
     proof: Certificate | None,
     known: Certificate | None,
+    c: Sequence[Sequence[float]] | None,
 ) -> ForceLimits:
     """Return the limiter for a loop, or clipping with the reason."""
     if limiter is False:
         return ForceLimits(None, "the limiter is switched off")
-    return _covered_limits(loop, coupling, requirements, proof, known)
+    return _covered_limits(loop, coupling, requirements, proof, known, c)
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:

@@ -12,9 +12,8 @@ known devices is not affine in its multiplier; `KnownDeviceLoop` computes it ane
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from copy import copy
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,12 +85,6 @@ class SampledLoop:
         self._rate: dict[str, Complex] = {}  # derivative of 1/V with respect to B/delta
         self._sample("band", self.band)
         self._impose(frequencies(self.E, low=1e-3, points=80))
-
-    def fresh(self) -> Self:
-        """Return a copy to which another search may add frequencies. The copy shares the sampled responses."""
-        other = copy(self)
-        other._known, other._delayed, other._rate = {}, dict(self._delayed), dict(self._rate)
-        return other
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(self._gains(x), 2)
@@ -464,11 +457,19 @@ class KnownDeviceLoop(SampledLoop):
 # The search, with frequencies added where a refined sweep finds a violation.
 
 
-def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, int]:
-    """Return (x of a local optimum that passes the refined sweep or None, number of searches)."""
+_SAME = 1e-3  # Two results of a search are one local optimum if no entry of x differs by more.
+
+
+def _optimum(sampled: SampledLoop, start: SpringDamper, known: Sequence[Array]) -> tuple[Array | None, int]:
+    """Return (x of a local optimum that passes the refined sweep, number of searches).
+
+    x is None if no such optimum was found, or if it is one of the `known` optima.
+    """
     x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
         x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)])
+        if any(np.abs(x - other).max() < _SAME for other in known):
+            return None, searches
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
@@ -480,25 +481,25 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
 
 
 def least_rms(
-    sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
+    sampled: SampledLoop, starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop, and the search from each start uses a copy. For more than FEW channels the first optimum
-    is returned, because steps are expensive and the start hardly matters. The caller sorts the starts.
+    All searches share the frequencies that they add to `sampled`. For more than FEW channels the first optimum is
+    returned, because steps are expensive and the start hardly matters. The caller sorts the starts.
     """
-    first = sampled()
-    best, least, searches, multiplier = None, np.inf, 0, None
+    best, least, searches, multiplier, loop = None, np.inf, 0, None, sampled.loop
+    known: list[Array] = []
     for start in starts:
-        loop = (condition := first.fresh()).loop
-        x, runs = _optimum(condition, start)
+        x, runs = _optimum(sampled, start, known)
         searches += runs
         if x is None:
             continue
-        coupling = condition.coupling(x)
+        known.append(x)
+        coupling = sampled.coupling(x)
         rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band_hz)
         if rms < least:
-            best, least, multiplier = coupling, rms, condition.multiplier(x)
+            best, least, multiplier = coupling, rms, sampled.multiplier(x)
         if loop.channels > FEW:
             break
     return best, least, searches, multiplier

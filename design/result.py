@@ -213,6 +213,7 @@ class Chosen:
         phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
         certificate: The Certificate of the file, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
+        c: The multipliers of the limiter that the design found, one row per device, or None.
         own: The user's own condition (design.conditions.Condition), or None.
         switching: The range of delays [samples] in which the coupling's file proves any switching, or None.
         notes: Remarks on the origin of the coupling, for reports.
@@ -225,6 +226,7 @@ class Chosen:
     phi: Array | None = field(kw_only=True, default=None)
     certificate: Any = field(kw_only=True, default=None)
     limiter: Any = field(kw_only=True, default=None)
+    c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)
     own: Any = field(kw_only=True, default=None)
     switching: DelayRange | None = field(kw_only=True, default=None)
     notes: tuple[str, ...] = field(kw_only=True, default=())
@@ -256,13 +258,13 @@ class Design(Chosen):
         requirement: The requirement of `condition`, from a refined sweep or, if its `proof` says so, a proof.
         sdps: The number of convex problems, of runs of a local search, or of bases of an optimal coupling.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per device, if a repeated search for it would take long; else None.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether the time limit ended the search, so that more time may find a better coupling.
         kind: The kind of the coupling in reports.
         phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
         certificate: The Certificate, if it was proved in this process.
         limiter: The Certificate for limited forces, or None.
+        c: The multipliers of the limiter that the design found, one row per device, or None.
         own: The user's own condition (design.conditions.Condition), or None.
         switching: The range of delays [samples] in which any switching is proved, or None.
         notes: Remarks on the origin of the coupling, for reports.
@@ -274,7 +276,6 @@ class Design(Chosen):
     requirement: Requirement
     sdps: int = 0
     wall_s: float = 0.0
-    c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)
     searched: Any = field(kw_only=True, default=None)
     hurried: bool = field(kw_only=True, default=False)
 

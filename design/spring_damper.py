@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -356,14 +355,14 @@ def _for_this_environment(
     span = loop.varying_delay
     if band_hz and span:
         raise ValueError("band_hz: designs for delays that vary use 0.5 to 80 Hz; leave out band_hz")
-    sampled = partial(SwitchingLoop, loop) if span else partial(SampledLoop, loop, band)
+    sampled = SwitchingLoop(loop) if span else SampledLoop(loop, band)
     many = loop.channels > FEW
     if many:
-        starts = likeliest_first(sampled(), starts)
+        starts = likeliest_first(sampled, starts)
     coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
     nothing = coupling is None and not many
     if limiter and not nothing:  # The search starts at the unlimited result, because limits soften it only a little.
-        limited = partial(LimiterLoop, loop, band)
+        limited = LimiterLoop(loop, band)
         linear, before = coupling, searches
         coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
         if coupling is None and linear:
@@ -385,7 +384,7 @@ def _for_this_environment(
         rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band)
     requirement = this_environment(loop.F(coupling), loop)
     wall_s = time.perf_counter() - started
-    return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c if many else None)
+    return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c)
 
 
 def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
@@ -397,10 +396,10 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
     if reason := KNOWN_DEVICE.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
     started, band = time.perf_counter(), band_hz or BAND_HZ
-    plain = least_rms(partial(SampledLoop, loop, band), starts or _default_starts(loop), band)
+    plain = least_rms(SampledLoop(loop, band), starts or _default_starts(loop), band)
     first = [plain[0]] if plain[0] else []
     coupling, rms, searches, _ = least_rms(
-        partial(KnownDeviceLoop, loop, band), [*first, *(starts or _default_starts(loop))], band
+        KnownDeviceLoop(loop, band), [*first, *(starts or _default_starts(loop))], band
     )
     searches += plain[2]
     if plain[0] and not rms < plain[1]:

@@ -238,6 +238,7 @@ def assessed(
         ranges_seed=seed,
         limiter=limiter,
         limiter_proof=chosen.limiter,
+        limiter_c=chosen.c,
         force_limit=tuple(device.force_limit for device in scenario.axis_devices),
         band_hz=band_hz,
         progress=progress,
