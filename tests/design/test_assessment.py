@@ -201,6 +201,15 @@ def test_a_swept_limiter_makes_the_guarantee_sampled(monkeypatch):
     assert assess(LOOP, HERE_ONLY, limiter=False).guarantee.proof == "rational"
 
 
+@pytest.mark.parametrize("wrong", [((0.0,),), ((4.0,),), ((0.7,), (0.7,))])
+def test_wrong_multipliers_of_a_limiter_are_replaced(wrong):
+    """Multipliers 0 and 4 do not certify this coupling with limited forces, and two multipliers are for two devices."""
+    right, none = ((0.75,),), None
+    c = [assess(LOOP, HERE_ONLY, limiter_c=c).force_limits.c for c in (right, wrong, none)]
+    assert c[0] == right
+    assert c[1] == c[2]
+
+
 @pytest.mark.slow
 def test_a_stored_limiter_proof_covers_no_longer_delay():
     """The stored proof is for a delay of 1 sample. With 801 samples the loop has more states than are proved."""
