@@ -183,7 +183,7 @@ def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
         *(listed(gains[name], 5) if name in gains else "-" for name in "KB"),
         f"{listed(certified.required, 5)} ({certified.condition}, {certified.proof})",
         listed(certified.available, 5),
-        assessment.guarantee.words if assessment.guarantee else "none",
+        assessment.guarantee_words or "none",
     )
 
 

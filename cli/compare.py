@@ -82,8 +82,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
         files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, rows)
     tables = [_beside(rows, args.condition)]
-    verdict = f"{_nearest(rows)}{_exact_positions(scenario)}"
-    render.publish(args, report, tables, _held(scenario, args.case), out, files, verdict)
+    render.publish(args, report, tables, _held(scenario, args.case), out, files, _nearest(rows))
     return options.exit_code(True)
 
 
@@ -150,12 +149,6 @@ def _held(scenario: Scenario, case: str) -> list[str]:
     return [f"Held torques: {torques}."] if torques else []
 
 
-def _exact_positions(scenario: Scenario) -> str:
-    """Return a sentence on the encoder steps of the devices, or ""."""
-    steps = any(device.encoder_step for device in scenario.axis_devices)
-    return " Guarantees are for exact positions: sim.run judges the encoder steps." if steps else ""
-
-
 # ----------------------------------------------------------------------------------------------------
 # Couplings over frequency.
 
@@ -167,8 +160,7 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     files = render.pictures(args, report, out, _PICTURES)
     lines = [*report.notes, *_held(scenario, args.case)]
     tables = [_guarantees(report), _feel(report)]
-    verdict = f"{_guaranteed(report)}{_exact_positions(scenario)}"
-    render.publish(args, report, tables, lines, out, files, verdict)
+    render.publish(args, report, tables, lines, out, files, _guaranteed(report))
     return options.exit_code(not failed)
 
 
@@ -244,8 +236,7 @@ def _guarantees(report: Comparison) -> render.Table:
 
 def _guaranteed(report: Comparison) -> str:
     """Return the verdict, the guarantee of each coupling."""
-    guarantees = {coupling.name: coupling.assessment.guarantee for coupling in report.couplings}
-    words = [f"{name} ({guarantee.words if guarantee else 'none'})" for name, guarantee in guarantees.items()]
+    words = [f"{coupling.name} ({coupling.assessment.guarantee_words or 'none'})" for coupling in report.couplings]
     return f"Guarantee: {', '.join(words)}."
 
 

@@ -319,8 +319,8 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)
     yield from verdicts.range_rows(assessment.ranges) if assessment.ranges else ()
-    guarantee, felt = assessment.guarantee, assessment.transparency
-    yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
+    felt = assessment.transparency
+    yield "guarantee", assessment.guarantee_words or f"none ({assessment.reason})"
     yield "guarantee, forces", assessment.force_limits.words
     yield "held torques", assessment.held_torques
     yield "transparency error", felt and render.transparency_error(felt)

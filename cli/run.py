@@ -207,7 +207,7 @@ def _title(what: str, report: RunReport) -> str:
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     guarantee = report.assessment.guarantee
     if kind != "none" and guarantee and guarantee.energy_J is None:
-        coupling += f" for {guarantee.words}"
+        coupling += f" for {report.assessment.guarantee_words}"
     rate, hertz = stability.exact_growth_rate_per_s, stability.exact_frequency_hz
     growth = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz" if rate > 0 else f"slowest motion decays by {-rate:.3f} 1/s"
     if report.varying_delay and report.switched:

@@ -71,8 +71,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
         swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
-        exact = guarantee.proof != "account"  # A shell requires exact positions, a budget does not.
-        steps = f" {encoder.sentence}" if encoder and exact else ""
+        steps = f" {encoder.sentence}" if encoder and guarantee.counts_positions else ""
         return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}{steps}"
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
@@ -149,8 +148,7 @@ def rows(assessment: Assessment) -> render.Rows:
     """Yield the rows of an assessment: conditions, ranges, guarantee, force limits, held torques."""
     yield from render.certificate_rows(assessment.requirements, 5)
     yield from range_rows(assessment.ranges) if assessment.ranges else ()
-    guarantee = assessment.guarantee
-    yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
+    yield "guarantee", assessment.guarantee_words or f"none ({assessment.reason})"
     yield "force limits", assessment.force_limits.words
     yield "held torques", assessment.held_torques
 

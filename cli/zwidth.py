@@ -188,7 +188,7 @@ def _share(count: int, report: MapReport) -> str:
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     """Yield the rows of the fixed coupling in the environment of the scenario."""
-    requirements, guarantee = fixed.assessment.requirements, fixed.assessment.guarantee
+    requirements, guarantee = fixed.assessment.requirements, fixed.assessment.guarantee_words
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})"
         for name, need in requirements.items()
@@ -201,7 +201,7 @@ def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     )
     yield (
         "in the scenario's environment",
-        f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}",
+        f"guarantee: {guarantee or 'none'}; {needs or 'no damping is enough'}",
     )
 
 

@@ -419,6 +419,11 @@ class EncoderSteps:
             return "Not covered: the encoder steps of the devices."
         return "Encoder steps are covered with this object only, while forces stay below their limits."
 
+    @property
+    def suffix(self) -> str:
+        """The same restriction for the end of a guarantee in a table or a title."""
+        return ", encoder steps with this object only" if self.covered else ", for exact positions only"
+
     @classmethod
     def of(
         cls,
@@ -502,8 +507,13 @@ class Guarantee:
         return self.environments == ANY
 
     @property
+    def counts_positions(self) -> bool:
+        """Whether the guarantee depends on exact positions; an energy budget at the devices does not."""
+        return self.proof != "account"
+
+    @property
     def words(self) -> str:
-        """One line for a report: the environments, the energy if it is bounded, and the user's own condition."""
+        """The environments, the energy if it is bounded, and the user's own condition, without encoder steps."""
         return f"{self._covered}, by the condition {self.own}, which is your own" if self.own else self._covered
 
     @property
@@ -563,6 +573,14 @@ class Assessment:
 
     def __repr__(self) -> str:
         return f"Assessment({self.coupling!r}: {self.guarantee or f'no guarantee, {self.reason}'})"
+
+    @property
+    def guarantee_words(self) -> str | None:
+        """The guarantee in one line for tables and titles, with what it says of encoder steps; None without one."""
+        if self.guarantee is None:
+            return None
+        limits = self.encoder.suffix if self.encoder and self.guarantee.counts_positions else ""
+        return f"{self.guarantee.words}{limits}"
 
     @property
     def facts(self) -> tuple[str, ...]:

@@ -132,7 +132,7 @@ def _alternative(
     row = Alternative(
         kind,
         condition,
-        guarantee=assessment.guarantee.words if assessment.guarantee else None,
+        guarantee=assessment.guarantee_words,
         dc_ratio=finite(felt.dc_ratio),
         rms_mismatch_db=decibels(felt.rms_mismatch),
         growth_rate_per_s=finite(growth),

@@ -12,7 +12,9 @@ from msgspec.structs import replace as change
 from worlds import FIGURE_4
 
 from haptic_loop.cli.audit import main as audit_command
+from haptic_loop.cli.bridge import _certified
 from haptic_loop.cli.bridge import main as bridge_command
+from haptic_loop.cli.compare import _panel_title
 from haptic_loop.cli.compare import main as compare_command
 from haptic_loop.cli.design import main as design_command
 from haptic_loop.cli.run import main as run_command
@@ -25,9 +27,11 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.assessment import EncoderSteps, assess
 from haptic_loop.design.conditions import _l1_gain, encoder_friction
+from haptic_loop.hw.control import CertifiedCoupling
 from haptic_loop.sim import scenario as scenario_module
 from haptic_loop.sim.api import simulate
-from haptic_loop.sim.couplings import encoder_steps
+from haptic_loop.sim.comparison import Alternative
+from haptic_loop.sim.couplings import assessed, encoder_steps, given
 from haptic_loop.sim.scenario import load
 
 T, STEP = 1.2e-3, 1e-5
@@ -115,7 +119,6 @@ def test_friction_is_compared_in_the_running_environment():
 
 
 _LOST = "varying_delay = { lo = [1, 2], hi = [2, 3], loss = 0.2 }"
-_EXACT = "Guarantees are for exact positions"
 _SHORT = ["--duration", "0.05", "--no-plot"]
 
 
@@ -155,7 +158,11 @@ def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, m
     monkeypatch.chdir(tmp_path)
     code, line, record = _first_line(command, scenario, options, tmp_path, capsys)
     if command is compare_command:
-        said = {"lost": "spring-damper (none)", "steps": _EXACT, "friction": _EXACT}
+        said = {
+            "lost": "spring-damper (none)",
+            "steps": "for exact positions only",
+            "friction": "encoder steps with this object only",
+        }
         (coupling,) = record["couplings"]
         assessment = coupling["assessment"]
     else:
@@ -184,6 +191,18 @@ def test_traces_state_the_qualified_guarantee():
         meta = simulate(scenario.replace(device=devices), SOFT).meta
         assert meta["assessment"]["guarantee"]
         assert any(f"encoder steps {words}" in remark for remark in meta["remarks"])
+
+
+def test_panels_and_bridge_tables_qualify_guarantees():
+    """Titles and table cells name the encoder steps as the verdict does."""
+    scenario, chosen = load("omega-pair"), given(SOFT)
+    for friction, words in (0.0, "for exact positions only"), (2.0, "encoder steps with this object only"):
+        devices = tuple(change(d, encoder_step=2e-4, friction=friction) for d in scenario.device)
+        assessment = assessed(scenario.replace(device=devices), "I", chosen)
+        panel = _panel_title(Alternative("spring-damper", "this-environment", assessment.guarantee_words))
+        program = CertifiedCoupling(0, scenario, "I", chosen, assessment)
+        assert panel.endswith(words)
+        assert _certified(program)[-1].endswith(words)
 
 
 def test_sessions_count_the_steps_of_the_device(tmp_path, capsys):
