@@ -84,13 +84,13 @@ _TAIL = 4000  # number of ticks at the end of a run in which a limit cycle is me
 
 @dataclass(frozen=True)
 class Row:
-    """Cost and errors of one setting of an engine; a missing figure is null."""
+    """Cost and errors of one setting of an engine; a missing figure is None."""
 
     engine: str
     integrator: str | None
     substeps: int | None
     position_relative_rms: float | None
-    growth_rate_error: float  # [1/s] the larger of the errors with and without the coupling
+    growth_rate_error: float  # [1/s] the error with or without the coupling, whichever is larger in magnitude
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
     cycle_frequency_hz: float | None  # frequency of the same force in the limit cycle
@@ -158,7 +158,7 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto` for rows with right verdicts that no row of the same engine dominates.
+    """Set `pareto` for rows with right verdicts and finite figures that no row of the same engine dominates.
 
     A dominating row is no worse in cost, position error and growth error, and better in one of them. MuJoCo's settings
     do not compete with the exact engine, which exists for linear plants only.
@@ -189,7 +189,10 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
 
 
 def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
-    """Return the larger growth-rate error of coupled and uncoupled loop, and whether both verdicts are right."""
+    """Return the growth-rate error [1/s] of larger magnitude, of two loops, and whether both verdicts are right.
+
+    The two loops are the coupled and the uncoupled one.
+    """
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
         held = _measured_hold(simulation, engine, integrator, substeps)
@@ -202,7 +205,10 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
 def _cycle(
     truth: _Reference, engine: str, integrator: str | None, substeps: int | None
 ) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
-    """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors [-], [Hz]."""
+    """Return standard deviation [N] and frequency [Hz] of the limit cycle's force, and their errors [-], [Hz].
+
+    All four are None if the exact loop has no limit cycle, or if the run diverged.
+    """
     if truth.cycle is None:
         return None, None, None, None
     channel, deviation, frequency = truth.cycle
@@ -485,7 +491,7 @@ def _refined(
                 f"{1e-6 * count:.0f} million evaluations; allowed are {1e-6 * _MOST_EVALUATIONS:g} million: give a "
                 "shorter --duration or a larger error"
             )
-    within = f"comes within {best:.1g}" if best < math.inf else "does not converge"
+    within = f"has an error of {best:.1g}" if best < math.inf else "does not converge"
     raise InputError(f"--error {error:g}: RK4 {within} with up to {_MOST_COMPARED // 2} substeps")
 
 
@@ -520,7 +526,7 @@ def _require_motion(positions: Array) -> None:
 
 
 def _apart(own: Array, truth: Array) -> float:
-    """Return the relative rms difference; infinite if one of the runs ended early."""
+    """Return the rms difference relative to `truth`; inf if one of the runs ended early, 0 if `truth` is all 0."""
     if own.shape != truth.shape:
         return math.inf
     scale = float(np.mean(truth**2))

@@ -142,9 +142,9 @@ def simulate(
     Returns:
         A Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
         f (N, m) [N] (the devices feel -f), and `meta`. `meta["stability"]` has the growth rates [1/s] of the trace and
-        of the exact loop, the verdict, and the ticks at the force limit (None under varying delays, with `environment`
-        and in a MuJoCo scene). `meta["assessment"]` states the guarantee of this run, or why there is none, and
-        `meta["energy_budget"]` how often forces were limited.
+        of the exact loop, the verdict, and the ticks at the force limit. It is None under varying delays, with
+        `environment` and in a MuJoCo scene. `meta["assessment"]` states the guarantee of this run, or why there is
+        none, and `meta["energy_budget"]` how often forces were limited (None without budget and shell).
 
     Raises:
         ValueError: An engine, integrator or number of substeps is impossible (InputError if the scenario is at fault).
@@ -235,7 +235,8 @@ def validate(
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
             engine and makes one engine for each set of humans.
-        duration: Length [s] of the traces. 0 means no traces, so that all growth rates come from period maps.
+        duration: Length [s] of the traces. 0 means no traces: growth rates come from period maps, except under varying
+            delays or ticks (`Findings.switching`).
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.

@@ -197,7 +197,7 @@ def least_substeps(integrator: str) -> int:
 
 
 def default_integrator(scene: Scene) -> str:
-    """Return "exponential" without friction, else "RK4", which then has the smaller error of both at equal cost."""
+    """Return "exponential" without friction, else "RK4", which with friction has the smaller error at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
     return "RK4" if rubs else EXPONENTIAL
 

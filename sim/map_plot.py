@@ -23,7 +23,7 @@ from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # colours of areas
 
-#: lines in the order of drawing: dashed lines are drawn over solid ones, so that both are visible where they coincide
+#: lines in the order of drawing: a dashed line follows the solid line that it may coincide with, so that both are seen
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},

@@ -47,13 +47,13 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 # The paper's numbers compared with those computed here.
 
 
-#: The transparency indices (25) [dB] that the paper prints; none of our readings of Figure 4 reproduces them.
+#: The transparency indices (25) [dB] that the paper prints. No reading of its Figure 4 that we tried reproduces them.
 _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A number of the paper, its value computed here, and the reason of the difference."""
+    """A number of the paper, its value computed here, and the reason why they differ."""
 
     what: str
     paper: str
@@ -62,7 +62,7 @@ class PaperRow:
 
 
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Return a row for each figure of the paper, beside the figure computed here. Other loops have no rows."""
+    """Return a row for each number that the paper prints for this case; () for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
@@ -150,7 +150,7 @@ class _DelaysMet:
 
     age: _Age | None  # None if some channel receives no force
     lost_packets: list[int]  # (m,) number of lost packets
-    held_ticks: list[int]  # (m,) ticks in which no newer force arrived
+    held_ticks: list[int]  # (m,) number of ticks in which no newer force arrived
     growth_rate_per_s: float
     verdict: str | None  # None if the rate is too small for the trace's duration
     judged_s: float  # duration of the trace that gave the growth
@@ -229,8 +229,8 @@ class UnevenTicks:
     """The periods of a run, and the latencies of its forces."""
 
     period_s: _Periods
-    recorded: bool
-    T_max_s: float | None
+    recorded: bool  # whether the periods come from a file; otherwise they are drawn at random or constant
+    T_max_s: float | None  # the longest period that certificates must cover; None if every period is T
     latency_s: tuple[tuple[float, float], ...] | None
 
     @classmethod

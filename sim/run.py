@@ -2,7 +2,7 @@
 
     trace = run(assemble(scenario, coupling), "mujoco")
 
-A tick samples the positions, computes the forces, limits and holds them, and advances the plant by T: see
+A tick samples the positions, computes the forces, limits and holds them, and advances the plant by one period: see
 controller.tick for the order of these steps, and sim.engines for the last one.
 """
 
@@ -65,12 +65,12 @@ _AHEAD = 8  # number of blocks for which external forces are sampled together
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Engine, integrator and steps; None means the default for the plant."""
+    """Engine, integrator and steps of a run; an integrator or `substeps` of None means the default for the plant."""
 
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # name in sim.engines.INTEGRATORS
     substeps: int | None = None  # integrator steps per period
-    error: float | None = None  # allowed relative rms error of positions, for which the cheapest setting is chosen
+    error: float | None = None  # allowed relative rms error of positions: the cheapest such setting replaces the above
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,13 +179,14 @@ def run(
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
         progress: Called with (ticks done, number of ticks).
-        may_end_early: Whether Ctrl-C only ends the trace early, which then has `interrupted`.
+        may_end_early: Whether Ctrl-C only ends the trace early. The trace then has `interrupted` = True.
 
     Returns:
         The trace. It ends early when a number stops being finite or the engine reports trouble.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C without `may_end_early`, or before any tick is finished.
+        KeyboardInterrupt: After Ctrl-C without `may_end_early`, or in the first block of 2048 ticks.
+        ValueError: `engine` is no engine for this loop (`make_engine`), or the trace is too large (InputError).
     """
     process, scenario = simulation.process, simulation.scenario
     engine = make_engine(simulation, engine)

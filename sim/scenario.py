@@ -1,7 +1,7 @@
 """Scenarios: devices, humans, environment, delays and timing of one loop, read strictly from TOML.
 
 Unknown keys and impossible numbers are refused. Humans can be in a separate file with one [[human]] per device, so that
-the humans of a search can be stored and replayed.
+humans that a search found (sim.adversary) can be stored and simulated again.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i, from 0: 0.3 kg on a spring whose other end swings 15 mm at 0.6 Hz.
+    """Return the default hand of device i: 0.3 kg on a spring whose other end swings with 15 mm of amplitude at 0.6 Hz.
 
-    The phase of hand i is a quarter period ahead of that of hand i - 1.
+    Devices are counted from 0. Each hand is a quarter period ahead of the hand of the device before.
     """
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
@@ -95,7 +95,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     population: Population = Population()  # distribution of random humans
     varying_delay: VaryingDelay | None = None  # delays of the forces in a range around theta; None: constant delays
     T_max: float | None = None  # [s] the longest period if periods vary; certificates hold up to it
-    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; latencies are shorter
+    T_min: float | None = None  # [s] the shortest period if periods vary, for known-device; it exceeds every latency
     period: Periods | None = None  # the simulated periods; the coupling is computed for T
     latency: tuple[tuple[float, float], ...] | None = None  # [s] (least, most) time from a tick to the latch of a force
 
@@ -170,7 +170,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def _per_channel(self) -> None:
         """Convert values per device to values per channel, if devices have several axes.
 
-        Raises ValueError for a list of wrong length, or if axes of one device differ.
+        Raises ValueError for a list of wrong length, or if a list gives the axes of one device different values.
         """
         counts = [len(device.free) for device in self.device]
         if max(counts, default=1) == 1:
@@ -217,7 +217,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def limiter_limits(self) -> tuple[tuple[float, ...], tuple[slice, ...]]:
         """Limits (m,) [N] of a limiter, and the channels of each force vector whose length it limits.
 
-        The limiter cannot combine vectors with walls. With walls each axis gets the limit of the box inside the ball.
+        The limiter cannot combine vectors with walls. With walls each of a vector's n axes gets 1/sqrt(n) of the limit.
         """
         limits = [device.force_limit for device in self.axis_devices]
         if not self.environment.walls:
@@ -717,7 +717,11 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
-    """Give each point of an environment a node per axis if devices have several. Raises ValueError if they differ."""
+    """Give each point of an environment one node per axis if the devices have several axes.
+
+    The node of a clamped axis is the ground. Raises ValueError if the devices have different numbers of axes, if the
+    number of contacts is not that of the devices, or for an impossible spring (`_along_axes`).
+    """
     devices, table = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
@@ -756,7 +760,8 @@ def _listed(value: Any) -> list[str]:
 def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     """Convert a spring whose stiffness or damping is a list or a matrix to springs along its principal directions.
 
-    Raises ValueError for a matrix that is not symmetric and positive semidefinite.
+    Any other spring is returned unchanged. Raises ValueError if such a spring also has `along`, and for a matrix that
+    is not symmetric and positive semidefinite.
     """
     fields = ("stiffness", "damping")
     several = [f for f in fields if isinstance(spring, dict) and isinstance(spring.get(f), list)]

@@ -47,7 +47,7 @@ def verdict(growth: float) -> str:
 
 
 def disagree(exact: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
-    """Return where two growth rates [1/s] have opposite signs although the exact one is clearly not zero."""
+    """Return where `other` is finite and contradicts the sign of a growth rate `exact` [1/s] that is clearly not 0."""
     return (unstable(exact) != unstable(other)) & (np.abs(exact) > _CLEAR) & np.isfinite(other)
 
 
@@ -325,7 +325,7 @@ class Stability(Eigenvalues):
 
     verdict: str | None  # verdict on the run; None if nothing decides it
     clipped_ticks: int
-    growth_rate_per_s: float | None  # growth rate of the trace; if it is None, `reason` says why
+    growth_rate_per_s: float | None  # of the trace, or of the linear loop if delays or ticks vary; None: see `reason`
     frequency_hz: float | None  # strongest frequency of the forces at the end of the trace
     contact: _Contact | None = off_table("if given", None)
     reason: str | None = off_table("if given", None)

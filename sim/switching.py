@@ -180,7 +180,7 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 # ---- many humans in one batch, each under its own varying delays, drawn or adversarial
 
 _SHORTEST_CROWD = 2.0  # [s] least duration of a trace; in a shorter one the spreading impulse hides a growth of 1 1/s
-_LONGER = 5  # factor of the duration of a second trace, for hands whose rate is too slow for the first
+_LONGER = 5  # duration of a second trace relative to the first, for hands whose rate is too slow for the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +264,7 @@ class DelaysCovered:
     covered: bool
     covers: str  # the covered delays, in words
     switching: SwitchingFigures | None = off_table(default=None)
-    on_file: DelayRange | None = None
+    on_file: DelayRange | None = None  # the range for which the coupling's file proves any switching, if it covers this
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:

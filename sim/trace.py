@@ -64,7 +64,7 @@ class Trace(ReadOnly):
         x_handle: (N, m) displacements of the handles [m].
         v_handle: (N, m) velocities of the handles [m/s].
         w: (N, outside) external forces [N], voluntary or of a tap.
-        meta: Settings and verdicts of the run, as in its JSON; `meta["stability"]`, `meta["assessment"]`.
+        meta: Settings and verdicts of the run as in its JSON, for example `meta["stability"]` and `meta["assessment"]`.
         z: (N, order) states of the controller.
         s: (N, states) states of the plant: positions [m], velocities [m/s], states of the hands' impedances, and with
             latencies the held forces [N].
@@ -181,7 +181,7 @@ class Trace(ReadOnly):
         return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
 
     def save_npz(self, path: Path) -> Path:
-        """Write the measured arrays and the metadata (as JSON text), without pickle.
+        """Write the arrays of `arrays` to an .npz file, without pickle, and return its path.
 
         Compression would take more than ten times as long, and make the file only a tenth smaller.
         """

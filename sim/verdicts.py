@@ -69,7 +69,10 @@ class EnvironmentsMet:
 
 
 def disagreement_words(question: Validation, findings: Findings) -> str:
-    """Return the number of disagreements, and for the first three both rates and, if a file holds them, a command."""
+    """Return the number of disagreements, and for the first three of them the rates of both engines.
+
+    If a file can hold the humans, a command that simulates them again is added.
+    """
     engine = "MuJoCo" if isinstance(question.engine, str) else engine_name(question.engine)
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
@@ -85,7 +88,7 @@ def disagreement_words(question: Validation, findings: Findings) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """A human that holds a device: its links, or the port of a user's own class."""
+    """A human that holds a device: the links of a Human, or the port of a human of any other class."""
 
     links: tuple[Link, ...] | None = off_table("if given", None)
     class_: str | None = off_table("if given", None)

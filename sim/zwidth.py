@@ -137,7 +137,7 @@ class CouplingSweep(_Sweep):
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,), for walls that make and break contact.
+        """Return required over available damping (n,); with walls, for contact that makes and breaks.
 
         The ratio is inf if the condition is refused or if no damping is enough.
         """
@@ -202,7 +202,7 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def stiffness_scale(self) -> float:
-        """The middle of the map [N/m]: the geometric mean of the stiffnesses at contacts."""
+        """The middle of the map [N/m]: the geometric mean of the stiffnesses at contacts, or 1000 if all are 0."""
         stiff = [s.stiffness for s in contact_springs(self.loop.network) if s.stiffness > 0]
         return float(np.exp(np.mean(np.log(stiff)))) if stiff else 1000.0
 

@@ -373,7 +373,7 @@ def test_gaps_between_runs_bound_the_finest_error():
             1e-18,
             "--error 1e-18: the most accurate setting with the right verdict, exponential x 1, has error",
         ),
-        (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
+        (RUBBING, 1e-18, "--error 1e-18: RK4 has an error of .* with up to 128 substeps"),
     ],
 )
 def test_unreachable_errors_are_refused(scenario, error, message):
