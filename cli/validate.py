@@ -298,8 +298,8 @@ class _Report:
     )
     adversary: verdicts.Attacked | None = render.figure("adversary", json="if given")
     adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="if given")
-    certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
-    holds: bool | None = render.figure("holds", lambda yes: "[green]yes[/]" if yes else "[red]no[/]", absent=_NOTHING)
+    certified: bool = render.figure("certified", "{r.certified_words}")
+    holds: bool | None = render.figure("holds", "{r.holds_words}", absent=_NOTHING)
     reason: str | None = off_table("if given")
     interrupted: bool
     kept: str = off_table("left out")
@@ -308,6 +308,19 @@ class _Report:
     wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")
     simulated_s_per_s: float
     remarks: Sequence[str]
+
+    @property
+    def certified_words(self) -> str:
+        """Whether a guarantee covers the simulated loops; the verdict says why there is none."""
+        stated = self.assessment.guarantee_words
+        return "yes" if self.certified else f"no: the guarantee is for {stated}" if stated else "no"
+
+    @property
+    def holds_words(self) -> str:
+        """Whether a test fails; without a certificate only disagreements and an uncertified condition can fail."""
+        if not self.holds:
+            return "[red]no[/]"
+        return "[green]yes[/]" if self.certified else "nothing is certified that the tests could contradict"
 
 
 def _varying(

@@ -246,9 +246,10 @@ def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
 
 
 @pytest.mark.slow
-def test_validations_with_lost_packets_are_not_covered(tmp_path):
+def test_validations_with_lost_packets_are_not_covered(tmp_path, capsys):
     code, part = validated(tmp_path, "--pattern", "bursty", "--loss", "0.1", "--humans", "8")
     assert code == 0
+    assert "nothing is certified" in capsys.readouterr().out
     assert not part["covered"]
     assert "lost packet" in part["covers"]
     assert part["humans"] == 8
