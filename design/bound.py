@@ -91,7 +91,8 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
     T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1, the
     condition's rows for the displacements after the latch have at most the damping Delta/(T_max - t1)
-    (design.facts.Latency). These rows alone are this-environment without a latency for more damping, which is bounded.
+    (design.facts.Latency). These rows alone are this-environment without a latency for devices with this damping, and
+    the bound is computed for these devices.
     """
     started, level = time.perf_counter(), even_level(loop)
     if loop.latency:
@@ -258,10 +259,10 @@ class _Dual:
         """Return (the bound on J from the point x, its largest error). The integrals of H are computed by Gauss's rule.
 
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, because H is
-        linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
-        positive. Its error is at most twice the length times the distance of g from such a polynomial. The distance
-        from the Taylor polynomial around the middle is at most q^2N/(1 - q) times the maximum of |g| on the disk of
-        radius half-width/q.
+        linear there; span is log(high/low) of the band. Gauss's rule of N points is exact for polynomials up to the
+        degree 2N - 1, and its weights are positive. Its error is at most twice the length times the distance of g from
+        such a polynomial. The distance from the Taylor polynomial around the middle is at most q^2N/(1 - q) times the
+        maximum of |g| on the disk of radius half-width/q.
         """
         middle, half, response, (size, error) = self._nodes
         low, high = self.band

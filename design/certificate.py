@@ -235,15 +235,15 @@ def _coefficients(value: Any) -> Iterator[float]:
             yield from _coefficients(part)
 
 
-_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the scale in `_another_system`
+_MOST_LOST = 1e-4  # largest change of the response by rounding, relative to the scale in `_another_system`
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     """Return the reason why the floating-point block of a tick differs from the proved system, or None.
 
-    At the frequencies of a sweep the difference of the responses, plus the rounding errors, may be at most _MOST_LOST
-    times the larger of two numbers: the largest response and, except in a world, the least delta/T. Terms that cancel
-    and are far larger than the forces increase the rounding errors.
+    At the frequencies of a sweep, rounding of a tick and of its coefficients may change the response by at most
+    _MOST_LOST times the larger of two numbers: the largest response and, except in a world, the least delta/T. Terms
+    that cancel and are far larger than the forces increase this change (design.frequency.rounding).
     """
     try:
         if loop.environment.world:  # A tick computes V alone; MuJoCo solves the scene with the feedthrough of V.

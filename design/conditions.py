@@ -17,8 +17,8 @@ To add a hands' side, derive a class from `HandsSide` and state
              in the displacement that f[k] multiplies. `moved` is (1,) for dx, (0, 1) for xa of a latency, which f[k-1]
              multiplies, and (-beta, beta) for the speed v of a known device in f'(dx + beta dv). `follows` is 0 for a
              speed and 1 for a displacement. `slips` says whether the limiter's slip is subtracted from the input;
-  `damping`  the matrix over its inputs that is proportional to Delta_D;
-  `rest`     matrices M_0, M_1 of the part M_0 + M_1/z that does not depend on Delta_D;
+  `damping`  the part of its quadratic form that is proportional to Delta_D, a matrix over its inputs;
+  `rest`     matrices M_0, M_1 of the other part of the form, M_0 + M_1/z;
   `unknowns` its multipliers, by name; `room`, `allowed` and `excess` state which values are allowed.
 Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
 adds walls, limiter and switching without further code.
@@ -101,7 +101,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     Delta_V = 0 where phi is 0. After the division by |1 - 1/z|^2 this is T He R >= H* Delta_V H for H = V - Theta-hat
     and the second result R of `_v_hat`. A Schur complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second
     block has rows only for phi > 0. Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises
-    ValueError for a phi that is not a multiplier.
+    ValueError unless 0 <= phi < Delta_D T/T_max.
     """
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
@@ -126,7 +126,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 
 
 def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
-    """Return E-hat + Phi without its pole, which must be positive real; `delayed` is Psi E.
+    """Return the block E-hat + Phi without its pole; the block must be positive real. `delayed` is Psi E.
 
     E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2, so the
     block is T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
@@ -223,7 +223,7 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """Return the least s (n,) with H + s diag(0, I) >= 0, where the zero block has r rows."""
+    """Return the least s (n,) with H + s diag(0, I) >= 0, where 0 has r rows; inf if H is not positive there."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size
@@ -344,7 +344,7 @@ class Condition(ABC):
         return {}
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        """Return rho (m,) [N/m] of a limiter that needs no further proof; None if limited forces are not covered."""
+        """Return rho (m,) [N/m] of the limiter that this condition covers without further proof, or None."""
         return None
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
@@ -360,7 +360,7 @@ class Condition(ABC):
         return named_values
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the multiplier that serves every coupling or None, the reason why there is none or None)."""
+        """Return (the multiplier for every coupling, None), (None, None) if none is needed, or (None, the reason)."""
         return None, self.beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
@@ -621,9 +621,10 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m].
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
-    a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). Friction of a device with
-    several `axes` opposes its velocity in space. It must be at least |W|_2 of these axes, because the power of the
-    errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises ValueError for a wrong number of steps or a negative step.
+    a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). `axes` lists the number of
+    axes of each device; () means one each. Friction of a device with several axes opposes its velocity in space. It
+    must be at least |W|_2 of these axes, as the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises
+    ValueError for a wrong number of steps or a negative step.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

@@ -135,7 +135,7 @@ def sealed(certificate: Certificate) -> Certificate:
 
 
 def load(path: str | Path) -> Stored:
-    """Read a stored coupling. Raises InputError with the name of the file and, if one is wrong, of the field."""
+    """Read a stored coupling. Raises InputError, which names the file and a field that is wrong."""
     content = read(path)
     if not content.strip():
         raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")

@@ -82,7 +82,8 @@ from haptic_loop.design.result import (
 )
 
 # ----------------------------------------------------------------------------------------------------
-# The search for the best multiplier. s is required over available damping, and the block is affine in (s, multiplier).
+# The search for the best multiplier. s is required over available damping. The block is affine in s and the multipliers
+# (`Multiplied.scaled`).
 # At finitely many frequencies a semidefinite program (design.cone) gives the least s over the multipliers between their
 # bounds (`Unknowns`), which is a lower bound. Frequencies at which a sweep with this multiplier needs a larger s are
 # added until the sweep attains the bound, or a budget is spent.
@@ -232,7 +233,10 @@ class _Search:
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`)."""
+        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`).
+
+        With a `spare` (`_worst`) this is a lower bound for the block less `spare`.
+        """
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]

@@ -106,14 +106,14 @@ def _shortfall(y: Array) -> Array:
     return np.where(y < _SERIES, series, 1 - np.tanh(y) / np.maximum(y, _SERIES))
 
 
-_SERIES = 0.03  # Below this y the truncated series has an error of 2e-14; above it cancellation costs 4e-13.
+_SERIES = 0.03  # At this y the truncated series has a relative error of 2e-14, and the other formula one of 4e-13.
 
 
 def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
     """Return a lower bound of the cost L of a period for devices with the damping `share` Delta, (..., m), as floats.
 
     For periods in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2), with the
-    mean speed vb = (v + v+)/2 and q as in `_q_bounds`. Entries are nan if beta is too large for this damping.
+    mean speed vb = (v + v+)/2 and q as in `_q_bounds`. Entries are nan or negative for too large a beta.
     """
     longest, shortest = loop.T_max or loop.T, shortest_period(loop) or loop.T
     c0, c2 = _rates(_known(loop, loop.T), np.asarray(share)[..., None] * np.array(loop.delta), beta)
@@ -302,11 +302,11 @@ _DIGITS = 7  # digits of beta and multipliers; the exact proof uses these rounde
 class _Best(NamedTuple):
     """The least share of the damping that a search found, with its beta and multipliers."""
 
-    share: float  # inf if no beta needs less than the allowed share
+    share: float  # inf if no beta that was tried needs less than the allowed share
     w: float  # binding frequency [rad/sample]
     beta: tuple[float, ...]  # (m,) [s]
     values: tuple[float, ...] = ()  # the multipliers of the facts
-    bound: float = 0.0  # lower bound of the share over all beta and multipliers, at the frequencies of the search
+    bound: float = 0.0  # lower bound of the share over all beta and multipliers, at sampled frequencies, with `spare`
 
 
 class Sweep:
@@ -781,7 +781,7 @@ class KnownDevice(Condition):
                 return replace(refusal(self.name, loop.delta, reason), multiplier=multiplier)
         share, w = sweep.required(beta, _MOST_SHARE, own)
         if not np.isfinite(share):
-            reason = f"beta = {beta.tolist()} s proves nothing for these devices, whatever the damping"
+            reason = f"beta = {beta.tolist()} s proves nothing for these devices, even with 1000 times the damping"
             return replace(refusal(self.name, loop.delta, reason), multiplier=multiplier)
         requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
         return replace(requirement, multiplier=multiplier)

@@ -72,7 +72,8 @@ class Requirement(Generic[C]):
         reason: Why `required` is infinite.
         proof: "rational" for exact arithmetic, "sampled" for a refined sweep.
         multiplier: The multiplier with which `required` was computed, or None.
-        bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None.
+        bound: Lower bound of `ratio` over the allowed multipliers, at the frequencies of the search, or None. For a
+            limiter it is the bound of the block less `Demand.spare`, unless `ratio` is smaller.
         guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter for which the condition holds without further proof, or None.
         applies: False if the condition does not cover the loop or the coupling, whatever the damping.
