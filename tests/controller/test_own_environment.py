@@ -72,7 +72,7 @@ def test_an_element_is_put_among_springs_and_walls():
 
 
 def test_a_block_equals_the_network_of_its_numbers():
-    """The block stands alone, then beside a spring; over Fractions its A is exact."""
+    """The block, alone and beside a spring, may add 2e-6 of its gain as a spring. Over Fractions its A is exact."""
     E = environment(INERT, T)
     alone = Network(INERT.contacts, block=Block.of(E))
     np.testing.assert_allclose(environment(alone, T).at(SQUARE), E.at(SQUARE), rtol=2e-6)
@@ -222,7 +222,7 @@ def test_maxwell_elements_are_passive_despite_rounding():
 def test_a_scenario_takes_an_own_environment():
     own = load().replace(environment=Gel())
     same = load().replace(environment=Network(Gel.contacts, (Spring(Gel.contacts, 600.0, 2.0),)))
-    np.testing.assert_allclose(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE), rtol=2e-6)
+    np.testing.assert_allclose(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE), rtol=2e-6)  # Block's spring
     with pytest.raises(InputError, match=r"environment int: expected a class with contacts, and E\(T\) or parts\(\)"):
         load().replace(environment=3)
     with pytest.raises(InputError, match=r"^environment Scalar.E\(T\) is 3.0, expected .*Lti with 2 inputs and 2 out"):

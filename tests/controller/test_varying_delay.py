@@ -99,7 +99,7 @@ def test_patterns_are_what_they_are_called():
     np.testing.assert_allclose(counts[1:], ticks / 3, rtol=0, atol=4 * np.sqrt(ticks * 2 / 9))
     bursty = VaryingDelay((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
     starts = int((np.diff(bursty) == 1).sum())
-    # about 1600 bursts and calm times, both geometric: 4 standard deviations of their number are 8 percent
+    # about 1600 bursts and calm times, both geometric: 4 deviations of their number are 8 percent, of the share 11
     assert starts == pytest.approx(ticks / 25, rel=0.1)
     assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
     recorded = VaryingDelay((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))

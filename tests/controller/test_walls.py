@@ -189,7 +189,7 @@ def boxed(scenario):
 @pytest.mark.parametrize(
     ("name", "humans", "seconds"), [("exact", 60, 4.0), pytest.param("mujoco", 6, 3.0, marks=pytest.mark.slow)]
 )
-def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
+def test_any_environment_hands_on_walls_slow_down(name, humans, seconds):
     """Behind a certified coupling all hands slow down from the first to the last quarter, despite many contacts."""
     scenario = boxed(load())
     assert requirements_of(scenario.loop("I"), SOFT)["any-environment"].certified
@@ -249,7 +249,7 @@ def test_a_run_reports_contact_and_its_certificate(tmp_path):
     assert any("no certificate covers it" in line for line in bare["remarks"])
 
 
-def test_this_environment_is_asked_of_every_frozen_state():
+def test_walls_need_more_damping_than_frozen_states():
     """Two walls make four linear loops; switching between them requires more damping than each by itself."""
     loop = boxed(load()).loop("I")
     requirement = requirements_of(loop, SOFT)["this-environment"]

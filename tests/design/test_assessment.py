@@ -35,7 +35,7 @@ from tests.asked import needs, safe_with
 ONE = parse(ONE_MASS)
 LOOP = ONE.loop("I")
 SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified in the default loop for any environment
-HERE_ONLY = SpringDamper([2100.0], [1.0])  # needs 97 % of the damping in LOOP
+HERE_ONLY = SpringDamper([2100.0], [1.0])  # this-environment needs 97 % of LOOP's damping
 change = msgspec.structs.replace
 
 
@@ -71,7 +71,7 @@ def test_another_loop_loses_the_guarantee(changes):
 
 
 def test_an_energy_account_covers_no_latency():
-    """A hand that moves only before forces latch takes energy from the last force, and the account misses this work."""
+    """A hand that moves only before forces latch takes energy from the previous force; the account misses it."""
     assert assess(LOOP, HERE_ONLY, energy_budget=0.1).guarantee.condition == "energy-budget"
     late = change(LOOP, latency=((0.0, 2e-4),))
     for accounted in ({"energy_budget": 0.1}, {"environment": lambda x: -100 * x}):
@@ -144,7 +144,7 @@ def test_a_users_condition_must_name_switching_delays():
 
 @pytest.mark.slow
 def test_a_guarantee_names_its_limiters_known_devices():
-    """This-environment certifies every device here, but its limiter needs 0.5 % more damping than is available."""
+    """This-environment needs 0.991 of the damping and its limiter 1.005: only the known devices' limiter is proved."""
     bounds = DeviceBounds(0.1, 2000.0, 0.5, 2.0)
     loop = change(LOOP, delta=(0.98 * 1.37,), known_devices=(bounds,))
     limited = assess(loop, HERE_ONLY)
@@ -212,7 +212,7 @@ def test_wrong_multipliers_of_a_limiter_are_replaced(wrong):
 
 @pytest.mark.slow
 def test_a_stored_limiter_proof_covers_no_longer_delay():
-    """The stored proof is for a delay of 1 sample. With 801 samples the loop has more states than are proved."""
+    """The stored proof is for a delay of 1 sample. With 801 samples the loop has too many states for a proof."""
     loop = Loop(1e-3, (1,), (0,), (0,), (1.5,), Network(("a",), (Spring(("a", GROUND), 300.0),)))
     coupling = SpringDamper([1.0], [0.01])
     on_file = prove(loop, coupling, LIMITER)
@@ -351,7 +351,7 @@ def test_switching_before_walls_needs_more_damping():
 
 
 def test_guarantees_name_the_environment_that_runs():
-    """A rigid wall behind 50,000 N/m needs at least 5/2 K T = 125 N s/m; the spring of 500 N/m that runs is soft."""
+    """Two samples late, a rigid wall behind 50,000 N/m needs 5/2 K T = 125 N s/m. The spring that runs is soft."""
     rigid = Loop(1e-3, (1,), (0,), (0,), (1.37,), RIGID_WALL, varying_delay=DelayRange((1,), (2,)))
     soft = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
     coupling = SpringDamper([50_000.0], [0.0])

@@ -135,7 +135,7 @@ def test_the_stiffest_gains_respect_full_levels():
 
 
 @pytest.mark.slow
-def test_axes_of_a_late_device_share_multipliers():
+def test_stiffest_axes_of_late_devices_hold_together():
     """The stiffest K of the two axes are certified together, not only axis by axis."""
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
     late = {"axes": (2,), "latency": ((0.0, 5e-4),) * 2}
@@ -191,6 +191,7 @@ def test_optimal_gains_rounded_up_fail_any_environment():
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
 def test_certification_ends_at_the_reported_edges(subject, condition):
+    """An edge errs by 1e-7: nothing is certified 1e-5 (1e-6 for delta) or one sample beyond it."""
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
@@ -499,8 +500,8 @@ def test_long_computations_are_refused_or_ended(monkeypatch):
     assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason
 
 
-def test_tables_of_switching_delays_are_for_constants(run):
-    """A wall K needs K T/2 without delay; switching within [0, 1] needs 3/2 K T, which the verdict says."""
+def test_tables_of_switching_loops_use_constant_delays(run):
+    """A wall K needs K T/2 without delay; switching within [0, 1] needs 3/2 K T, more than is available."""
     loop, coupling = wall(1000.0, 0.0)
     audited = audit(loop.switching(DelayRange((0,), (1,))), coupling)
     for condition in CONDITIONS:

@@ -167,7 +167,8 @@ def test_any_environment_takes_matrix_levels() -> None:
 
 def test_latency_takes_matrix_levels() -> None:
     late = msgspec.structs.replace(LOOP, latency=((1e-4, 3e-4),) * 2 + ((2e-4, 2e-4),) * 2)
-    apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)  # q11 < 1/t2 and q22 < 1/(T - t1) of device 1
+    # Without q12, q11 < 1/t2 and q22 < 1/(T - t1) of device 1. The constant latency of device 2 has only zeros.
+    apart = (1 / 3e-4 - 1e-9, 0.0, 0.0, 0.0, 1 / 9e-4 - 1e-9, 0.0)
     assert required_damping(late, BUILT, "this-environment", apart).ratio == pytest.approx(0.619369, abs=5e-7)
     assert required_damping(late, BUILT, "this-environment").ratio < 0.619369
 
@@ -318,7 +319,10 @@ def test_a_stiffness_matrix_meets_its_closed_form() -> None:
 
 @pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
 def test_walls_need_damping_along_their_normal(theta: int, damping: float, needs: float) -> None:
-    """The ratio is s = c n' Delta^-1 n, the least with s Delta >= c n n': n is the normal, and one axis needs c."""
+    """A wall that needs c on one axis has s = c n' Delta^-1 n, the least s with s Delta >= c n n'; n is its normal.
+
+    Separate code gave c = 4.2221 with five digits; the closed forms are k T/2 + b and, one sample late, 3 k T/2.
+    """
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
     network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})

@@ -47,7 +47,7 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
 def test_loops_with_psi_are_proved_with_phi(psi):
-    """With psi >= 1 a proof of Theorem 4 needs a large enough Phi and guarantees this environment only."""
+    """With psi = 1 in a channel, Theorem 4 needs a large enough Phi and guarantees this environment only."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(loop)
     stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "any-environment", found.phi))
@@ -94,7 +94,7 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
 def test_safe_gains_are_proved_again_from_files(tmp_path, coupling, condition, ratio):
     stored = certified(DEFAULT, coupling, condition)
     assert stored.certificate.proof == "rational"
-    if ratio:  # None: this ratio is not compared
+    if ratio:  # None: not compared; the others have three digits
         assert stored.certificate.required[0] / 1.37 == pytest.approx(ratio, abs=1e-3)
     save(stored, tmp_path / "coupling.json")
     assert load(tmp_path / "coupling.json") == stored
@@ -119,6 +119,7 @@ def test_unsafe_gains_are_refused(coupling, condition):
 
 
 def test_no_coupling_is_proved_where_the_damping_suffices():
+    """Without a coupling the loop needs 1.7229 N s/m."""
     assert verify(certified(change(DEFAULT, delta=(1.7232, 1.7232)), NoCoupling(), "this-environment")).proved
 
 
@@ -313,7 +314,7 @@ def test_realisations_changed_by_rounding_are_refused(condition):
 
 
 def test_the_bound_on_rounding_holds_over_ticks():
-    """Parseval's theorem bounds the errors of 200 forces by `rounding` times the norm of x, less than 3 sqrt(200)."""
+    """Parseval's theorem bounds the errors of 200 forces by `rounding` times |x|, and |x| is below 3 sqrt(200)."""
     loop, rng = change(wall(1000.0, 2.0, 5.0), theta=(1,), lam=(1,)), np.random.default_rng(8)
     for size in (1.0, 1e3):
         running, exact = loop.F(cancelling(size)), loop.F(cancelling(size), exact=True)
@@ -461,6 +462,7 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
     loop = Loop(1e-3, (1,) * m, (0,) * m, (1,) * m, (5.0,) * m, network)
     for coupling in (NoCoupling(), SpringDamper((900.0,) * m, (0.2,) * m)):
         needed = required_damping(loop, coupling, "this-environment").required
+        # A proof may need 1e-4 more damping than the sweep.
         for factor, expected in ((1 + 1e-4, True), (1 - 1e-6, False)):
             asked = change(loop, delta=tuple(d * factor for d in needed))
             try:
@@ -505,7 +507,7 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
 
 
 def test_a_loop_with_a_long_delay_is_stored(tmp_path):
-    """The coupling of a loop with a delay of 101 samples is proved, and its file is saved and loaded."""
+    """A delay of 101 samples, one more than an audit allows, is proved, saved and loaded."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
     kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
     save(kept, tmp_path / "late.json")

@@ -223,7 +223,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
         assert told is reason or told.startswith(reason)
     zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # with P = 1 the KYP matrix is exactly zero
     assert _prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
-    # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
+    # An unstable block may have a positive KYP matrix with P < 0; only the inequality P > 0 refuses it.
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert _prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or too close to singular for a proof"

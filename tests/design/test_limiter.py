@@ -97,6 +97,7 @@ def test_limited_springs_meet_their_closed_forms(theta):
 
 @pytest.mark.parametrize(("c", "factor"), [(0.0, 2.0), (0.25, 1.6875), (0.5, 1.5625), (1.0, 1.5), (2.0, 1.6)])
 def test_the_multiplier_sets_a_delayed_springs_need(c, factor):
+    """One sample late, a spring K needs (2 + c)^2/(4 c + 2) K T with the multiplier c."""
     G = Lti.constant([[1000.0]], T)
     assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
 
@@ -157,7 +158,7 @@ def test_unequal_multipliers_need_enough_rho():
     assert required(BUILT, unequal) < 1.36
 
 
-def test_bad_multipliers_and_betas_are_refused():
+def test_bad_multipliers_betas_and_loops_are_refused():
     G = PAIR.sent(BUILT)
     with pytest.raises(ValueError, match="equally many per device"):
         limiter(G, (1, 2), DELTA, LAG, ((0.1,),))
@@ -171,7 +172,10 @@ def test_bad_multipliers_and_betas_are_refused():
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
 def test_the_least_multiple_makes_the_block_singular(rank):
-    """The least eigenvalue of free + s gain is 0 at the least s, positive just above it and not positive below."""
+    """At the least s free + s gain is singular, just above it positive, and below it not.
+
+    s is infinite unless `free` is positive where `gain` vanishes.
+    """
     rng = np.random.default_rng(rank)
     for _ in range(20):
         half = rng.normal(size=(3, rank)) + 1j * rng.normal(size=(3, rank))

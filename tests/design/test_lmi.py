@@ -152,7 +152,7 @@ def test_lemma_3_holds_above_the_norm_only(seed):
             assert np.linalg.eigvalsh(full).min() > 0
 
 
-def test_15_as_printed_is_strictly_infeasible():
+def test_15_as_printed_is_not_strictly_feasible():
     E = unit_environment(environment(FIGURE_4, T), DELTA)
     printed = e_hat_printed(E, (0, 0))
     n = printed.order

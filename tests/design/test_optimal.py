@@ -62,7 +62,7 @@ _bounds = {}
 
 
 def short_bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None):
-    """Return the bound with eight knots, computed once for each loop."""
+    """Return the bound with eight knots, whatever `knots` is; it is computed once per loop and band."""
     key = msgspec.json.encode(loop), band_hz
     if key not in _bounds:
         _bounds[key] = bound(loop, band_hz, 8)
@@ -278,7 +278,7 @@ def test_sixteen_samples_beside_slow_poles_are_proved():
 
 
 def random_loop(seed: int) -> Loop:
-    """Draw one to three devices around one or two masses, with random stiffnesses and small delays."""
+    """Draw one to three devices around one or two masses, with random stiffnesses, theta up to 8 and psi up to 2."""
     rng = np.random.default_rng(seed)
     m = int(rng.integers(1, 4))
     contacts = tuple("abc"[:m])

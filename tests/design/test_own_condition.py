@@ -165,7 +165,7 @@ def test_facts_and_conditions_need_one_method_each():
 
 
 def test_an_own_fact_matches_a_dense_sweep(repeats):
-    """The ratio s is the least with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid; no other a has less."""
+    """The ratio s is the least with He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2) on a grid; 8 other a have no less."""
     own = repeats["RepeatedForces"]()
     found = required_damping(PAIR, SOFT, own)
     F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
@@ -226,7 +226,7 @@ def test_own_conditions_state_environments_and_limits():
 
 @dataclass(frozen=True)
 class Mean(Coupling):
-    """A spring after a mean of two samples. Its form is `kept` times as soft, its compliance `told` times."""
+    """A spring after a weighted mean of two samples; `kept` softens its form, and `told` its compliance."""
 
     K: float
     kept: float = 1.0

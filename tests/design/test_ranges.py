@@ -263,7 +263,7 @@ def test_the_sweep_agrees_with_the_condition_by_hand(robust):
 
 @pytest.mark.slow
 def test_an_absent_environment_needs_no_damping():
-    """At the vertex without both springs the object exerts no force, so no damping is required."""
+    """At the vertex without either spring the object exerts no force, so no damping is required."""
     both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in LOOP.network.springs))
     loop = change(LOOP, ranges=both)
     found = optimal.design(loop, SMALLEST)

@@ -25,7 +25,7 @@ E = environment(FIGURE_4, T)
         (SpringDamper([878.86, 551.94], [0.3865, 0.5220]), (0, 0), 18.60, 0.15),
     ],
 )
-def test_agreed_figures(coupling, lam, sup, rms):
+def test_mismatches_equal_recorded_figures(coupling, lam, sup, rms):
     figures = transparency(force_map(E, coupling, THETA, (0, 0)), E, lam)
     assert decibels(figures.relative_mismatch) == pytest.approx(sup, abs=0.006)
     assert decibels(figures.rms_mismatch) == pytest.approx(rms, abs=0.006)

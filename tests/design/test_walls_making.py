@@ -96,7 +96,10 @@ def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
 
 
 def test_without_m_closed_forms_bound_the_requirement():
-    """With m = 0 the need is at least (k/2 + b) T at theta = 0, (k/2 + b + k^2/(4 b)) T at 1, and 7.5 N s/m at 2."""
+    """With m = 0 the least need is (k/2 + b) T at theta = 0, (k/2 + b + k^2/(4 b)) T at 1, and 7.5 N s/m at 2.
+
+    One choice of the other multipliers per theta does not need less.
+    """
     k, damping = 3000.0, 2.0
     b = damping / T
     for theta, need in ((0, (k / 2 + b) * T), (1, (k / 2 + b + k**2 / (4 * b)) * T), (2, 7.5)):

@@ -27,7 +27,7 @@ T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 RANGED = scenario.load(SCENARIOS / "omega-pair-ranges.toml").loop("I")
 _first, _second = FIGURE_4.springs
 STIFF = (msgspec.structs.replace(_first, stiffness=840.0), msgspec.structs.replace(_second, stiffness=735.0))
-#: The edge of RANGED on which VERTICES_ONLY violates the condition: both springs at their upper ends, any mass.
+#: The edge of RANGED, inside of which VERTICES_ONLY violates the condition: both springs are at their upper ends.
 EDGE = msgspec.structs.replace(
     RANGED, environment=Network(FIGURE_4.contacts, STIFF, {"mass": 2.0}), ranges=Ranges(masses={"mass": (0.5, 2.0)})
 )

@@ -249,7 +249,10 @@ def test_friction_loss_takes_more_than_it_creates(tmp_path):
 
 @pytest.mark.parametrize("scene", SCENES[:5])
 def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
-    """A one-sided row that presses has f = -D ((w+ - w)/h + b w+ + K (r + h w+)); no row is in a friction cone."""
+    """A one-sided row that presses has f = -D ((w+ - w)/h + b w+ + K (r + h w+)), which is <= 0 for the others.
+
+    No row is in a friction cone.
+    """
     port = world(tmp_path, scene_of_the_lemma(1, *scene[1:])).port()
     pressed = 0
     for k in range(300):
@@ -431,7 +434,7 @@ def test_scene_defaults_do_not_reach_slides(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "/proc/kmsg", "empty.xml"])
-def test_files_without_an_end_are_refused(tmp_path, name):
+def test_empty_or_irregular_files_are_refused(tmp_path, name):
     (tmp_path / "empty.xml").touch()
     with pytest.raises(ValueError, match="is empty or not a regular file, expected an MJCF file"):
         touchable_bodies(tmp_path / name)
