@@ -86,7 +86,7 @@ def main(argv: list[str]) -> int:
         limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
         with options.refused():
             audited = audit(loop, coupling, condition, args.seed, limits, move)
-    if not args.rigid:  # CHAI3D's wall replaces the scenario's devices.
+    if not args.rigid:  # The loop before a rigid wall is judged without the scenario's encoder steps and lost packets.
         audited = replace(audited, assessment=qualified(scenario, args.case, audited.assessment))
     notes = ()
     if args.coupling and not _is_own(args):
@@ -121,8 +121,8 @@ def _parser() -> options.Parser:
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|FILE.py:NAME", help=stored)
     parser.add_condition(
-        "the report judges this-environment and any-environment; for exit code 0 this condition must hold (default "
-        "this-environment, or known-device for known devices)",
+        "condition that must hold for exit code 0 (default this-environment, or known-device for known devices); the "
+        "report judges this-environment and any-environment in any case",
         to=coupling,
     )
     device = "its damping and, unless gains are given, CHAI3D's largest gains on a rigid wall at 1 kHz"

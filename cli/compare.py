@@ -217,7 +217,10 @@ def _guarantees(report: Comparison) -> render.Table:
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
-    title = f"{damping} (available: {_list(available)} N s/m) · {report.scenario}, case {report.case}"
+    title = (
+        f"{damping} (available: {_list(available)} N s/m; at 10 %: for the worst stiffness or mass within 10 %) · "
+        f"{report.scenario}, case {report.case}"
+    )
     scale = available[0] if alike else 1.0
     cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
     for i, condition in enumerate(report.conditions):
@@ -235,7 +238,7 @@ def _guarantees(report: Comparison) -> render.Table:
 
 
 def _guaranteed(report: Comparison) -> str:
-    """Return the verdict, the guarantee of each coupling."""
+    """Return the verdict of the command: one sentence with the guarantee of each coupling."""
     words = [f"{coupling.name} ({coupling.assessment.guarantee_words or 'none'})" for coupling in report.couplings]
     return f"Guarantee: {', '.join(words)}."
 

@@ -124,7 +124,7 @@ _MOMENT = 0.05  # [s]
 def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__unraisablehook__) -> None:
     """Repeat a moment later a Ctrl-C that came during a clean-up such as __del__, where Python ignores it.
 
-    Here, too, Python would ignore it. `shown` is an argument because Python deletes `sys` at its end.
+    Python would also ignore one that is raised here. `shown` is an argument because Python deletes `sys` at its end.
     """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         shown(unraisable)

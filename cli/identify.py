@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--speed", type=number(0.05, 1.5), default=0.5, metavar="M/S", help=fast)
     far = "amplitude of the slow swing (default 30)"
     add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)
-    count = "sittings; each records every axis with the handles at another place, and two must agree (default 2)"
+    count = "number of sessions; each records every axis with the handles at another place; two must agree (default 2)"
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
     stay = "leave the handles where they are between sittings (for an emulator, whose handles nobody moves)"
     add("--same-place", action="store_true", help=stay)

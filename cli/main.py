@@ -22,7 +22,7 @@ COMMANDS = {
     "validate": ("sim.validate", "test with random passive humans in both engines, and search for the worst"),
     "bridge": ("hw.bridge", "drive a device with a certified coupling"),
     "zwidth": ("sim.zwidth", "draw the Z-width map: which springs and dampers are safe"),
-    "view": ("sim.view", "feel the loop in a window, or film it"),
+    "view": ("sim.view", "show the loop in a window, or film it"),
     "trace": ("sim.trace", "measure how oscillations grow in a stored trace"),
     "accuracy": ("sim.accuracy", "compare speed and error of the engines"),
     "check": ("design.check", "prove a stored coupling again, from its file alone"),

@@ -146,7 +146,10 @@ class Parser(argparse.ArgumentParser):
         for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
             what = f"{what} delay of each device [samples], or one for all"
             loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
-        damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m], or one for all"
+        damping, what = (
+            several(float, 0, MOST_DAMPING, "N s/m"),
+            "guaranteed damping of each device [N s/m], or one for all",
+        )
         loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
         longest = (

@@ -93,7 +93,7 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: 1 with exponential without friction, else enough for the fastest motion)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
-    error = "try integrators and steps on this scene, and run with the fastest setting of a relative rms error up to E"
+    error = "try integrators and steps, and run with the cheapest whose positions have a relative rms error up to E"
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
     check = "repeat the run with RK4, which uses other formulas (with exponential, if RK4 ran), and compare"
     add("--cross-check", action="store_true", help=check)
@@ -143,12 +143,12 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
-    """Return the paper's figures beside those of this run. Raises InputError for another loop."""
+    """Return the paper's figures beside those of this run. Raises InputError for a loop that is not the paper's."""
     from haptic_loop.sim.report import beside_the_paper
 
     rows = beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
     if not rows:
-        raise InputError("--paper: the paper prints figures of its own two cases only; leave the loop as it is")
+        raise InputError("--paper: the paper prints figures of its own loop only; leave the loop as it is")
     return rows
 
 
@@ -264,7 +264,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield (
         "force error",
-        f"{apart}, compared before clipping (with a limiter or switching delays: after clipping)"
+        f"{apart}, before clipping (after it with a limiter, an energy budget or switching delays)"
         if apart
         else f"- ({report.ideal_force.reason})",
     )

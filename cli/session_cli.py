@@ -64,9 +64,9 @@ def add_link_options(parser: options.Parser) -> None:
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
     baud = "baud rate of a UART, checked against T, or none (default 921600; none for a pseudo-terminal or --rehearse)"
     add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
-    count = "answers that are timed (default 800)"
+    count = "number of answers that are timed (default 800)"
     add("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
-    share = "share of the measured answers whose age theta or the latency covers (default 0.99)"
+    share = "share of the measured answers that theta or the latency must cover by their age (default 0.99)"
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to the measured age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)

@@ -172,10 +172,10 @@ def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings,
 
 @dataclass(frozen=True)
 class _Searched:
-    """Results of the adversary; None without --adversary, or if Ctrl-C ended its search."""
+    """Results of the adversary; a result is None without --adversary, or if Ctrl-C ended its search."""
 
-    worst: Worst | None = None
-    drawn: Worst | None = None  # the worst human of a user's own class of populations; None for a Population
+    worst: Worst | None = None  # the worst lossless human
+    drawn: Worst | None = None  # the worst human that a user's own population can draw; None for a Population
     ratio: float = 0.0  # required over available damping of the attacked loop
     interrupted: bool = False
 
@@ -326,7 +326,10 @@ class _Report:
 def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
-    """Return how many hands make the loop grow with varying delays and with varying periods; None if constant."""
+    """Return how many hands make the loop grow while delays vary, and while periods or latencies vary.
+
+    A part is None if the scenario has no such variation.
+    """
     from haptic_loop.sim.switching import DelaysCovered
 
     scenario, switching, timing = question.scenario, None, None

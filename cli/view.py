@@ -162,7 +162,7 @@ def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(with_file=True))
     parser = options.Parser(
         "sim.view",
-        f"Feel the loop in a window, or film it.\n\nKeys: {keys}; `given` means --coupling FILE.json.",
+        f"Show the loop in a window, or film it.\n\nKeys: {keys}; `given` means --coupling FILE.json.",
         *_EXAMPLES,
         first="scenario coupling condition reference video script",
     )
@@ -175,7 +175,7 @@ def _parser() -> options.Parser:
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events SECONDS:EVENT (default of a video without world, --coupling or --case none: '{_SCRIPT}')",
+        help=f"events SECONDS:EVENT (default of a video, unless --coupling, --case none or a world: '{_SCRIPT}')",
     )
     until = "length (default: until the window is closed, or 3 s after a video's script; in a world the scenario's)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)

@@ -171,9 +171,9 @@ def _rows(report: MapReport) -> render.Rows:
         yield from _designed_rows(report.fixed)
     for name in report.conditions:
         error = (report.error or {}).get(name)
-        near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of the condition's own sweep" if error else ""
+        near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of that by single sweeps" if error else ""
         yield f"certified, {name}", f"{_share(report.ratios[name].certified_cells, report)}{near}"
-    stable = f"{_share(crowd.stable_cells, report)} ({crowd.decided_cells} decided)"
+    stable = f"{_share(crowd.stable_cells, report)} ({crowd.decided_cells} cells decided)"
     yield f"stable with all of {crowd.humans} random humans", stable
     if simulation.points:
         beside = f"{simulation.undecided} {UNDECIDED}, {simulation.differ_from_linear} unlike the linear loop"

@@ -9,7 +9,7 @@ HANDS = 500
 
 
 def meet(name: str, scenario: Scenario, coupling: Design | None) -> int:
-    """Print how many hands make the loop unstable and which one is worst, and return their number."""
+    """Print how many hands make the loop unstable and which hand is worst; return the number of unstable hands."""
     findings = validate(scenario, coupling, humans=HANDS, seed=1, engine="exact", duration=0)
     unstable = int((findings.exact > 0).sum())
     worst = int(np.argmax(findings.exact))

@@ -1,4 +1,4 @@
-"""python examples/touch_a_scene.py: three ways to touch one MuJoCo scene, with the same lossless hands.
+"""python examples/touch_a_scene.py: three ways to touch two MuJoCo scenes, with the same lossless hands.
 
     contact force times a gain   usual in robot simulators: the contact is at the device's position, and the device
                                  feels a part of the contact force, clipped by its motors

@@ -109,7 +109,8 @@ class Port:
     many humans of the same structure.
 
     Raises:
-        ValueError: A shape does not match, a parameter is negative, or a point other than a handle has no mass.
+        ValueError: A shape does not match, a parameter is negative, a point other than a handle has no mass, `pull` is
+            no spring-damper, or a port with several handles has an impedance.
     """
 
     mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
@@ -289,7 +290,7 @@ class Hand(Protocol):
         """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port.
 
         The force has the shape (N,) of t, or (N, axes) on a device with several axes. There a force of shape (N,) acts
-        on the first axis only.
+        on the first free axis only.
         """
         ...
 
@@ -308,7 +309,7 @@ def _freeze(record: object, name: str, values: Any) -> None:
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A mass and the spring-damper from it to the next mass, or to the moving equilibrium.
 
-    On a device with several axes damping and stiffness are one number for all directions, one number per axis, or
+    On a device with several axes damping and stiffness are one number for all directions, one number per free axis, or
     symmetric matrices.
     """
 
@@ -417,7 +418,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         return Port.chain_in_space(np.array(rows), axes)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Return the force of the last link on the last mass [N] at the times t [s], from the equilibrium's motion."""
+        """Return the force [N] of the equilibrium's motion on the last mass at times t (N,) [s], (N,) or (N, axes)."""
         if self.voluntary is None:
             return np.zeros_like(t)
         last, along = self.links[-1], self.voluntary.along

@@ -209,7 +209,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     contracts the joint or tendon named `pull`, by default the last spring-damper. Gravity and collisions are ignored.
 
     Raises:
-        ValueError: The model is not a network of masses, springs and dampers along x.
+        ValueError: The model is not a network of masses, springs and dampers along x, or `handle` or `pull` is missing.
     """
     import mujoco
 
@@ -736,7 +736,7 @@ def crowds(
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` lists the devices of each person who holds several, and `axes` each device's number of axes, as in Crowd.
+    `holds` lists the devices of each person who holds several, and `axes` the free axes of each device, as in Crowd.
     `known` are the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
     """
     drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}

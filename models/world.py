@@ -150,7 +150,7 @@ def touchable_bodies(path: Path) -> list[str]:
 class World:
     """A scene with slides and springs at its contacts, compiled with the settings that `WorldPort` needs.
 
-    One world serves any number of ports (simulations), one after the other on one thread.
+    One world serves any number of ports (simulations) on one thread; their steps may alternate.
     """
 
     def __init__(
@@ -307,7 +307,7 @@ class World:
 
 
 def _lifted_by_actuators(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Return the bodies (nbody,) whose gravity compensation acts through actuators, which may limit it."""
+    """Return a mask (nbody,) of the bodies whose gravity compensation acts through actuators, which may limit it."""
     lifted = np.zeros(m.nbody, dtype=bool)
     lifted[m.jnt_bodyid[m.jnt_actgravcomp != 0]] = True
     for body in range(1, m.nbody):  # parents come before their children
