@@ -30,7 +30,8 @@ from haptic_loop.design.certificate import lag, required_damping
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
-from haptic_loop.hw.limits import Gain, Heat, SafetyLimits, Units
+from haptic_loop.hw.encoders import EncoderMonitor, EncoderTest, Expected
+from haptic_loop.hw.limits import Heat, SafetyLimits, Units
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
 from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.couplings import assessed, choose, given
@@ -281,25 +282,25 @@ class Drive:
         settings: monitor.LinkSettings,
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
-        expected: monitor.Expected,
+        expected: Expected,
         still: Sequence[int],
     ) -> None:
         """Take `still` (m,) [counts], the range of encoders at rest, and `expected`, which predicts tested motions."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
-        self.gain = Gain(limits, T)
+        self.gain = 0.0  # factor of the controller's forces
         self.ended = False  # whether the gain has fallen to 0 and the last motor test, if any, is passed
         self.force = (0.0,) * config.axes  # [N] last force sent
         self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
         about = limits, T, units, still
-        first = monitor.EncoderTest(*about, expected, config.theta == 0)
-        last = monitor.EncoderTest(*about, expected, config.theta == 0, first.sizes)
+        first = EncoderTest(*about, expected, config.theta == 0)
+        last = EncoderTest(*about, expected, config.theta == 0, first.sizes)
         self._test, self._last_test = (first, last) if settings.test_encoders else (None, None)
         self.remarks = first.remarks  # what the test at arming could not judge
-        self.encoders = monitor.EncoderMonitor(*about)
+        self.encoders = EncoderMonitor(*about)
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
@@ -349,7 +350,7 @@ class Drive:
         self._check_motion(x, ticks, 1e-6 * lasted)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
-        if self.gain.value > 0:  # otherwise only test forces act
+        if self.gain > 0:  # otherwise only test forces act
             self.encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
@@ -361,13 +362,13 @@ class Drive:
             test = self._test.force(state, ticks) if self._test else None
             if test is None:
                 self._test = None
-                self.gain.rise(ticks)
+                self.gain = self.limits.next_gain(self.gain, ticks * self.T)
         elif direction < 0:
-            self.gain.fall(ticks)
-            if closing and self._last_test and self.gain.value == 0:
+            self.gain = self.limits.next_gain(self.gain, -ticks * self.T)
+            if closing and self._last_test and self.gain == 0:
                 test = self._last_test.force(state, ticks)
-            self.ended = self.gain.value == 0 and test is None
-        shaped = self.limits.shape(wanted, self.force, self.gain.value, self.T, test)
+            self.ended = self.gain == 0 and test is None
+        shaped = self.limits.shape(wanted, self.force, self.gain, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
         if self._budget:
             limited = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
@@ -381,7 +382,7 @@ class Drive:
         self._counters.slowed += shaped.slowed
         if self._commands:
             self._commands.tell(state.tick, steps)
-        self._record(TraceRow(state.tick, x, wanted, self.gain.value, steps, state, self._arming, test))
+        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming, test))
         return steps
 
     def _through_shell(
@@ -435,7 +436,7 @@ class Drive:
         """Advance the controller through ticks without a STATE, at interpolated positions (m,) [m]."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
             tick, wanted = (state.tick - back) & 0xFFFF, self.controller.step(x)
-            self._record(TraceRow(tick, x, wanted, self.gain.value, (), None, self._arming))
+            self._record(TraceRow(tick, x, wanted, self.gain, (), None, self._arming))
 
 
 # couplings that are certified for a link

@@ -131,7 +131,6 @@ class Rehearsal:
     faults: tuple[FaultInjection, ...] = ()
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
-    host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, duration [s]) of host freezes
     arm: bool = True  # whether to arm the first coupling; a softer coupling waits for a person
     operator: Operator | None = None  # decides in place of `arm`, as in a live session
     latency_us: float = _LATENCY_US
@@ -157,21 +156,24 @@ class Rehearsal:
 
     def run(self, seconds: float) -> Session:
         """Run until `seconds` of virtual time are over, and return the session."""
-        while self.now <= 1e6 * seconds:
-            self._turn()
-        return self.session
+        return self._run(lambda: self.now > 1e6 * seconds)
 
     def run_until_armed(self, seconds: float) -> Session:
         """Run until `seconds` after arming, or until shortly after the end of the session if that is earlier."""
-        while not self._over and (self.armed_us is None or self.now <= self.armed_us + 1e6 * seconds):
-            self._turn()
-        return self.session
+        return self._run(lambda: self._over or (self.armed_us is not None and self.now > self.armed_us + 1e6 * seconds))
 
     def run_to_the_end(self, most: float) -> Session:
         """Run until shortly after the end of the session, or for `most` seconds of virtual time."""
-        while not self._over and self.now <= 1e6 * most:
+        return self._run(lambda: self._over or self.now > 1e6 * most)
+
+    def _run(self, ready: Callable[[], bool]) -> Session:
+        while not ready():
             self._turn()
         return self.session
+
+    def freeze(self, seconds: float) -> None:
+        """Let time pass without the host, as a busy or hung computer does."""
+        self._pass(1e6 * seconds)
 
     @property
     def _over(self) -> bool:
@@ -201,10 +203,7 @@ class Rehearsal:
             self._ended = self.now
 
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
-        """Advance time until bytes have come, by at most `seconds`, and then until the host is no longer frozen.
-
-        Returns whether bytes have come, or a cable was pulled.
-        """
+        """Advance time by at most `seconds`, until bytes have come or a cable was pulled. Return whether they have."""
         until, cables = self.now + 1e6 * seconds, cables or self._cables
         one = cables[0]  # usually the only cable; the loop checks it first to save time
         while not (ready := bool(one.data or one.gone or (cables[1:] and _come(cables)))):
@@ -212,18 +211,7 @@ class Rehearsal:
                 self.now = until
                 break
             self._next()
-        if self.host_stalls and (frozen := self._frozen_for()) > 0:
-            self._pass(frozen)
-            return _come(cables)
         return ready
-
-    def _frozen_for(self) -> float:
-        """Return the time [us] for which the host stays frozen."""
-        since = self.emulator.since_armed(round(self.now))
-        if since is None:
-            return 0.0
-        left = [start + lasts - since for start, lasts in self.host_stalls if start <= since < start + lasts]
-        return 1e6 * max(left) + 1 if left else 0.0
 
     # the queue of events
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
+from haptic_loop.hw.encoders import EncoderNoise, Expected
 from haptic_loop.hw.limits import DRIVING, ENDED, SafetyLimits, Stage, Units, probe_delay, watchdog_for
-from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
+from haptic_loop.hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.models.device import symmetric
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
@@ -76,7 +77,7 @@ class Session:
     @property
     def gain(self) -> float:
         """The factor, from 0 to 1, of the controller's forces; 0 while the session does not drive."""
-        return self.drive.gain.value if self.drive else 0.0
+        return self.drive.gain if self.drive else 0.0
 
     @property
     def held(self) -> bool:

@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
+from haptic_loop.hw.encoders import EncoderMonitor
 from haptic_loop.hw.limits import SafetyLimits, Units
-from haptic_loop.hw.monitor import EncoderMonitor
 from haptic_loop.hw.protocol import SafetyStop
 
 T, TICKS, SUBSTEPS = 1.2e-3, 1000, 8

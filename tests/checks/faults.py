@@ -456,13 +456,17 @@ def _rehearse_case(
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(nobody(scenario) if case.free else scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick
+
+    def frozen(session: Session, now: int) -> Said:
+        rehearsal.freeze(case.host_stall)
+        return ()
+
     rehearsal = Rehearsal(
         session,
         emulator,
         _plan(case, scenario, made),
         faults,
-        actions=[(case.acts, case.action)] if case.action else (),
-        host_stalls=[(_WHEN, case.host_stall)] if case.host_stall else (),
+        actions=[(case.acts, case.action)] if case.action else [(_WHEN, frozen)],
         clock=case.period,
     )
     rehearsal.run_until_armed(case.lasts)

@@ -10,8 +10,9 @@ from msgspec.structs import replace
 from worlds import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
+from haptic_loop.hw.encoders import EncoderMonitor, EncoderNoise, EncoderTest, Expected
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
-from haptic_loop.hw.monitor import EncoderMonitor, EncoderNoise, EncoderTest, Expected, LinkSettings
+from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.protocol import Phase, SafetyStop, State
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session, session_for
