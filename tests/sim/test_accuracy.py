@@ -28,7 +28,8 @@ def report(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_measured_errors_and_verdicts_equal_known_ones(report):
+def test_integrators_have_known_errors_and_verdicts(report):
+    """When measured, RK4 x 4 had a relative position error of 5e-8 and a growth error of 2e-4 1/s."""
     code, outcome = report
     assert code == 0
     rows = {(row["integrator"], row["substeps"]): row for row in outcome["rows"]}
@@ -47,7 +48,7 @@ def test_measured_errors_and_verdicts_equal_known_ones(report):
 
 
 def test_cycle_deviation_is_that_of_the_last_forces():
-    """The deviation is the largest standard deviation of a channel's force in the last 4000 ticks of the cycle."""
+    """The deviation is the largest standard deviation of a channel's force in the last 4000 ticks without coupling."""
     scenario = load().replace(duration=5.0)
     loops = (assemble(scenario, PUBLISHED["I"]), assemble(scenario, NoCoupling()))
     row = measure(reference(*loops), "exact", None, None)
@@ -56,6 +57,7 @@ def test_cycle_deviation_is_that_of_the_last_forces():
 
 
 def test_each_engines_front_has_undominated_correct_rows():
+    # engine, wall time, position error, growth error, whether the verdict is right
     values = [("a", 1, 1, 1, True), ("a", 2, 0.5, -0.5, True), ("a", 3, 0.5, -0.6, True), ("b", 9, 9, 9, True)]
     cycle, values = (None,) * 4, (*values, ("a", 0.5, 2, 2, False))
     rows = [Row(kind, None, None, p, g, right, *cycle, wall) for kind, wall, p, g, right in values]
@@ -68,7 +70,7 @@ def test_a_duration_that_is_no_number_is_refused():
 
 
 def test_runs_say_when_they_stop_being_credible():
-    """Transmission forces and motor speeds follow from positions; in Figure 5's run a force exceeds 36 N at 7.35 s."""
+    """In Figure 5's run a transmission, a spring of 14500 N/m, exceeds the credible 36 N at 7.35 s."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
@@ -103,4 +105,5 @@ def test_dominant_frequency_is_independent_of_the_start_time():
     t = 1e-3 * np.arange(1000)
     f, none = np.sin(2 * np.pi * 50 * t)[:, None], np.zeros((1000, 1))
     rates = [Trace(t + begin, none, f, none, none, none, {}).dominant_frequency_hz() for begin in (0.0, 5.0)]
-    assert rates == pytest.approx([50.0, 50.0], abs=4.0)  # Lines of a spectrum of 0.25 s are 4 Hz apart.
+    # The spectrum is that of the last quarter of the run, 0.25 s, so its lines are 4 Hz apart.
+    assert rates == pytest.approx([50.0, 50.0], abs=4.0)

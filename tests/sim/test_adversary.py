@@ -1,4 +1,4 @@
-"""The search for the worst passive human destabilises loops that fail this-environment, and none that meets it."""
+"""The search for the worst passive human destabilises loops with too little damping, and none with enough."""
 
 import json
 from dataclasses import replace
@@ -33,7 +33,7 @@ def _few(monkeypatch):
 
 
 def test_the_search_destabilises_loops_below_the_requirement():
-    """With 5 % less damping than required, the search finds lossless hands that destabilise each loop."""
+    """With 5 % less damping than required, the search destabilises each loop."""
     rows = attempts(LOOPS, np.array([0.05]), generations=60)
     assert all(row.worst.destabilises for row in rows)
 
@@ -56,7 +56,7 @@ def test_the_search_assumes_longest_periods_and_latest_forces():
 
 @pytest.mark.slow
 def test_the_condition_is_tight_with_long_delays():
-    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping hands destabilise it."""
+    """With delays of 4 and 9 samples the condition binds at 8 Hz; with 0.5 % less damping the loop is destabilised."""
     delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
     rows = attempts(delayed, np.array([-1e-3, 0.005]), generations=6)
     print([(row.short, row.worst.growth) for row in rows])
@@ -66,7 +66,10 @@ def test_the_condition_is_tight_with_long_delays():
 
 @pytest.mark.slow
 def test_known_devices_are_searched_within_their_bounds(tmp_path):
-    """The nominal motors are heavy; the search finds the lightest motor that the guaranteed bounds allow."""
+    """The nominal motors are heavy; the search finds the lightest motor within the bounds, 0.06 kg.
+
+    The found devices are saved and loaded again; a lighter motor in the file is refused.
+    """
     heavy = {"motor_mass": 1.0, "transmission_stiffness": 3000.0}
     known = load("omega-pair-known")
     devices = tuple(change(device, **heavy) for device in known.device)
@@ -125,7 +128,7 @@ def test_a_found_person_replays_with_equal_spectral_radius(tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_the_adversarys_search_is_repeatable():
-    """Its hands are lossless, and the scene of these hands has the growth that the search found."""
+    """The hands of the search are lossless, and their scene has the growth that the search found."""
     F = assemble(SCENARIO, NoCoupling()).F
     worst, again = (search(SCENARIO, F, seed=4, generations=5) for _ in range(2))
     assert worst == again
@@ -144,6 +147,7 @@ def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
     assert main([*options, "--out", str(out), "--json", str(file)]) == 0
     adversary = json.loads(file.read_text())["adversary"]
     assert adversary["found"]
+    # The loop requires 1.7229 N s/m (rounded) on each channel, and 1.37 N s/m are available.
     assert adversary["required_over_available_damping"] == pytest.approx(1.7229 / 1.37, rel=1e-4)
     replay = ["--case", "none", "--human", str(out / "adversary.toml"), "--duration", "0.5", "--engine", "exact"]
     assert run_command.main([*replay, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
@@ -152,7 +156,7 @@ def test_found_humans_replay_with_equal_spectral_radius(tmp_path):
 
 
 def test_validation_fails_if_an_adversary_contradicts_a_certificate(tmp_path, monkeypatch):
-    """Here the search attacks the uncoupled loop, which contradicts the coupling's certificate: the exit code is 1."""
+    """A search that attacks the uncoupled loop instead seems to contradict the certificate, so the exit code is 1."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(
         adversary, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)

@@ -1,4 +1,4 @@
-"""Devices with several axes match closed forms and devices with one axis; impossible ones are refused."""
+"""Devices with several axes match closed forms and devices with one axis; impossible fields are refused."""
 
 from __future__ import annotations
 
@@ -355,7 +355,8 @@ def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch
     for name in ("_NEWTON", "_HALVINGS", "_SPLIT"):
         monkeypatch.setattr(complementarity, name, 0)
     blocked = run_scenario(space, COUPLING, lag)
-    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # zeros are unsolved, or the delay's
+    # A force vector is 0 where no solution was found, and before the first delayed force arrives.
+    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()
     assert 10 < blocked.unsolved <= zero
     assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
 

@@ -13,7 +13,10 @@ SLOW = ("limited, any environment", "energy budget")
     "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GUARANTEES]
 )
 def test_requirements_suffice_and_much_less_fails(name):
-    """With 1.02 times what a guarantee requires, no adversary takes too much energy; with far less, one does."""
+    """With 1.02 times what a guarantee requires, no adversary takes too much energy; with far less, one does.
+
+    Forces are limited, or walls touched, in over a third of the ticks, so that the guarantee matters.
+    """
     rows = list(challenges(0, loops=1, hands=8, seconds=0.3, ticks=250, names=[name]))
     assert [row.factor for row in rows] == [ENOUGH, GUARANTEES[name][1]]
     enough, less = rows

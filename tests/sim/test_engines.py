@@ -62,7 +62,7 @@ def test_errors_shrink_at_the_order_of_the_integrator(simulation, exact, integra
 
 
 def test_the_default_engine_is_exact_to_1e_8(simulation):
-    """Without the tap the relative position error was 2e-14, or 9e-11 with RK4 x 4, when measured."""
+    """When measured without the tap, the relative rms position error was 2e-14, and with RK4 x 4 it was 9e-11."""
     quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
@@ -82,6 +82,7 @@ def test_the_exact_engine_equals_a_fine_integration(simulation):
         k2 = rate(expected + h / 2 * k1)
         k3 = rate(expected + h / 2 * k2)
         expected = expected + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(expected + h * k3))
+    # The rounding of 20000 steps adds up; when measured, the largest difference was 1e-12.
     np.testing.assert_allclose(held.A @ s + held.B @ u, expected, rtol=1e-10, atol=1e-10)
 
 
@@ -133,6 +134,7 @@ def test_uncoupled_limit_cycle_stays_within_the_force_limit():
     force = record.f[-4000:, 1]
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size)))
     assert np.abs(record.f).max() == 12.0
+    # The spectrum of 4000 ticks, 4.8 s, has lines 0.2 Hz apart.
     assert np.fft.rfftfreq(force.size, 1.2e-3)[spectrum.argmax()] == pytest.approx(83.85, abs=0.2)
     assert force.std() == pytest.approx(9.62, abs=0.02)
 
@@ -177,7 +179,10 @@ def test_runs_work_without_mujocos_profiler_clock(monkeypatch, simulation):
 
 
 def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
-    """A trace on disk has the same numbers as in memory; without room, the error gives the longest duration."""
+    """A trace on disk has the same numbers as in memory; without room, the error gives the longest duration.
+
+    The run's report needs 400 bytes of memory per tick, so that half of this memory allows half of the duration.
+    """
     expected, ticks = run(simulation, "exact"), simulation.scenario.samples
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(loop, "_SMALL", 0)

@@ -92,7 +92,8 @@ def longer(matrix):
 def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     """The measured map equals exponentials by SciPy and in extended precision.
 
-    Velocities are divided by the `fastest` mode [rad/s], so that they are of the size of positions. Rounding of the
+    Velocities are divided by `fastest`, about the fastest mode [rad/s], so that they are of the size of positions.
+    Rounding of the
     generator by `eps`, relative to its norm, moves its exponential by `eps` times the condition number; rounding of the
     result adds one `eps` for each term of its sums.
     """
@@ -348,8 +349,8 @@ def test_with_friction_the_cheapest_setting_keeps_the_error():
 def test_gaps_between_runs_bound_the_finest_error():
     """Gaps are distances between runs with n and 2 n substeps.
 
-    For runs x + c/n the bound is 1.5 c/n of the largest n. If gaps shrink by a factor q > 0.6, it is the last gap times
-    q/(1 - q).
+    For runs x + c/n the bound is 1.5 c/n of the largest n. If gaps shrink by a factor q from 0.6 to 0.7, it is the last
+    gap times q/(1 - q).
     """
     assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
     assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))

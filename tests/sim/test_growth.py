@@ -167,7 +167,7 @@ def test_unusable_traces_and_plot_paths_are_refused(tmp_path):
 
 
 def alike():
-    """Return two equal devices and hands with equal motions, joined so stiffly that a mode between them grows.
+    """Return a scenario of two equal devices and hands with equal motions, joined so stiffly that a mode grows.
 
     A BLAS kernel may add the two halves of a row in different orders. A tick then excites the mode by one rounding,
     2e-16 of the state. The mode grows by 33/s: all roundings of 0.35 s add up to 6e-10; 1e-8 counts as excited.

@@ -70,10 +70,10 @@ def quiet(loop):
 
 
 def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
-    """Return the share of 60 far starts and the number of `near` starts with clipping after 48 s, and a frequency.
+    """Return the share of 60 far starts and the number of `near` starts that still clip at the end, and a frequency.
 
-    Far starts are random within 0.5 m and 10 m/s; near starts are within a fifth of this. The frequency [Hz] is that of
-    the strongest motion.
+    A run lasts 48 s, and its end is the last 1.2 s. Far starts are random within 0.5 m and 10 m/s, near starts within a
+    fifth of this. The frequency [Hz] is that of the strongest motion at the end.
     """
     humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
     limits = (CompliantDevice(), CompliantDevice(force_limit=5.657))
@@ -162,4 +162,5 @@ def test_engines_agree_from_a_random_state():
 
     engines = (make_engine(loop, "mujoco", "RK4", default_substeps(loop, "RK4")), make_engine(loop, "exact"))
     a, b = (run(loop, engine, quiet(loop), 300, start) for engine in engines)
+    # The random start excites stiff modes, in which RK4 errs: by 9.3e-4 of the largest position when measured.
     assert np.abs(a.s[:, :2] - b.s[:, :2]).max() < 1e-3 * np.abs(b.s[:, :2]).max()

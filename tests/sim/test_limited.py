@@ -35,6 +35,7 @@ def test_the_limiter_follows_from_the_requirements():
     any_environment = _covered_limits(loop, SOFT, requirements_of(loop, SOFT))
     assert any_environment.rho == (0.0, 0.0)
     own = _covered_limits(loop, BUILT, requirements_of(loop, BUILT))
+    # rho = beta delta/T = 0.01 s 1.37 N s/m / 1.2 ms
     assert own.rho == pytest.approx((11.4167, 11.4167))
     assert own.requirement is not None
     assert own.requirement.proof == "rational"
@@ -79,7 +80,10 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
 @pytest.mark.parametrize("limit", [0.69, 1e3])
 def test_runs_in_blocks_equal_runs_by_ticks(engine, apart, limit):
-    """Runs in blocks equal runs tick by tick up to rounding, even if a block must be undone from a limited tick on."""
+    """Runs in blocks equal runs tick by tick up to rounding (RK4: exactly), even if a block must be undone.
+
+    A block is undone from its first limited tick on; `apart` is relative to a signal's largest value.
+    """
     simulation = assemble(weak(limit, limit).replace(duration=3.0), BUILT, (11.4167, 11.4167))
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
     fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))

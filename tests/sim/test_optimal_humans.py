@@ -92,7 +92,7 @@ def test_mujoco_gives_the_exact_verdicts(scenario, lossless):
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", [pytest.param(DEVICES[0], marks=pytest.mark.validate), DEVICES[1]])
 def test_adversaries_succeed_only_with_too_little_damping(scenario, monkeypatch):
-    """With 12 % less damping one of an adversary's 24 sets of hands destabilises the loop; with full damping none does.
+    """With 12 % less damping, hands of a short search destabilise the loop; with full damping none do.
 
     `python -m sim.validate --coupling optimal --adversary` runs a long search.
     """

@@ -66,7 +66,7 @@ def limited_and_idle(scenario, coupling, condition):
 
 
 def test_budgets_act_on_couplings_for_known_devices():
-    """known-device-any also uses the motors' mass, so stiff springs that it certifies are limited by the budget."""
+    """known-device-any also uses the motors' mass; the budget, which does not, limits forces that it certifies."""
     scenario = load("omega-pair-known")
     ends = scenario.environment.contacts
     network = Network(ends, tuple(Spring((end, "ground"), 1e6) for end in ends))
@@ -90,7 +90,10 @@ def test_budgets_act_where_walls_store_energy():
 
 
 def test_a_budget_acts_on_clipped_forces():
-    """Clipped at 0.3 and 0.1 N, a certified coupling gives 1.3 mJ on this closed path, so the budget must limit it."""
+    """Forces of a certified coupling, clipped at 0.3 and 0.1 N, do 1.3 mJ of work on this closed path.
+
+    This is 0.4 mJ more than the devices dissipate, so the budget, which begins empty, must limit the forces.
+    """
     loop, most = SHORT.loop("I"), np.array([[0.3], [0.1]])
     G, budget = loop.sent(SpringDamper([600.0, 400.0], [0.5, 0.5])), EnergyBudget(loop.delta, loop.T, Packets((1, 2)))
     corners = 1e-3 * np.array([[0, 0], [-10, -10], [-13, -10], [-3, 0], [0, 0]])

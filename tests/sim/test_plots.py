@@ -137,7 +137,7 @@ def test_onsets_have_amplitudes_and_grey_times(drawn):
     middle, sizes = plots._amplitudes(result, 84.0, 5000)
     np.testing.assert_allclose(sizes[:, 0], 1e-6 * np.exp(1.4 * middle), rtol=0.02)
     assert middle[-1] < 5.0  # the amplitudes end before the first clipped tick
-    onset = Onset(1.4, 5000, 4.0)
+    onset = Onset(1.4, 5000, 4.0)  # growth [1/s], first clipped tick, end of the credible part [s]
     figure = plots.draw_run(result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
     assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
@@ -210,7 +210,7 @@ def test_binding_frequencies_are_marked(undrawn):
     assert anywhere.get_title() == "any passive environment (with a multiplier for this environment)"
 
 
-def test_drawn_singular_values_are_the_reported_ones(undrawn):
+def test_drawn_curves_are_the_reported_ones(undrawn):
     figure = undrawn(plots.plot_singular_values, report())
     assert [axis.get_title() for axis in figure.axes] == ["soft", "stiff"]
     assert legend(figure) == ["E, the environment", "F, felt at the devices", "M, the mismatch"]

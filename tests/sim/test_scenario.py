@@ -157,8 +157,8 @@ def test_replacing_nothing_changes_nothing(name):
     assert same.digest == scenario.digest
 
 
-def test_scripts_and_files_make_equal_scenarios():
-    """Scripts may use lists, NumPy's arrays and numbers, and integers for floats."""
+def test_scripts_may_use_lists_arrays_and_integers():
+    """Lists, NumPy's arrays and numbers, and integers for floats give the same scenario as tuples and floats."""
     scenario = load().replace(theta=[1, 3], psi=np.array([1, 0]), T=np.float64(1e-3), duration=2, delta=np.ones(2))
     assert (scenario.theta, scenario.psi, scenario.delta) == ((1, 3), (1, 0), (1.0, 1.0))
     assert [type(value) for value in (*scenario.psi, scenario.T, scenario.duration)] == [int, int, float, float]

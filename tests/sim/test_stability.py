@@ -39,7 +39,8 @@ from haptic_loop.sim.stability import (
     ("coupling", "growth", "frequency"),
     [(NoCoupling(), 1.481, 83.98), (PUBLISHED["I"], -0.939, 83.83), (PUBLISHED["II"], -1.718, 1.93)],
 )
-def test_exact_and_measured_growth(coupling, growth, frequency):
+def test_measured_growth_equals_that_of_eigenvalues(coupling, growth, frequency):
+    """Traces and eigenvalues agree; the listed growth [1/s] and frequency [Hz] are rounded."""
     simulation = assemble(load(), coupling)
     loop = close(simulation.plant, simulation.F)
     mode = dominant_mode(loop)
@@ -115,7 +116,7 @@ def test_free_hands_settle_by_their_speed():
 
 
 def test_figures_of_an_impulse_follow_from_its_trace():
-    """Energy is the least sum of f'dx + dx' delta dx/T; settling is the speed in the last quarter over the second's."""
+    """Energy is the least sum of f'dx + dx' delta dx/T; settling is the last quarter's speed over the second's."""
     late = Network(("a",), (Spring(("a", GROUND), 2000.0),))
     scenario = load("one-wall").replace(environment=late, theta=(2,), tap=None)
     question = Validation(scenario, NoCoupling(), 0, 3, 1, "exact", 0.25)

@@ -110,7 +110,7 @@ def test_substeps_with_friction_include_the_person():
     """The number of substeps follows from the scene without friction, but with the person who holds both devices."""
     person, device = Person((1, 2), 20.0, 1.0, 100.0), CompliantDevice(friction=0.5)
     loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), PUBLISHED["I"])
-    assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5
+    assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5  # two motors, two handles and the body
     assert default_substeps(loop, "RK4") == 4
 
 

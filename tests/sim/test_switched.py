@@ -318,7 +318,7 @@ def test_constant_delays_of_uncertified_loops_are_uncovered():
     assert "nothing is certified" in found.covers
 
 
-def test_runs_report_the_constant_delays_mismatch():
+def test_the_felt_force_includes_constant_delays():
     """The law of a switching loop sends G without Theta; `felt`, from which reports are made, is F = Theta G."""
     moved = with_delays(ASSEMBLY, np.ones((5, 2, 1), dtype=int))
     z = np.exp(1j * np.linspace(0.001, 3, 50))

@@ -281,7 +281,7 @@ def test_sampled_traces_are_those_of_all_hands():
     assert chosen[lossless].all()
     for batch in question.batches():
         assert chosen[batch[int(np.abs(some.exact[list(batch)]).argmin())]]
-    assert 64 <= chosen.sum() < 160
+    assert 64 <= chosen.sum() < 160  # the random sample has 64 hands
     more = Traces.of(question, some)
     assert (more.witnessed, more.humans) == (chosen.sum(), 200)
 

@@ -282,6 +282,7 @@ def test_every_tick_is_made_or_counted_as_lost(steps):
         assert 0 <= pace.due(now) <= 100
         # after each call less than a tick is left over
         assert -1e-6 <= now - pace.lost - pace.done * pace.T <= pace.T * (1 + 1e-6)
+    # More than 100 ticks are due only if the step, with the rest of less than a tick, exceeds 0.1 s.
     assert pace.overruns <= sum(step > 0.098 for step in steps)
 
 
@@ -296,7 +297,7 @@ def test_late_ticks_are_lost_and_counted():
 # the mouse
 
 
-def test_the_mouse_is_one_more_passive_hand(none):
+def test_the_mouse_adds_a_spring_and_damper(none):
     """A grip equals a hand of one link with the mouse's spring and damper added to those of the link."""
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))

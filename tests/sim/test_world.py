@@ -140,7 +140,7 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
 
 
 def test_the_plate_lifts_the_cube():
-    """Friction at the plate lifts the cube of 0.1 kg by more than a centimetre."""
+    """The plate rises by 3 cm; its friction lifts the cube, which rests at 3 cm, by more than a centimetre."""
     loop = load("world-cube")
     coupling = certified(loop).coupling
     port, shell = scene_of(loop, coupling).port(LIMIT), Shell(coupling.compliance(T), start=START_J)
