@@ -204,6 +204,8 @@ def _sitting(
     # `hold_session` counts time at full gain; the gain rises while the excitation begins with 0.3 s of zero force.
     seconds = played(1).seconds - 0.2
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
+    if number == 1:
+        render.remove_earlier(out, "devices.toml", *(each.name for each in out.glob("trace-[0-9]*.npz")))
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
         try:

@@ -215,7 +215,8 @@ def _save(
 ) -> list[Path]:
     """Save humans for `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
-    render.remove_earlier(out, "population.png")
+    humans = "worst-human.toml", "adversary.toml", *(each.name for each in out.glob("disagreement-[0-9]*.toml"))
+    render.remove_earlier(out, "population.png", *humans)
     named = {f"disagreement-{i}.toml": int(i) for i in findings.index[findings.disagreements]}
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}

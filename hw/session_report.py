@@ -254,12 +254,14 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 
 def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
-    """Write the trace (if forces acted), its picture and the report, and return their paths."""
-    files, acted = [], len(recorder) > 0
-    for name, written in (("trace.npz", acted), ("trace.csv", acted), ("figure.png", acted and plot)):
-        if not written:
-            remove(out / name)  # A file of an earlier session must not stand beside this report.
-    if acted:
+    """Write the trace (if forces acted), its picture and the report, and return their paths.
+
+    The files of an earlier session are removed first, the report before all others: an interrupt leaves no report.
+    """
+    files = []
+    for name in ("report.json", "trace.npz", "trace.csv", "figure.png"):
+        remove(out / name)
+    if len(recorder):
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
         names = session.scenario.channel_names
         result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay}, names)

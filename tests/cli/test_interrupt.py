@@ -120,7 +120,18 @@ TRACES = ["trace.csv", "scene.xml", "figure.png"]
         (
             ["sim.validate", "--coupling", "published", "--humans", "2", "--duration", "0"],
             "haptic_loop.cli.validate.save_humans",
-            ["population.png"],
+            ["population.png", "worst-human.toml", "adversary.toml", "disagreement-7.toml"],
+        ),
+        (
+            ["hw.bridge", "--rehearse", "--duration", "0.1"],
+            "haptic_loop.sim.trace.Trace.save_csv",
+            ["trace.csv", "figure.png"],
+        ),
+        pytest.param(
+            ["hw.identify", "--rehearse", "--seconds", "0.5", "--sittings", "1"],
+            "haptic_loop.sim.trace.Trace.save_npz",
+            ["devices.toml", "trace-1.npz", "trace-2.npz"],
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -141,7 +152,8 @@ def test_ctrl_c_while_storing_mixes_no_runs(command, writer, files, tmp_path, mo
 def finish(command, folder):
     """Run a command in this process, without pictures, and return its exit code."""
     main = import_module(f"haptic_loop.cli.{command[0].rpartition('.')[2]}").main
-    return main([*command[1:], "--no-plot", "--out", str(folder)])
+    undrawn = [] if command[0] == "hw.identify" else ["--no-plot"]
+    return main([*command[1:], *undrawn, "--out", str(folder)])
 
 
 def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
