@@ -22,7 +22,7 @@ from haptic_loop.sim.accuracy import MOST
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.engines import INTEGRATORS
 from haptic_loop.sim.run import ENGINES, EngineSettings
-from haptic_loop.sim.scenario import InputError, Scenario, is_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_latch_at_ticks
 from haptic_loop.sim.shown import Contacts, Onset, Signals
 
 if TYPE_CHECKING:
@@ -114,6 +114,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     scenario = options.with_varying_delays(args, options.scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
+    if args.energy_budget or is_world(scenario):
+        require_latch_at_ticks(scenario)
     return options.with_humans(args, scenario)
 
 

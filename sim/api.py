@@ -31,7 +31,14 @@ from haptic_loop.sim.run import (
     make_engine,
     run,
 )
-from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_linear, require_no_world
+from haptic_loop.sim.scenario import (
+    InputError,
+    Scenario,
+    is_world,
+    require_latch_at_ticks,
+    require_linear,
+    require_no_world,
+)
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
@@ -167,6 +174,8 @@ def simulate(
         raise InputError("environment= with a scenario that has environment.world: remove one of them")
     if world and energy_budget is None:
         energy_budget = START_J
+    if environment is not None or energy_budget is not None:
+        require_latch_at_ticks(scenario)
     alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # only the nominal environment runs
     clipped = None if limiter else False
     assessment = assessed(

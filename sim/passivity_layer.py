@@ -32,7 +32,7 @@ from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.environments import ANY_ENVIRONMENT
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, require_latch_at_ticks
 
 _HELD = 4  # ticks beyond the largest delay for which a device holds a force when packets are lost
 
@@ -105,11 +105,10 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
     """Return the loop with a net between controller and devices, for runs of up to `ticks` (default: the scenario's).
 
     For linear analyses, such as certificates and modes, use the simulation without a net. The delays of the simulation
-    do not change. Raises InputError for latencies, and the errors of `wanted.net` for impossible settings.
+    do not change. Raises InputError for a latency, and the errors of `wanted.net` for impossible settings.
     """
     scenario, process = simulation.scenario, simulation.process
-    if scenario.latency:
-        raise InputError("latency: an energy account assumes forces that latch at ticks; add a sample to theta instead")
+    require_latch_at_ticks(scenario)
     if process.delays is None:
         samples = scenario.samples if ticks is None else ticks
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))

@@ -523,6 +523,12 @@ def require_even_ticks(scenario: Scenario, what: str) -> None:
             raise InputError(f"{name}: {what} does not simulate this key; remove it, or use sim.run")
 
 
+def require_latch_at_ticks(scenario: Scenario) -> None:
+    """Raise InputError if forces have a latency, for energy budgets and shells."""
+    if scenario.latency:
+        raise InputError("latency: an energy account assumes forces that latch at ticks; add a sample to theta instead")
+
+
 # ---- humans in a separate file
 
 

@@ -18,6 +18,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, idle, netted
 from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import InputError
 
 SHORT = load().replace(duration=1.5)
 
@@ -218,6 +219,15 @@ def test_uneven_periods_cannot_exceed_the_budget():
         assert trace.net.figures().limited_ticks > 10
 
 
-def test_energy_accounts_refuse_forces_that_latch_late():
-    with pytest.raises(ValueError, match="an energy account assumes forces that latch at ticks"):
-        netted(assemble(SHORT.replace(latency=((0.0, 1e-4),) * 2), NoCoupling()), NoCoupling(), EnergyNet(0.0))
+def test_energy_accounts_refuse_a_latency_before_computing(capsys, monkeypatch, tmp_path):
+    late = SHORT.replace(latency=((0.0, 1e-4),) * 2)
+    with pytest.raises(InputError, match="an energy account assumes forces that latch at ticks"):
+        netted(assemble(late, NoCoupling()), EnergyNet(0.0))
+    for module in "cli.verdict", "sim.api":
+        monkeypatch.delattr(f"haptic_loop.{module}.assessed")
+    with pytest.raises(InputError, match="latency"):
+        simulate(late, energy_budget=0.0)
+    for loop in ["--energy-budget", "0.01"], ["--scenario", "world-cube"]:
+        with pytest.raises(InputError, match="latency"):
+            run_command([*loop, "--latency", "1e-4", "--out", str(tmp_path)])
+    assert not capsys.readouterr().out
