@@ -105,7 +105,7 @@ _NOT_CERTIFIED = "not certified, so there are no margins"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest stiffness [N/m] of each channel, all certified together. If none is known, `reason` says why."""
+    """The largest stiffness [N/m] of each channel, all certified together. If one is not known, `reason` says why."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)
@@ -378,7 +378,7 @@ class Audit:
     margins: dict[str, Margins]  # by condition, in the nominal environment with constant delays
     switching: SwitchingFigures | None
     helps: list[Help]  # empty for delays that switch, for which no change is searched
-    constant: dict[str, Requirement] = off_table("left out")  # requirements for which `margins` are
+    constant: dict[str, Requirement] = off_table("left out")  # the requirements to which `margins` belong
     not_covered: str = CAVEATS
     left_over: LeftOver | None = off_table("if given", None)  # the damping of Theorem A for known devices
 

@@ -51,7 +51,7 @@ class SwitchingFigures:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> SwitchingFigures:
-        """Evaluate a coupling in the nominal environment; `known` is its requirement there, if already evaluated."""
+        """Evaluate a coupling in the nominal environment; `known` is the requirement of SWITCHING there, if known."""
         loop = loop.at(loop.environment)
         requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays
         if requirement.reason:

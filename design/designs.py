@@ -114,7 +114,7 @@ def design_by_kind(
         loop: The loop.
         kind: A name of KINDS, or FILE.py:NAME of a user's own function.
         condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed by the
-            kind's usual condition, with the largest share of the damping for which the user's condition holds.
+            kind's usual condition, with a share of the damping for which the user's condition holds.
         progress: Called during long searches with (task, steps done, number of steps).
         **options: Options of the kind (design.api.DesignOptions). A spring-damper by this-environment covers limited
             forces if LIMITER has designs for the loop and one is found; `limiter` True requires it. `switching`
@@ -298,10 +298,11 @@ _UNUSED = 0.005  # `_with_less_damping` ends if the coupling leaves less than th
 def _with_less_damping(
     loop: Loop, make: Callable[[Loop], Design], condition: Condition, made_for: Condition | None = None
 ) -> Design:
-    """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
+    """Return a design for a share of the damping whose coupling satisfies the condition in this loop.
 
-    The designs are made for the condition `made_for` (by default `condition`) in the nominal environment, with all
-    walls touching and without the latency. Designs that cannot consider switching delays use the longest delays.
+    Up to LESS_DAMPING_ROUNDS shares are tried, until the coupling needs almost all of the damping. The designs are made
+    for the condition `made_for` (by default `condition`) in the nominal environment, with all walls touching and
+    without the latency. Designs that cannot consider switching delays use the longest delays.
     """
     share, best, shortfall = 1.0, None, ""
     walls = loop.environment.walls

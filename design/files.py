@@ -326,7 +326,7 @@ def remove(path: Path) -> None:
 
 
 def _spare(path: Path) -> None:
-    """Record that a file is replaced or removed. Raises InputError if it was read, or if it is an option's output."""
+    """Raise InputError if the command has read the file, or has written it and an option names it."""
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):

@@ -486,7 +486,7 @@ def least_rms(
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
     All searches share the frequencies that they add to `sampled`. For more than FEW channels the first optimum is
-    returned, because steps are expensive and the start hardly matters. The caller sorts the starts.
+    returned, because steps are expensive and the start hardly matters.
     """
     best, least, searches, multiplier, loop = None, np.inf, 0, None, sampled.loop
     known: list[Array] = []

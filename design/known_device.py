@@ -306,7 +306,7 @@ class _Best(NamedTuple):
     w: float  # binding frequency [rad/sample]
     beta: tuple[float, ...]  # (m,) [s]
     values: tuple[float, ...] = ()  # the multipliers of the facts
-    bound: float = 0.0  # lower bound of the share over all beta and multipliers, at sampled frequencies, with `spare`
+    bound: float = 0.0  # lower bound of the share at the frequencies of the search, for the block less `spare`
 
 
 class Sweep:

@@ -1,8 +1,9 @@
-"""The convex program of the optimal coupling (design.optimal): bases of R, constraints on F = Theta R Psi E, solution.
+"""The convex program of the optimal coupling (design.optimal), whose force filter R gives F = Theta R Psi E.
 
-All constraints are affine in R, and R = kappa I satisfies each of them for a small kappa, so a start always exists.
-Each constraint is a linear matrix inequality at every frequency. design.barrier solves the program on a grid of
-frequencies, and a dense sweep adds the frequencies at which the solution violates a constraint.
+R is a sum over a basis with unknown coefficients. All constraints are affine in R, and R = kappa I satisfies each of
+them for a small kappa, so a start always exists. Each constraint is a linear matrix inequality at every frequency.
+design.barrier solves the program on a grid of frequencies, and a dense sweep adds the frequencies at which the solution
+violates a constraint.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def _gain_block(
 #
 # Let g = k + b (1 - 1/z) per channel. The norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
 # L g is affine in the gains. g* g is replaced by its tangent at the previous gains, which lies below g* g. So no step
-# increases the norm, and mu^2 enters linearly, without bisection.
+# increases the norm at the sampled frequencies, and mu^2 enters linearly, without bisection.
 
 
 def step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
@@ -212,7 +212,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return _gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
-_SETTLED = 1e-6  # The sequence stops when a step improves the norm by less than this share.
+_SETTLED = 1e-6  # The sequence stops when a step changes the norm by less than this share, and the bound is as close.
 _NEGLIGIBLE = 1e-6  # Dampers below this share of the usable damping become 0, because solvers return 1e-9 for 0.
 
 
@@ -227,9 +227,10 @@ def design(
 ) -> Design:
     """Return the spring-damper of least objective that `condition` certifies.
 
-    any-environment reduces ||W1 L W2||_inf (23) over the exact set of gains (for psi >= 1, that of one Phi) until the
-    norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is reached
-    from the starts, or with more than FEW channels the first one. known-device-any maximises the sum of K.
+    any-environment reduces ||W1 L W2||_inf (23) over the exact set of gains (for psi >= 1, the set for one Phi) until
+    the norm settles. this-environment and known-device take the lowest local minimum of the rms mismatch that is
+    reached from the starts, or with more than FEW channels the first minimum found. known-device-any maximises the sum
+    of K.
 
     Args:
         loop: The devices, their delays and the environment. Delays that switch are for this-environment only.
