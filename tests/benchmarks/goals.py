@@ -2,10 +2,11 @@
 
 PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
 
-Times are CPU seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of
-rounds in which the compared programs alternate. A command runs in a new process, five times or, if long, once. It
-alternates with the floor, a process that only imports NumPy and MuJoCo; goals are multiples of the floor's time.
-`--write` puts the table of cold into docs/accuracy.md; use it on an idle machine.
+`cold` measures commands to their end, `first` to their first line, `long` commands of many seconds. Times are CPU
+seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of rounds in which the
+compared programs alternate. A command runs in a new process, five times or, if long, once. It alternates with the
+floor, a process that only imports NumPy and MuJoCo; goals of commands are multiples of the floor's time. `--write` puts
+the table of cold into docs/accuracy.md; use it on an idle machine.
 """
 
 from __future__ import annotations

@@ -28,13 +28,13 @@ def test_spring_damper(benchmark):
     need, seconds = design.requirement.ratio, benchmark.stats.stats.median
     work = f"{design.sdps} convex problems, {seconds:.2f} s"
     print(f"\ncase I, spring-damper, any-environment: norm {design.objective:.4f} in {work}; needs {need:.6f} delta")
-    assert design.objective < 11.2495
+    assert design.objective < 11.2495  # the optimum is 11.2491
 
 
 def test_inner_convex_approximation(benchmark):
     design = benchmark.pedantic(lambda: ccl.design(LOOP), rounds=1)
     print(f"\nccl, order one per channel: norm {design.objective:.4f} in {design.sdps} SDPs")
-    assert design.objective < 9.8
+    assert design.objective < 9.8  # the approximation ended at 9.749 when measured
 
 
 @pytest.mark.parametrize("case", ["I", "II"])

@@ -112,6 +112,7 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
         f"\nMuJoCo batch RK4 x {substeps}: loop / raw steps {np.median(ratios):.2f} (median of {len(ratios)}), growth "
         f"within {error:.1e} 1/s, {wrong} wrong verdicts in {HUMANS}"
     )
+    # [1/s] When measured, the growth rates of RK4 erred by 1.4e-2 with two steps, and by 4e-4 with four.
     assert error < 0.1
 
 
@@ -127,6 +128,6 @@ def test_how_tight_the_certificate_is(benchmark):
     for name, (_, coupling) in loops.items():
         frequency = this_environment(assemble(scenario, coupling).F, scenario.delta).frequency_hz
         x = np.pi * frequency * scenario.T
-        # The certificate bounds dissipation by the motion per tick, which misses a part of it in sinusoidal motion.
-        print(f"\n{name}: binds at {frequency:.1f} Hz, where a sinusoid loses {1 - (np.sin(x) / x) ** 2:.1%}", end="")
+        # The certificate bounds dissipation by the motion per tick, and misses a part of the dissipation of a sinusoid.
+        print(f"\n{name}: binds at {frequency:.1f} Hz and misses {1 - (np.sin(x) / x) ** 2:.1%} of losses", end="")
     assert all(row.worst.destabilises for row in rows if row.short >= 0.05)

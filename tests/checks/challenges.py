@@ -49,10 +49,10 @@ class _Challenge:
     factor: float  # times what the guarantee requires
     motions: int  # motions tried
     took: int  # motions that took more energy than the guarantee allows
-    least_J: float  # the lowest energy balance plus `given` of all motions and hands
+    least_J: float  # the lowest energy balance plus `given` of all motions and hands, at most 0
     hands: int  # hands tried in each generation
     grew: int  # hands whose motion grew, or that took more energy than the guarantee allows
-    limited: float  # share of ticks with limited forces or contact, largest over the three values of greed
+    limited: float  # share of ticks with limited forces or contact, largest over the three values of greed (`_moved`)
     holds: bool  # no adversary succeeded, or nothing is guaranteed (factor < 1)
 
 

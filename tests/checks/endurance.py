@@ -33,7 +33,7 @@ class _Endured:
     result: str
     tenth_mib: float | None  # after a tenth of the work
     end_mib: float | None
-    allowed_mib: float  # by how much it may rise after that
+    allowed_mib: float  # by how much the peak may rise after a tenth
     holds: bool
 
 

@@ -298,6 +298,7 @@ CASES = (
         Fault(f"motor 2 makes {part} of force 1, too", G.FINISHED, "", (f"cross={part}",), **_UNFOUND)
         for part in (0.2, -0.2)
     ),
+    # more faults that are found, most of them at arming; encoder noise is no fault
     *(
         Fault(
             f"encoder {axis} is read {n} ticks late before",

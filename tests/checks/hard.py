@@ -1,4 +1,4 @@
-"""Numerically hard loops, each with an integrator setting that fails and one that holds.
+"""Numerically hard loops, each with an integrator setting that holds and, but for one loop, a setting that fails.
 
 The rule is `default_substeps`, which picks the substeps of an integrator.
 """
@@ -35,7 +35,7 @@ class _Hard:
     name: str
     scenario: Scenario
     fails: _Setting | None  # a setting that does not hold; None if all of _TRIED hold
-    how: str  # what is wrong with `fails`: "refused", "verdict", "growth" or "position"
+    how: str  # what is wrong with `fails`: "refused", "verdict", "growth" or "position"; no key of `faults` if None
     coupling: Coupling = PUBLISHED["I"]
     substeps: int | None = None  # RK4 substeps that hold; None: those that the rule picks
 

@@ -32,7 +32,7 @@ def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
 
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
-def test_fifty_pairs_without_gravity_gain_nothing(name, lossless):
+def test_without_gravity_fifty_pairs_stay_within_the_account(name, lossless):
     """Hands, devices and bodies of the scene gain at most W0 and the energy that springs released."""
     rng = np.random.default_rng(8)
     for run in range(PAIRS):

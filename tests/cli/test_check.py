@@ -1,4 +1,4 @@
-"""design.check has the right exit codes and output, and imports no solver."""
+"""design.check has the right exit codes and output, and does not import cvxpy."""
 
 import json
 import subprocess
@@ -66,7 +66,7 @@ def test_help_has_an_example(capsys):
     assert "python -m design.check coupling.json" in capsys.readouterr().out
 
 
-def test_checking_imports_no_solver(path):
+def test_checking_does_not_import_cvxpy(path):
     code = f"import sys, cli.check as c; r = c.main([{str(path)!r}]); sys.exit(r or ('cvxpy' in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 

@@ -52,7 +52,7 @@ def test_an_interrupted_comparison_reports_nothing(tmp_path):
 
 
 def interrupt(monkeypatch, simulation, blocks=1):
-    """Let Ctrl-C come when so many blocks of the command's simulation of this number are finished."""
+    """Let Ctrl-C come in the command's simulation of the number `simulation`, after `blocks` of its blocks."""
     run_blocks, numbers = loop.run_blocks, count(1)
 
     def interrupted(process, engine, outside, ticks, start, keep, block):
@@ -73,7 +73,7 @@ RUN = ["sim.run", "--coupling", "published", "--duration", "3"]
     [([*RUN, "--cross-check"], 2), ([*RUN, "--cross-check"], 3), (["design.compare"], 1), (["design.compare"], 2)],
 )
 def test_interrupted_secondary_runs_give_no_report(command, simulation, tmp_path, monkeypatch):
-    """Besides the reported run, sim.run simulates the exact loop, and design.compare every coupling."""
+    """sim.run then simulates the exact loop and the cross-check; design.compare simulates every coupling."""
     interrupt(monkeypatch, simulation)
     with pytest.raises(KeyboardInterrupt):
         finish(command, tmp_path)
@@ -136,7 +136,7 @@ TRACES = ["trace.csv", "scene.xml", "figure.png"]
     ],
 )
 def test_ctrl_c_while_storing_mixes_no_runs(command, writer, files, tmp_path, monkeypatch):
-    """The folder holds the files of an earlier run, and Ctrl-C comes while this writer is called."""
+    """The folder holds the files of an earlier run, and Ctrl-C comes when the command calls `writer`."""
 
     def interrupted(*content):
         raise KeyboardInterrupt
@@ -251,12 +251,12 @@ def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
 
 @pytest.mark.parametrize("code", [INTERRUPT, IN_EXEC, IN_C], ids=["signal", "exec", "compiled"])
 def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
-    command = "sim.run --case none --duration 0.05 --no-plot"  # this imports MuJoCo without a design before
+    command = "sim.run --case none --duration 0.05 --no-plot"  # without a design, MuJoCo is imported soon
     assert interrupted_at(command, "mujoco", code, tmp_path) == (130, "interrupted\n")
 
 
 def interrupted_at(command, module, code, folder):
-    """Run a command that imports a file with this code in place of the module."""
+    """Run a command that imports `code` in place of the module, and return its exit code and error lines."""
     (folder / f"{module}.py").write_text(code)
     environment = ENVIRONMENT | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     words = [sys.executable, "-m", *command.split()]

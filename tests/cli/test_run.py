@@ -135,7 +135,7 @@ def test_a_zero_damping_device_is_reported_not_certified(tmp_path):
     assert "no damping" in decisive(report)["reason"]
 
 
-def test_running_twice_gives_the_same_files(tmp_path):
+def test_a_second_run_adds_no_files(tmp_path):
     for _ in range(2):
         _, report = run(tmp_path, "--duration", "0.5", "--coupling", "published")
     ran = report["run"]

@@ -99,7 +99,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
 
 @pytest.mark.slow
 def test_rehearsed_sessions_finish_with_their_guarantee():
-    """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
+    """The link takes 130 us from a sample to its force, so a delay of one tick of 1 ms covers it."""
     scenario = load().replace(T=1e-3, theta=(1, 1))
     session = rehearse(scenario, seconds=0.5)
     assert (session.stage, session.theta) == ("finished", (1, 1))
@@ -364,7 +364,7 @@ def test_a_trace_draws_itself(tmp_path):
         (np.full(2, np.nan), r"array\(\[nan, nan\]\), shape \(2,\),"),
     ],
 )
-def test_wrong_environment_answers_are_refused_in_one_line(answer, shown):
+def test_wrong_answers_of_an_environment_are_refused(answer, shown):
     design = design_coupling(LOOP, condition="any-environment")
     with pytest.raises(InputError, match=rf"^environment .*{shown} expected an array of 2 finite forces \[N\], shape"):
         simulate(SHORT, design, environment=lambda u: answer)

@@ -35,6 +35,7 @@ def test_the_table_has_the_figures_of_the_loop(path):
 
 
 def test_no_certified_coupling_beats_the_bound():
+    # The bound is at most the best coupling's error, and that at most the designed one's; 0.01 dB is the table's digit.
     for row in ROWS.values():
         figures = [float(row[name] or "nan") for name in ("bound_rms_db", "best_rms_db", "designed_rms_db")]
         for less, more in ((0, 1), (1, 2), (0, 2)):
@@ -86,4 +87,5 @@ def test_the_checker_takes_another_tool(tmp_path):
         "def without_coupling(loop):\n    return 2.0 if loop['name'][0] == 'p' else None\n"
     )
     done = subprocess.run([sys.executable, ROOT / "check.py", tmp_path / "mine.py"], capture_output=True, text=True)
+    # There are five loops p*.
     assert len(re.findall(r"^p\d\S+ +without_coupling .* 2 ", done.stdout, re.MULTILINE)) == 5

@@ -23,6 +23,7 @@ def test_energy_bounding_clips_to_the_published_interval():
         else:
             b = np.sort([c1, -c1 - 2 * before / dx])
             assert force == pytest.approx(before + np.clip((wanted - before) / dx, *b) * dx, abs=1e-12)
+        # T f^2/(4 delta) rises by at most the energy f_- dx that flows in, plus the device's dissipation.
         assert T * force**2 / 4.8 <= T * before**2 / 4.8 + before * dx + 1.2 * dx**2 / T + 1e-15
         before = force
 
@@ -64,6 +65,7 @@ def test_the_passivity_controller_is_the_published_one():
 def test_energy_bounding_keeps_its_bound_in_a_run():
     scenario = load().replace(duration=1.5)
     trace = run(netted(assemble(scenario, NoCoupling()), Classic(EnergyBounding)), "exact")
+    # Theta delays the forces by 1 and 2 samples.
     sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
     dx = np.diff(trace.x, axis=0)
     c1 = 2 * np.array(scenario.delta) / scenario.T

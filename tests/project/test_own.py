@@ -136,7 +136,7 @@ def test_an_own_environment_is_proved_and_stored(name, covered, place):
         ("ends.py:X", "SystemExit: 7"),
     ],
 )
-def test_wrong_environments_are_refused_in_one_line(words, message, place):
+def test_wrong_environments_are_refused(words, message, place):
     done = run(f"{RUN} --environment {words}", place)
     *before, last = done.stderr.splitlines()
     assert done.returncode == 2
@@ -154,7 +154,7 @@ def test_an_own_file_prints_to_standard_error(place):
 @pytest.mark.parametrize(
     "line", ['type = "mine:Gel"', 'elements = [{ type = "mine:Hardening", between = ["left", "right"] }]']
 )
-def test_a_scenario_file_executes_nothing(line, place):
+def test_scenario_files_cannot_name_classes(line, place):
     scenario = 'name = "own"\nT = 1e-3\ntheta = [1, 1]\ndevice = ["omega.3", "omega.3"]\n[environment]\n'
     (place / "code.toml").write_text(f'{scenario}contacts = ["left", "right"]\n{line}\n')
     (place / "mine.pth").touch()
@@ -208,7 +208,7 @@ def test_a_coupling_may_be_given_by_its_compliance(command, place):
 
 
 def test_errors_name_the_innermost_line(tmp_path):
-    """Errors of the user's code keep their traceback; errors that this package raises on purpose do not."""
+    """`is_refusal` tells errors that this package raises on purpose from errors of the user's code."""
     file = tmp_path / "nested_error.py"
     file.write_text("def inner():\n    raise ValueError('no')\n\ndef outer():\n    inner()\n")
     with pytest.raises(ValueError, match="no") as caught:

@@ -1,4 +1,4 @@
-"""Yield bad command lines: wrong values and paths, outputs that would replace inputs, contradicting options."""
+"""Bad command lines: wrong values and paths, outputs that would replace inputs, contradicting options."""
 
 from __future__ import annotations
 

@@ -285,7 +285,7 @@ def _fails(item: pytest.Item, after: pytest.Item | None) -> str:
 
 
 def _forked(work: Callable[[], Any]) -> Callable[[], Any]:
-    """Begin the work in a fork, and return a function that waits for its result; None if the fork was ended."""
+    """Begin the work in a fork. Return a function that waits for the result, which is None if the fork was killed."""
     read, write = os.pipe()
     if not (pid := os.fork()):
         os.close(read)

@@ -14,7 +14,7 @@ measured times, with that on the pages. The exit code is 1 if they differ.
 
 A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
 `<!-- picture: FROM TO -->` keeps a picture that a command has drawn.
-tests/project/test_docs.py runs the same steps and compares all but measured output.
+tests/project/test_docs.py runs the same steps and compares all but slow and measured output.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
     parser.add_argument(
-        "pages", nargs="*", metavar="PAGE", help="pages to renew, by name or path, except for measured output"
+        "pages", nargs="*", metavar="PAGE", help="pages to renew, by name or path; their measured output stays"
     )
     args = parser.parse_args()
     if args.check:
