@@ -65,7 +65,10 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse the options `names`, with an error that ends in `where`, unless `acts` is true for the arguments."""
+        """Refuse values of the options `names` other than the defaults, unless `acts` is true for the arguments.
+
+        The error ends in `where`.
+        """
         self._only.append((where, acts, names))
 
     def format_help(self) -> str:

@@ -106,7 +106,8 @@ class Painter:
 def serve() -> None:
     """Read what `ask` sends from standard input, and write its picture to standard output, in the second process.
 
-    A thread reads while matplotlib is loaded, so that `ask` does not wait, and ends this process with the first one.
+    A thread reads while matplotlib is loaded, so that `ask` does not wait. It ends this process if the first process
+    ended without a request.
     """
     import pickle
 

@@ -43,7 +43,7 @@ _LONGEST = 3600  # [s] longest video
 
 
 def main(argv: list[str]) -> int:
-    """Show the loop until the window is closed, --duration or the film ends. Return 0, or 130 if interrupted."""
+    """Show the loop until the window is closed or --duration is over, or film it. Return 0, or 130 if interrupted."""
     args = _parser().parse_args(argv)
     from haptic_loop.sim.view.stage import check_film
 

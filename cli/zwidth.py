@@ -255,7 +255,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
     if report.walls:
         yield (
             f"Walls: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
-            "humans meet each frozen contact state, the simulated points contact made and broken."
+            "humans meet each fixed set of touching walls; at the simulated points contact makes and breaks."
         )
     if simulation.points:
         yield (

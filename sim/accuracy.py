@@ -662,7 +662,7 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """Return the growth rate [1/s] of an engine's loop; with walls, that of the worst contact state.
+    """Return the growth rate [1/s] of an engine's loop; with walls, the largest over all sets of touching walls.
 
     Raises InputError if a tick of the engine gives numbers that are not finite.
     """

@@ -57,7 +57,7 @@ class ScenarioRun:
     """The run of a scenario, with its settings."""
 
     simulation: Simulation  # the loop without a net (passivity layer)
-    ran: Simulation  # the loop with its net, if it has one, as it ran
+    ran: Simulation  # the loop that ran: `simulation`, with its net if there is one
     period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # engine, integrator and steps, with defaults filled in
@@ -238,14 +238,14 @@ def validate(
     """Let `humans` sets of random passive humans, one human per device, hold the devices without voluntary motion.
 
     Args:
-        scenario: The loop. The verdict of a loop with walls is that of its worst frozen contact state.
+        scenario: The loop. With walls the verdict is that of the set of touching walls with which it grows fastest.
         coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
         humans: Number of sets, drawn from `scenario.population`; set i depends on `seed` and i alone.
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
             engine and makes one engine for each set of humans.
-        duration: Length [s] of the traces. 0 means no traces: growth rates come from period maps, except under varying
-            delays or ticks (`Findings.switching`).
+        duration: Length [s] of the traces. 0 means no traces: growth rates come from eigenvalues over one period,
+            except under varying delays or ticks (`Findings.switching`).
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.

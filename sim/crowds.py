@@ -1,10 +1,11 @@
 """Validate a loop with many random passive humans, by two engines, in batches over processes.
 
 Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
-the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the period map of its RK4
-integrator, which shares only the model with the exact engine. MuJoCo's traces use the exponential integrator, at a
-fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates all humans; the other
-engine, MuJoCo or a user's own, all or a sample (`_witnessed`). Workers end when their parent ends.
+the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the map of its RK4
+integrator over one period (its period map), which shares only the model with the exact engine. MuJoCo's traces use the
+exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates
+all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`). Workers end when their parent
+ends.
 """
 
 from __future__ import annotations
@@ -296,7 +297,8 @@ def _other_engine(
 ) -> tuple[_Other | None, Array | None]:
     """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
 
-    `frozen` are the force maps of the contact states. A user's own engine steps every basis state once to give its map.
+    `frozen` has the force map for each set of touching walls. A user's own engine gives its map by one step from each
+    basis state.
     """
     if not isinstance(validation.engine, str):
         drawn = crowd.mechanics or ((),) * len(crowd)

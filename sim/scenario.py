@@ -298,6 +298,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def samples(self) -> int:
+        """Number of ticks of a run: its duration over the mean period."""
         return max(1, round(self.duration / (self.period.mean if self.period else self.T)))
 
     @property

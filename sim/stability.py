@@ -1,6 +1,7 @@
 """Stability by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
 
-A closed loop or a mode may be a stack, one for each set of humans. Arrays of a stack have a leading axis.
+A closed loop or a mode may be a stack, one for each set of humans. Arrays of a stack have a leading axis. A contact
+state is a set of walls that are touched; frozen means that contact is neither made nor broken.
 """
 
 from __future__ import annotations
@@ -204,7 +205,7 @@ class Ringing:
         decay_per_s: Decay rate of the slowest mode [1/s]; negative if it grows.
         frequency_hz: Frequency of the slowest mode [Hz].
         damping_ratio: Damping ratio of the slowest mode.
-        least_damping_ratio: Least damping ratio of all modes but free drifts.
+        least_damping_ratio: Least damping ratio of all modes but free drifts (|s| up to 0.001 1/s).
         least_frequency_hz: Frequency of the mode with the least damping ratio [Hz].
     """
 

@@ -264,7 +264,7 @@ class DelaysCovered:
     covered: bool
     covers: str  # the covered delays, in words
     switching: SwitchingFigures | None = off_table(default=None)
-    on_file: DelayRange | None = None  # the range for which the coupling's file proves any switching, if it covers this
+    on_file: DelayRange | None = None  # range for which the file proves any switching; None unless it covers these
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:

@@ -232,8 +232,8 @@ class Growing(Generic[_Met]):
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # whether certificates cover the variation
     unstable: Unstable = off_table()
-    humans: int = off_table()
-    mujoco_unclipped: int = off_table()
+    humans: int = off_table()  # number of sets of humans whose growth was computed
+    mujoco_unclipped: int = off_table()  # number of MuJoCo's traces in which no force was clipped
     largest_growth_per_s: float | None = off_table()
     worst_index: int | None = off_table()
     holds: bool = off_table()

@@ -56,10 +56,10 @@ class WorldFigures(ShellFigures):
 
 @dataclass(frozen=True)
 class WorldRecord:
-    """The entry `world` of a report."""
+    """The entry `world` of a report; `WorldFigures` explains the figures."""
 
     ticks: int
-    ticks_acted: int
+    ticks_acted: int  # ticks in which the shell changed a force
     given_J: float
     port_least_J: float
     released_J: float

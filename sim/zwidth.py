@@ -123,10 +123,10 @@ class CouplingSweep(_Sweep):
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """Return F of every coupling, a stack for each frozen contact state, with all walls touching first.
+        """Return F of every coupling, a stack for each set of touching walls, the set of all walls first.
 
-        A rigid wall always touches, because a device without contact is safe. Random hands are tested in each frozen
-        state; certificates cover walls that make and break contact.
+        A rigid wall always touches, because a device without contact is safe. Random hands are tested with each set;
+        certificates cover walls that make and break contact.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
@@ -563,7 +563,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Return the growth with every human in the worst contact state [1/s]."""
+    """Return the growth [1/s] with every human, for the set of touching walls with which it is largest."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 

@@ -179,7 +179,7 @@ class PreparedLoop:
     label: str  # name of the coupling in scripts
     chosen: Chosen
     simulation: Simulation
-    mode: Mode | None  # dominant mode of the exact loop, or of its worst contact state; None for a world
+    mode: Mode | None  # dominant mode of the exact loop, over all sets of touching walls; None for a world
     assessment: Assessment
 
     @property
@@ -235,7 +235,7 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 
 HISTORY = 4.0  # [s] time span of the forces in a picture
 _BLOCK = 64  # largest number of ticks in one block
-LONGEST_LAG = 0.1  # [s] lag that a window may catch up in one frame; a longer lag is dropped and counted
+LONGEST_LAG = 0.1  # [s] lag that a window may catch up in one frame; the excess of a longer lag is dropped and counted
 _STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand, as in the hands of the default scenario
 
 
@@ -335,7 +335,7 @@ class LiveLoop:
             prepared: The first loop.
             executor: Prepares the loops that keys request while the present loop runs.
             script: Events at given times. This constructor prepares their loops.
-            patience: Largest lag behind the clock [s] that is caught up; a longer lag is dropped.
+            patience: Largest lag behind the clock [s] that is caught up; the excess of a longer lag is dropped.
 
         Raises:
             InputError, DesignFailed, SingularLoop: An event of the script is impossible.
