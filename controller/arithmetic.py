@@ -50,7 +50,7 @@ class _Counter(threading.local):
 
     done = 0  # in 1/_PARTS of a unit; an integer, so that earlier work causes no rounding
     most: float = math.inf  # in the same parts
-    message = ""  # of TooLong
+    message = ""  # of the TooLong that `spend` raises
     over: Callable[[], bool] | None = None  # returns whether the user's time limit is over
 
 
@@ -88,8 +88,8 @@ def within(
 ) -> Iterator[None]:
     """Limit the counted work in this context to `units`, and to the rest of a surrounding budget.
 
-    Work beyond this limit raises TooLong, whose message contains `what` and `why`. Any work raises TooLong once `clock`
-    returns True, which says that the user's time limit is over.
+    Work beyond this limit raises TooLong. Its message contains `what` and `why` of the budget that is spent first. Any
+    work raises TooLong once `clock` returns True, which says that the user's time limit is over.
     """
     before = _counter.most, _counter.message, _counter.over
     if units < math.inf and spent_after(units) < _counter.most:
@@ -285,7 +285,7 @@ def times(left: Array, right: Array) -> Array:
 
 
 def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
-    """Return the rows multiplied by their common denominators, as integers, and these denominators."""
+    """Return the rows of M multiplied by their common denominators, as integers, and these denominators."""
     common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
     integers = [
         [v.numerator * (den // v.denominator) if v else 0 for v in row]
@@ -295,7 +295,7 @@ def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
 
 
 def solve(M: Array, right: Array) -> Array:
-    """Return M^-1 right in the arithmetic of M. Raises SingularLoop."""
+    """Return M^-1 right in the arithmetic of M. Raises SingularLoop if M is singular."""
     if M.dtype != object:
         try:
             return np.linalg.solve(M, right)

@@ -321,7 +321,7 @@ class Shell(_Net):
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:
-        """Raise ValueError if V is not square, or if D_V is not passive."""
+        """Raise ValueError if V is not square, D_V is not passive, or W0 = `start` [J] is negative or infinite."""
         super().__init__(start, np.inf, nsim)
         if V.inputs != V.outputs:
             raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected equal numbers")

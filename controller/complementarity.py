@@ -85,6 +85,7 @@ class BoxProblem(_Problem):
 
     Raises:
         SingularLoop: A principal minor of M is negative. With more than ten unknowns only the diagonal is checked.
+        ValueError: A lower limit is not below its upper limit.
     """
 
     lower: Array  # (n,) -inf without a limit
@@ -308,6 +309,7 @@ class _BallBlock:
         return ~(np.abs(f + self.M @ v - q) <= allowed).all(axis=0)
 
     def _of(self, u: Array) -> tuple[Array, Array]:
+        """Return (v, f) for u = f + tau v."""
         f = _within_balls(u, self.limit, self.balls)
         return (u - f) / self.tau, f
 

@@ -430,7 +430,8 @@ class ForceFilter(ReadOnly, Coupling):
     R_k has one column for the force of each channel, and optionally one more for the sum of all forces.
 
     Raises:
-        ValueError: A pole is not stable, a shape does not match, or the coefficients do not sum to g I with g >= 0.
+        ValueError: A pole is not stable, a shape does not match, an entry of R exceeds 1e9, or the coefficients do not
+            sum to g I with g >= 0.
     """
 
     poles: Array  # (n,) in (-1, 1); poles at zero are delays

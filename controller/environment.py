@@ -35,7 +35,7 @@ MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _LEAST_AMOUNT = 1e-12
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
-_MOST_NODES, _MOST_PARTS = 200, 2000  # A mass has two states, and a proof can handle a few hundred states.
+_MOST_NODES, _MOST_PARTS = 200, 2000  # nodes and springs; a mass has two states, a proof handles a few hundred
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
@@ -555,7 +555,7 @@ def environment(network: Network, T: Number) -> Lti:
     return E + network.block.at(T) if network.block else E
 
 
-#: E(z), without blocks, of the networks used last. A design needs the same E(z) about eighty times.
+#: E(z), without blocks, of the last networks. A design needs the same E(z) about eighty times.
 _computed: dict[Any, Lti] = {}
 _MOST_COMPUTED = 32
 

@@ -47,7 +47,7 @@ class Law(ReadOnly):
 
     `sent` is the block from [x; p] to [f_e; y], with the forces f_e before Theta. The walls compute p from y. The state
     consists of the state of the block with its delays, and of h [m], the depth in each wall at the previous tick.
-    Raises SingularLoop if the walls' forces are not unique.
+    Raises SingularLoop if the walls' forces are not unique, and ValueError if `sent` has another size.
     """
 
     sent: Lti  # m + w inputs and outputs, for w walls

@@ -70,7 +70,7 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # rows, points and entries that are computed together in the cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # rows of the Schur form, points and entries that fit into the cache
 _SHORT, _DOUBLINGS = 0.3, 5  # the powers of poles up to 0.3 decay to 2e-17 within 2^5 samples
 _ERROR = 1e-9  # largest error of a sum over poles and taps, relative to the largest response of an output
 _UNIT = 1e-15  # bound on the rounding of a product of a few matrices, relative to its terms
@@ -352,7 +352,7 @@ class Lti(ReadOnly):
         return np.triu(U.conj().T @ A @ U), U
 
     def dc(self) -> Array:
-        """Return G(1), shape (..., p, m)."""
+        """Return G(1), shape (..., p, m). Raises SingularLoop if A has the eigenvalue one."""
         return self._rest[0] if self.is_exact else self.C @ solve(_identity(self) - self.A, self.B) + self.D
 
     @cached_property

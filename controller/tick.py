@@ -120,7 +120,7 @@ class Process(ReadOnly):
         return np.where(coarse, np.round(x / step) * step, x)
 
     def applied(self, force: Array, out: Array | None = None) -> Array:
-        """Return the forces (.., m, nsim) [N] clipped at the limits of actuators and balls."""
+        """Return forces (.., m, nsim) [N] clipped to limits of actuators and balls, in place if `out` is `force`."""
         high = self.force_limit[:, None]
         for ball in self.balls:  # A clipped vector keeps its direction.
             force = force if out is not None else force.copy()

@@ -13,7 +13,7 @@ from haptic_loop.design.certificate import prove
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
-    """Return a loop. By default each contact has a spring to ground, and the `walls` are at the first contact."""
+    """Return a loop. By default each contact has a spring to ground; `walls` are stiffnesses [N/m] at the first one."""
     m = len(delta)
     contacts = tuple(f"contact {i}" for i in range(m))
     springs = tuple(Spring((contact, GROUND), 1.0) for contact in contacts)

@@ -22,7 +22,7 @@ class Driven:
 def driven(
     process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
-    """Close the loop from the plant states `start`, (2n, nsim); with `last`, keep only the blocks of the last ticks."""
+    """Close the loop from plant states `start`, (2n, nsim); with `last`, keep only blocks of the last `last` ticks."""
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:

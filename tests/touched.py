@@ -1,8 +1,9 @@
 """Print the tests of changed files, or with `sources` the changed files of the packages, for `make check`.
 
-Changed tests come first. A file of a package is tested by the files under tests/ named like it or its folder, else by
-those that import it, else by the folder of its package. Files with few tests come first: `make check` ends after a
-minute. Changed files are those that differ from HEAD or are untracked or, if there are none, those of the last commit.
+Changed tests come first, then test_layers.py. A file of a package is tested by the files under tests/ named like it or
+its folder, else by those that import it, else by the folder of its package. Files with few tests come first: `make
+check` ends after a minute. Changed files are those that differ from HEAD or are
+untracked or, if there are none, those of the last commit.
 """
 
 import re
@@ -34,7 +35,9 @@ def sources_of(paths: list[str]) -> list[str]:
 
 
 def _mirror(path: str) -> set[str]:
-    """Return the tests named like the file or its folder, else those that import it, else its package's folder."""
+    """Return the tests named like the file or its folder, else those that import it (in tests/PACKAGE, if any), else
+    the folder of its package.
+    """
     package, *folders = Path(path).parts[:-1]
     tests, stem = sorted(Path("tests").glob("*/test_*.py")), Path(path).stem
     own = {str(test) for test in tests if test.stem[5:] in (stem, *folders)}

@@ -1,4 +1,4 @@
-/* The part of the Arduino interface that hw/firmware/example.ino uses; stub.cpp implements it. */
+/* The part of the Arduino interface that example.ino and teensy.ino use; stub.cpp and m7_board.cpp implement it. */
 #pragma once
 #include <stddef.h>
 #include <stdint.h>

@@ -51,7 +51,8 @@ static uint32_t word(void)
     return (uint32_t)b[0] | (uint32_t)b[1] << 8 | (uint32_t)b[2] << 16 | (uint32_t)b[3] << 24;
 }
 
-/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F | D held; every tick answers: n, n bytes, axes forces */
+/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F | D held; every tick answers:
+ * n (16 bits), n bytes, a force (16 bits) per axis */
 int main(void)
 {
     uint32_t values[5 * HL_MAX_AXES], serial = word(), period_ns = word(), axes = word(), a;

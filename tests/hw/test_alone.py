@@ -15,8 +15,8 @@ import pytest
 GCC = shutil.which("gcc")
 pytestmark = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_alone.h is not compiled here")
 FIRMWARE = Path(__file__).parents[2] / "hw/firmware"
-T, MASS, COUNT = 1e-3, 0.08, 2e-5
-READY, RUNNING, STOPPING = 1, 3, 4
+T, MASS, COUNT = 1e-3, 0.08, 2e-5  # [s], [kg], [m]
+READY, RUNNING, STOPPING = 1, 3, 4  # phases of haptic_alone.h; the next line has causes
 ASKED, RANGE, SIGN, DEAD, SCALE, LIMITS = 1, 4, 6, 7, 8, 9
 #: A spring of 300 N/m with a little damping and an outside force replace the exported file. The board's force is -f.
 SOURCE = """
@@ -206,7 +206,7 @@ def test_an_invalid_position_at_rest_is_forgotten(board):
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
 @pytest.mark.parametrize("limit", range(3), ids=["range", "speed", "cap"])
-def test_limits_that_limit_nothing_prevent_arming(board, limit, value):
+def test_impossible_limits_prevent_arming(board, limit, value):
     bench = Bench(board)
     for _ in range(150):
         bench.tick()

@@ -138,7 +138,7 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
 
 
 def swing(k):
-    """Return a slow push [N] that is 2.2 N stronger in 30 of 250 ticks, at times above the limit."""
+    """Return a slow swing of 3 N from tick 700 on, and 2.2 N more in 30 of 250 ticks: at times above 4.8 N."""
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 
@@ -211,7 +211,7 @@ def test_the_cortex_m7_repeats_the_test_vector(teensy):
 def test_the_cortex_m7_limits_vectors(tmp_path):
     """For two devices of three axes, the vector limiter repeats the ticks of Python to the last bit."""
     loop = load_scenario("omega-space").loop("I")
-    stiffness, damping = [16000.0] * 3 + [6000.0] * 3, [0.2] * 3 + [2.3] * 3  # rounded from a design of ten seconds
+    stiffness, damping = [16000.0] * 3 + [6000.0] * 3, [0.2] * 3 + [2.3] * 3  # rounded design, which took ten seconds
     coupling = SpringDamper(stiffness, damping)
     save(Stored.of(loop, coupling, assess(loop, coupling).force_limits.certificate), tmp_path / "coupling.json")
     process = ["--process", "--force-limit", "3", "--out", str(tmp_path / "coupling-process.c")]

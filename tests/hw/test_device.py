@@ -431,6 +431,6 @@ def test_frames_of_wrong_kinds_are_not_obeyed():
     assert (rig.state.crc_errors, rig.forces, rig.device.phase) == (5, (0, 0), Phase.HOLDING)
 
 
-def test_an_info_beyond_the_wires_range_is_refused():
+def test_an_info_out_of_range_is_refused():
     with pytest.raises(ValueError, match=r"Info.period_ns: 1; 100000 to 100000000"):
         Device(INFO._replace(period_ns=1))

@@ -161,7 +161,7 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
 
 
 def test_frozen_ticks_of_moving_handles_are_no_jumps(scenario, rungs):
-    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze, over 0.18 mm are a jump."""
+    """A freeze of 2.4 ms at 0.2 m/s adds 0.48 mm to one displacement; without a freeze a pulse of 0.19 mm is a jump."""
     session, send = hand_driven(scenario, rungs, tested=True)
     session.drive._commands = None  # this device applies no forces
     x = 0
@@ -343,7 +343,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
 
 
 def test_skipped_answers_are_older_than_the_youngest():
-    """In USB frames of 1 ms with T = 0.3 ms, one margin stands for FORCEs of 1, 1.3 and 1.6 ms; none is missed."""
+    """In USB frames of 1 ms with T = 0.3 ms, one margin stands for FORCEs 1, 1.3 and 1.6 ms old; none is missed."""
     answers = AnswerAges(15, 300.0)
     for k in range(3, 300, 3):
         answers.note(k - 3, 3500)

@@ -398,7 +398,7 @@ def test_sessions_stopped_at_zero_gain_do_not_finish(scenario, rungs, at):
 
 
 def test_each_channel_in_space_expects_its_free_mass():
-    """In each of six channels, the first tick moves the free mass by F T^2 / 2 m, and a heavy hand halves this."""
+    """In each of six channels a tick from rest moves the mass by F T^2 / 2 m, and a hand of equal mass halves this."""
     space = load("omega-space")
     session = session_for(space, LinkSettings(held=False))
     for axis, mass in enumerate(session._expected.mass):
@@ -630,7 +630,7 @@ def test_the_range_counts_from_the_middle(scenario, rungs):
     assert "encoder 1 is at -101 mm, its range is" in session.cause
 
 
-def test_faults_of_missing_axes_are_refused(scenario):
+def test_faults_of_impossible_axes_are_refused(scenario):
     with pytest.raises(ValueError, match="is for axis3, the scenario has 2 channels"):
         Emulator(scenario, (FaultInjection.parse("axis3:freeze"),))
     with pytest.raises(InputError, match="does not happen to one axis"):

@@ -133,7 +133,7 @@ class Traffic:
         return Force(command, shifted(source, d.config.theta if d.config else self.theta), source, force)
 
     def oddity(self) -> bytes:
-        """Return a well-formed message that is wrong at this moment, or a wrong frame."""
+        """Return a well-formed message that may be wrong at this moment, or a wrong frame."""
         rng, d, good = self.rng, self.device, self.force()
         axes, (code, size) = rng.randint(1, 8), rng.choice(list(_READ))
         late = rng.choice((-1, -2, 1, 2, 300, 0x8000, rng.randint(0, 0xFFFF)))
@@ -366,7 +366,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 @needs_gcc
 def test_the_headers_need_no_library_or_heap(tmp_path):
-    """Both headers include no library beyond C99; the compiled harness calls memcpy, memset and strncpy only."""
+    """Both headers include only C99 and have no float; the compiled harness calls memcpy, memset and strncpy only."""
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
         '#include "haptic_frame.h"',
@@ -511,7 +511,7 @@ def test_small_write_buffers_send_whole_frames(sketch, room):
 
 @needs_gxx
 def test_only_ticks_feed_the_boards_watchdog(sketch):
-    """Ticks feed the watchdog. A loop whose clock stands still, or that hangs, does not."""
+    """Ticks feed the watchdog; a loop whose clock stands still, or that hangs, does not, as the sketch's text shows."""
     sketch.run(100_000)
     assert not sketch.lib.stub_bites()
     text = (HEADER / "example.ino").read_text()

@@ -135,7 +135,7 @@ class StandIn:
 
 
 def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None):
-    """Run a session of Live with the stand-in from the handshake to the end."""
+    """Run a session of Live with the stand-in to its end; return it, its recorder and its couplings."""
     session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:

@@ -52,7 +52,7 @@ def test_delay_defaults_match_the_page():
     assert int(args.measure) == LinkSettings().measure == 800
 
 
-def test_the_bridge_runs_without_garbage_collection():
+def test_sessions_run_in_a_context_without_collections():
     before, frozen = gc.isenabled(), gc.get_freeze_count()
     with _no_collections():
         assert not gc.isenabled()

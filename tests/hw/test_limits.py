@@ -156,7 +156,7 @@ def test_values_at_a_limit_are_allowed():
     LIMITS.check_speed((0.7e-3, 0.0), (0.0, 0.0), 1e-3)
     LIMITS.check_jump((3e-3, 0.0), (0.0, 0.0), 1)
     Units.of(INFO).check_range((10**5, -(10**5)))
-    assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # the limiter leaves forces at the cap
+    assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # a coupling's limiter sends the cap itself
 
 
 def test_the_gain_stays_between_zero_and_one():

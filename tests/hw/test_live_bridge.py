@@ -339,7 +339,7 @@ def test_ctrl_c_ends_a_running_design(emulator, scenario):
     assert live.signals == [signal.SIGINT]
 
 
-def test_an_exception_stops_the_device_first(emulator, scenario):
+def test_an_exception_in_the_design_is_raised_again(emulator, scenario):
     def plan(ages):
         raise ZeroDivisionError("a mistake of ours")
 

@@ -44,7 +44,7 @@ def test_a_key_during_a_hindrance_arms_nothing(scenario, rungs, monkeypatch):
     assert rehearsal.run_until_armed(1.5).stage == Stage.ARMED
 
 
-def test_late_answers_never_reach_full_gain(scenario, rungs):
+def test_sessions_with_late_answers_never_reach_full_gain(scenario, rungs):
     """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
     session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
     assert Stage.DISARMING in stages(session)

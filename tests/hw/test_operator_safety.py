@@ -86,7 +86,7 @@ def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
     assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.STOPPED]
 
 
-def test_releasing_the_deadman_early_ends_at_once(scenario, rungs):
+def test_a_release_before_full_gain_ends_the_session(scenario, rungs):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     faults = (FaultInjection.parse("letgo@0"),)
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)

@@ -186,7 +186,7 @@ def test_damaged_traces_raise_only_input_errors(trace, tmp_path):
         damaged = whole.copy()
         damaged[place] ^= 0x55
         (tmp_path / "damaged.npz").write_bytes(damaged)
-        with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
+        with suppress(InputError):  # a byte of the archive's padding or of a name may not matter
             replay_command.main([str(tmp_path / "damaged.npz")])
 
 

@@ -96,7 +96,7 @@ def test_a_cable_pulled_after_the_end_changes_nothing(scenario, rungs):
 
 
 def test_devices_with_free_handles_are_armed(scenario, rungs):
-    """A faulty device that nobody holds is armed, so tests/checks/faults.py prints true speeds of free handles."""
+    """A device that nobody holds is armed, so tests/checks/faults.py prints true speeds of free handles."""
     session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
     assert session.stage == Stage.ARMED, session.cause
 
@@ -227,7 +227,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert np.abs(forces - exact.f).max() < bound
 
 
-def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
+def test_sessions_equal_a_simulation_that_rounds(scenario, rungs):
     """The session equals a separate loop: plant with held forces, rounded encoders, F with delays, rounded forces."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)

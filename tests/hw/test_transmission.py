@@ -1,4 +1,4 @@
-"""Bounds of motor and transmission contain the true values of simulated rigs; other records are refused."""
+"""Bounds of motor and transmission contain the true values of simulated rigs; unsuitable rigs are refused."""
 
 import json
 from contextlib import suppress
@@ -20,7 +20,7 @@ from haptic_loop.hw.transmission import transmission_bounds
 from haptic_loop.hw.viscosity import Spectra
 from haptic_loop.sim.scenario import load
 
-T, STEP, FAR = 1.2e-3, 5e-6, 1e9
+T, STEP, FAR = 1.2e-3, 5e-6, 1e9  # [s], [m], [N/m]; FAR stands for a clamp of 1000 t
 
 
 def signals(seconds=1.5):
@@ -73,7 +73,7 @@ def test_bounds_contain_the_truth(m1, m2, k, b, delta):
 
 @pytest.mark.parametrize("held", [False, True])
 def test_derivatives_of_responses_are_exact(held):
-    """Central differences agree to 1e-5 of the largest, which covers their second-order error and rounding."""
+    """Derivatives equal central differences to 1e-5 of the largest, which covers second-order error and rounding."""
     free = signals(0.2)[0]
     spectra = Spectra(record(free, *RIGS[0]), free, T, held)
     p = np.array([*np.log(RIGS[0][:4]), 1.37, 3e-5, 2e-5, 0.3, 0.1])
@@ -143,7 +143,7 @@ def test_the_command_writes_bounds_for_known_device(tmp_path):
     text = (tmp_path / "devices.toml").read_text()
     known = load("omega-pair-known")
     written = msgspec.toml.decode(text)["device"]
-    again = known.replace(device=written)  # what is simulated lies within the bounds
+    again = known.replace(device=written)  # refused unless the simulated devices lie within the bounds
     for device in again.device:
         assert isinstance(device.guaranteed, DeviceBounds)
         assert 0.057 < device.guaranteed.motor_mass_min <= 0.06

@@ -54,7 +54,9 @@ links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
 
 
 def account(trace, link, coupling, T):
-    """Return the least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell.
+    """Return the least sum of f'(u - u_-) [J], without the program's shell.
+
+    f is the force as it was sent, u = x - V f, and u_- is u at the previous tick.
 
     Forces that test a motor are left out, since the scene does not send them.
     """
