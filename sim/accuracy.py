@@ -24,7 +24,7 @@ from haptic_loop.controller.tick import StepBuffer
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant
 from haptic_loop.models.scene import quiet_warnings
-from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, least_substeps, pace
+from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, evaluations, least_substeps, pace
 from haptic_loop.sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
@@ -351,7 +351,6 @@ def _rms(values: Array) -> float:
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
-_EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics per step; other integrators need one
 _MOST_EVALUATIONS = 6e7  # largest number in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
@@ -375,7 +374,7 @@ class EngineChoice:
     @property
     def cost(self) -> tuple[int, float]:
         """The key by which settings are sorted: evaluations of the dynamics per tick, then the error."""
-        return self.substeps * _EVALUATIONS.get(self.integrator, 1), self.position_relative_rms
+        return self.substeps * evaluations(self.integrator), self.position_relative_rms
 
 
 def compare_engines(
@@ -484,7 +483,7 @@ def _refined(
         if gaps[-1] + missed <= error:
             return fine, missed
         needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # The error is of first order in a step.
-        count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # n + n/2 + ... substeps are 2 n
+        count = ticks * evaluations("RK4") * 2 * needed  # n + n/2 + ... substeps are 2 n
         if count > _MOST_EVALUATIONS:
             raise InputError(
                 f"--error {error:g}: with friction this error requires RK4 with about {needed:.0f} substeps, "

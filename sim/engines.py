@@ -196,6 +196,11 @@ def least_substeps(integrator: str) -> int:
     return 1 if integrator == EXPONENTIAL else 4
 
 
+def evaluations(integrator: str) -> int:
+    """Return how often a step of the integrator evaluates the dynamics (mj_forward)."""
+    return 4 if integrator == "RK4" else 1
+
+
 def default_integrator(scene: Scene) -> str:
     """Return "exponential" without friction, else "RK4", which with friction has the smaller error at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
@@ -453,7 +458,7 @@ class MujocoBatchEngine:
 
         substeps = least_substeps(integrator) if substeps is None else substeps
         model = _discretised(held_by.scene, T, integrator, substeps)
-        calls = len(held_by) * substeps * (1 if integrator == EXPONENTIAL else 4)
+        calls = len(held_by) * substeps * evaluations(integrator)
         self.batch = batch = Batch(model, len(held_by), nthread or int(calls < _CALLS_FOR_THREADS))
         for name, rows in held_by.fields.items():
             batch.expand(name)[...] = rows

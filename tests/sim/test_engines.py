@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from driven import alike, driven
@@ -17,7 +18,7 @@ from haptic_loop.models.scene import plant
 from haptic_loop.sim import engines as mujoco_engine
 from haptic_loop.sim import run as loop
 from haptic_loop.sim.accuracy import simulated_growth
-from haptic_loop.sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
+from haptic_loop.sim.engines import INTEGRATORS, MujocoBatchEngine, MujocoEngine, evaluations, profiler_off
 from haptic_loop.sim.run import assemble, make_engine, outside_forces, run
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import close, dominant_mode
@@ -219,3 +220,17 @@ class Lost:
 def test_diverging_engines_are_named(simulation):
     with pytest.raises(InputError, match=r"engine .*:Lost: a tick from rest gives numbers that are not finite"):
         simulated_growth(simulation, None, None, Lost)
+
+
+@pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {mujoco_engine.EXPONENTIAL}))
+def test_evaluations_are_mujocos_forward_passes(integrator):
+    """MuJoCo calls the control callback once in every evaluation of the dynamics."""
+    model, calls = assemble(load(), NoCoupling()).scene.model, []
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
+    data = mujoco.MjData(model)
+    mujoco.set_mjcb_control(lambda *state: calls.append(state))
+    try:
+        mujoco.mj_step(model, data)
+    finally:
+        mujoco.set_mjcb_control(None)
+    assert len(calls) == evaluations(integrator)
