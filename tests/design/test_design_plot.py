@@ -14,7 +14,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.compare import curves, grid, ideal, judge
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim import plots
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, load
 
 T, DELTA = 1.2e-3, 1.37
 
@@ -159,14 +159,21 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_three_unequal_devices_have_a_curve_each(tmp_path):
-    """Three unequal devices with delays of 0, 1 and 2 samples have a curve each; --no-plot writes no picture."""
+def test_delays_turn_the_phase_of_each_curve(tmp_path):
+    """Without a coupling device i feels z^-n of the ideal E_ii for its delay of n samples; --no-plot draws nothing."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
     assert main([*args, "--json", str(tmp_path / "r.json")]) == 0
     assert not list(tmp_path.glob("*.png"))
     outcome = json.loads((tmp_path / "r.json").read_text())
-    assert outcome["available_damping"] == [2.0, 0.8, 1.37]
-    assert np.shape(outcome["ideal"]["stiffness"])[1] == 3
+    w = 2 * np.pi * np.array(outcome["frequency_hz"])[:, None]
+
+    def felt(curves):
+        return np.array(curves["stiffness"]) + 1j * w * np.array(curves["damping"])
+
+    late = np.exp(-1j * w * load("three-rigid").T * [0, 1, 2])
+    ideal = felt(outcome["ideal"])
+    # Rounding in z^-n E of the largest response, and in the 12 digits of the frequencies.
+    np.testing.assert_allclose(felt(outcome["couplings"][0]["perceived"]), late * ideal, atol=1e-9 * abs(ideal).max())
 
 
 def test_an_impossible_design_leaves_the_other_couplings(tmp_path, capsys):
