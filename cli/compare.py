@@ -51,7 +51,7 @@ def _parser() -> options.Parser:
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("condition for names without :CONDITION (default: the coupling's); your own judges all")
+    parser.add_condition("condition for names without :CONDITION (default: the coupling's); your own judges every one")
     parser.add_output(picture=True)
     parser.only("with --coupling: the runs of every coupling use no seed", lambda args: args.coupling, "seed")
     return parser

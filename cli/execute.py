@@ -1,4 +1,4 @@
-"""Run a command: its errors become one line on standard error, and its exit code says what happened."""
+"""Run a command: errors of its input become one line on standard error, and its exit code says what happened."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _terminated(number: int, frame: Any) -> NoReturn:
     raise SystemExit(_say("terminated", 128 + number))
 
 
-_MOMENT = 0.05  # [s]
+_MOMENT = 0.05  # [s] time after which an ignored Ctrl-C is repeated
 
 
 def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__unraisablehook__) -> None:

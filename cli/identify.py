@@ -195,9 +195,9 @@ def _sitting(
 
     if args.port and number > 1:
         told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
-        told += "; then press a" if not args.arm else "" if args.same_place else ": the sitting begins 5 s later"
+        told += "; then press key a" if not args.arm else "" if args.same_place else ": the sitting begins 5 s later"
         if clamped is not None:
-            told = "clamp every handle to the bench; then press a" if not args.arm else "every handle must be clamped"
+            told = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)

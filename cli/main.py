@@ -19,7 +19,7 @@ COMMANDS = {
     "audit": ("design.audit", "judge whether gains are safe, and with what margin"),
     "design": ("design", "design a coupling, prove its certificate and store both"),
     "run": ("sim.run", "close the loop once: stability, transparency and error"),
-    "validate": ("sim.validate", "test with random passive humans in both engines, and search for the worst"),
+    "validate": ("sim.validate", "test with random passive humans in both engines; search for the worst human"),
     "bridge": ("hw.bridge", "drive a device with a certified coupling"),
     "zwidth": ("sim.zwidth", "draw the Z-width map: which springs and dampers are safe"),
     "view": ("sim.view", "show the loop in a window, or film it"),

@@ -224,7 +224,7 @@ class Parser(argparse.ArgumentParser):
         group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
         span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
         self.add_varying_delay(span, group)
-        pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
+        pattern = f"how delays vary: {', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
         group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
         loss = "probability that a force is lost; the device then holds the last force"
         group.add_argument("--loss", type=number(), metavar="P", help=loss)

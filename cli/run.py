@@ -308,7 +308,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
         "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
         "CPU s": "{r.cpu_s:.3f}",
-        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # 0 s is below the resolution
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # below the clock's resolution
     }
     title = "speed against error on this scene (*: this run, the cheapest within --error)"
     return render.columns(title, cells, engines)

@@ -335,7 +335,7 @@ def _rehearsed(
     alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
-    """Run the session in virtual time; the emulated person arms once and holds the deadman."""
+    """Run the session in virtual time; the emulated person arms once and holds the dead-man switch."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     with options.refused("the scenario cannot run behind a serial link: "):
         emulator = Emulator(axis_by_axis(alone or options.scenario_from(args)), faults, coulomb=coulomb)

@@ -101,7 +101,7 @@ def _parser() -> options.Parser:
     parser.add_limiter()
     many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
     add("--humans", type=whole_number(1, 1_000_000), metavar="N", help=many)
-    add("--links", choices=tuple(_LINKS), help="masses in each human (default: as in the scenario)")
+    add("--links", choices=tuple(_LINKS), help="masses in each human (default: as in the scenario); mixed: 1 or 2")
     add("--engine", choices=ENGINES, default="both", help="engines that judge; mujoco means both (default both)")
     seconds = "length of the traces [s] (default 2; 0: no traces)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
@@ -112,11 +112,11 @@ def _parser() -> options.Parser:
         type=whole_number(1, 256),
         default=1,
         metavar="K",
-        help="number of processes; the result is the same (default 1)",
+        help="number of processes, on which the result does not depend (default 1)",
     )
     add("--adversary", action="store_true", help="also search for the worst passive human")
     add("--generations", type=whole_number(1, 10_000), metavar="N", help="generations of --adversary (default 150)")
-    met = "nominal (default), or ranges: in turn the nominal environment, the ranges' vertices, and points inside"
+    met = "environments: the nominal one (default), or in turn the nominal one, the ranges' vertices, and points inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")

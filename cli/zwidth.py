@@ -91,7 +91,7 @@ def _parser() -> options.Parser:
     names = f"{', '.join(NAMES)} or FILE.json (default: map K and B of a spring-damper)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
     parser.add_condition(
-        "condition to draw: your own or, with --coupling, a named one (default: that of the coupling)", to=of_map
+        "with --coupling: condition of its design (default: that of the coupling); your own is always drawn", to=of_map
     )
     rows = "rows and columns (default 60; 24 with --coupling or walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
