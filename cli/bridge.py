@@ -49,7 +49,8 @@ def main(argv: list[str]) -> int:
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
     # In a rehearsal the scenario's hands hold the handles.
-    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)
+    checked = not (args.rehearse or args.no_axis_check)
+    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse, check_axes=checked)
     session = session_for(scenario, settings, **limits)
     below = session.scenario.delta if session.scenario.delta != scenario.delta else ()
     scenario = session.scenario

@@ -101,8 +101,10 @@ def add_safety_options(parser: options.Parser) -> None:
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
     add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
+    unchecked = "arm without having asked to move every axis in its + direction by hand"
+    add("--no-axis-check", action="store_true", help=unchecked)
     add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
-    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man")
+    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man", "no_axis_check")
     held = "with --port: in a rehearsal only --deadman device acts"
     parser.only(held, lambda args: args.port or args.deadman == "device", "deadman")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
@@ -360,12 +362,11 @@ def _rehearsed(
 def _show(session: Session) -> None:
     """Overwrite the status line, unless the terminal would block."""
     words, drive, counters = [str(session.stage)], session.drive, session.counters
+    words += [session.request] if session.request else []
     if session.stage == Stage.MEASURING:
         words.append(f"{len(session.measurement.result.values)} of {session.settings.measure} answers")
     elif session.stage == Stage.MEASURED:
         words.append("designing the coupling")
-    elif session.request:
-        words.append(session.request)
     elif drive and drive.x:
         words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")

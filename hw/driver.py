@@ -37,7 +37,7 @@ class Operator:
         if session.stage == Stage.DISARMED:
             self._armed_at = None
             if self.auto_arm and session.hindrance:
-                self._free_at = now + _LET_GO_US * bool(session.settings.elsewhere)
+                self._free_at = now + _LET_GO_US * (session.settings.check_axes or bool(session.settings.elsewhere))
             elif self.auto_arm and now >= self._free_at:
                 return self._arm_once(session, now)
         if session.stage == Stage.ARMED and self._armed_at is None:

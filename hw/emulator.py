@@ -73,6 +73,7 @@ _DEVICE = {
     "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
     "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
+    "exchange": ("no value: motors and encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
     "cross": ("share of motor 1's force that motor 2 adds to its own force", -1.0, 1.0, 1.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
@@ -314,7 +315,7 @@ class Emulator:
         self._motor: Array = np.ones((2, scenario.channels))  # shares of a positive and of a negative force
         self._most: Array = np.full(scenario.channels, np.inf)  # [N] forces at which motors saturate
         self._zone: Array = np.zeros(scenario.channels)  # [N] dead zones of motors
-        self._swapped, self._crossed, self._motors_fail = False, 0.0, False
+        self._swapped, self._exchanged, self._crossed, self._motors_fail = False, False, 0.0, False
         # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
@@ -325,7 +326,7 @@ class Emulator:
                 raise ValueError(
                     f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
                 )
-            if fault.kind in ("swap", "cross") and scenario.channels < 2:
+            if fault.kind in ("swap", "exchange", "cross") and scenario.channels < 2:
                 raise ValueError(f"--fault {fault.kind} is for two axes, the scenario has one channel")
         self._waiting = list(faults)
         self._ready = 0
@@ -349,6 +350,8 @@ class Emulator:
         forces = np.array(steps) * self.force_step
         if not self._motors_fail:
             return forces
+        if self._exchanged:
+            forces[:2] = forces[1::-1]
         forces = np.clip(forces, -self._most, self._most)
         forces -= np.clip(forces, -self._zone, self._zone)
         forces *= np.where(forces > 0, *self._motor)
@@ -445,7 +448,7 @@ class Emulator:
     def _misbehave(self, now: int) -> None:
         for fault in [u for u in self._waiting if u.active(self.since_armed(now))]:
             self._waiting.remove(fault)
-            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "zone", "cross")
+            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "zone", "cross", "exchange")
             match fault.kind:
                 case "stall":
                     self.stalled_until = now + round(1e6 * fault.value)
@@ -464,8 +467,8 @@ class Emulator:
                     self._most[fault.axis] = fault.value
                 case "zone":
                     self._zone[fault.axis] = fault.value
-                case "swap":
-                    self._swapped = True
+                case "swap" | "exchange":
+                    self._swapped, self._exchanged = True, fault.kind == "exchange"
                 case "cross":
                     self._crossed = fault.value
                 case "leap":

@@ -38,6 +38,8 @@ _CLEAN, _RUBBED = 0.15, 0.25  # for _ZONE: largest one-sided share, largest fric
 _BETTER = 8.0  # least ratio of squares that a one-sided fault explains to the rest; friction and weight reach 6
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
+ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as moved to another place
+_SETTLED = 0.5  # [s] time of rest before a person is asked to move an axis
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, as a multiple of 1 N; longest time [s] of rest under this force
 _TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser counts the encoder looks dead
@@ -68,6 +70,45 @@ class EncoderNoise:
         Broken channels toggle by 1. Over a longer time, noise exceeds this range with a probability below 1e-6.
         """
         return tuple(2 * least if least and least > 1 else 1 for least in self.range)
+
+
+class AxisCheck:
+    """Let a person move one axis after the other in its + direction while no force acts.
+
+    This finds axes that are reversed or exchanged with motors and encoders together, which no force can show.
+    """
+
+    def __init__(self, units: Units, T: float, lever: float) -> None:
+        self._step, self._far, self._rest = units.encoder_step, ELSEWHERE / lever, round(_SETTLED / T)
+        self._axis, self._still, self._origin = 0, 0, tuple[int, ...]()
+
+    @property
+    def request(self) -> str | None:
+        """What the person must do now; None once all axes were moved."""
+        if self._axis == len(self._step):
+            return None
+        if self._still < self._rest:
+            return f"let every handle rest: then move axis {self._axis + 1}"
+        return f"move axis {self._axis + 1} by {1e3 * self._far:.3g} mm or more in its + direction"
+
+    def note(self, counts: tuple[int, ...]) -> str | None:
+        """Process the counts (m,) of a tick. Return a message if an axis moves the wrong way or instead of another."""
+        moved = [(n - then) * q for n, then, q in zip(counts, self._origin or counts, self._step, strict=True)]
+        farthest = max(range(len(moved)), key=lambda i: abs(moved[i]))
+        ready, axis = self._still >= self._rest, self._axis + 1
+        if not self._origin or (not ready and abs(moved[farthest]) > self._far / 5):
+            self._origin, self._still = counts, 0
+        elif not ready:
+            self._still += 1
+        elif axis <= len(moved) and abs(moved[farthest]) >= self._far:
+            far = f"{1e3 * moved[farthest]:+.3g} mm"
+            if farthest + 1 != axis:
+                both = "the axes are exchanged, with motors and encoders"
+                return f"axis {farthest + 1} moved by {far} instead of axis {axis}: {both}"
+            if moved[farthest] < 0:
+                return f"axis {axis} moved by {far}, not in + direction: reverse both its motor and its encoder"
+            self._axis, self._origin, self._still = axis, (), 0
+        return None
 
 
 class Expected:

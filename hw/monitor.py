@@ -47,6 +47,7 @@ class LinkSettings:
     rereference: bool = True  # whether positions count from the handles' place at arming
     deadman: bool = False  # whether forces act only while the deadman at the device is held
     behind: tuple[int, ...] = ()  # (m,) with several boards, ticks added to the link's delay (hw/boards.py)
+    check_axes: bool = False  # whether a person must move every axis in its + direction before the first arming
     elsewhere: tuple[int, ...] | None = None  # [counts] places that every handle must have left before arming
 
 

@@ -197,6 +197,8 @@ class Rehearsal:
         if self.operator:
             self._driver.do(self.operator.decide(session, now))
         elif session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
+            if session.hindrance:
+                return self.watch(session)
             self._driver.do(session.arm(now))
         self.watch(session)
         if session.stage not in ENDED:

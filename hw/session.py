@@ -17,7 +17,7 @@ import numpy as np
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
-from haptic_loop.hw.encoders import EncoderNoise, Expected
+from haptic_loop.hw.encoders import ELSEWHERE, AxisCheck, EncoderNoise, Expected
 from haptic_loop.hw.limits import DRIVING, ENDED, SafetyLimits, Stage, Units, probe_delay, watchdog_for
 from haptic_loop.hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.models.device import symmetric
@@ -28,7 +28,6 @@ _ARMING_US = 600_000  # time per axis in which the device must arm and its encod
 _QUIET_US = 1_000_000  # longest silence of a device while no force acts; unlimited during the design
 _STOPPING_US = 50_000  # time for which STOP is repeated to a silent device
 _OBEYING_US = 30_000  # time after STOP in which a device must rest: 1.5 times the longest hold and ramp
-_ELSEWHERE = 5e-3  # [m] least motion after which a handle counts as moved to another place
 _STRONGEST = 12.0  # [N] largest force at the hand, whatever a scenario allows
 
 
@@ -71,6 +70,7 @@ class Session:
         self.now = self.entered = self.heard = 0  # [us] times of the last call, stage change, and new STATE or ACK
         self._units: Units | None = None
         self._noise: EncoderNoise | None = None
+        self._axes: AxisCheck | None = None
         self._shutdown: _Shutdown | None = None
         self._after: Stage | None = Stage.FINISHED  # stage after a ramp-out; None: disarmed with a softer coupling
 
@@ -89,6 +89,8 @@ class Session:
         """The reason why the session cannot be armed at the moment, or None."""
         if not self.held:
             return "the deadman at the device is not held"
+        if self._axes and self._axes.request:
+            return self._axes.request
         last, before = self.link.last, self.settings.elsewhere
         if before is None:
             return None
@@ -98,9 +100,9 @@ class Session:
         near = [
             f"{i}"
             for i, (n, then, step) in enumerate(places, 1)
-            if abs(n - then) * step < _ELSEWHERE / self.limits.lever
+            if abs(n - then) * step < ELSEWHERE / self.limits.lever
         ]
-        where = f"within {1e3 * _ELSEWHERE / self.limits.lever:.3g} mm of its place in the previous sitting"
+        where = f"within {1e3 * ELSEWHERE / self.limits.lever:.3g} mm of its place in the previous sitting"
         return f"handle {', '.join(near)} is {where}: move it farther and let go" if near else None
 
     @property
@@ -247,6 +249,8 @@ class Session:
             return self._end(Stage.REFUSED, "; ".join(reasons))
         self.info, self._units = info, Units.of(info)
         self._noise = EncoderNoise(info.axes, self.scenario.T)
+        if self.settings.check_axes:
+            self._axes = AxisCheck(self.units, self.scenario.T, self.limits.lever)
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
         return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
@@ -294,6 +298,10 @@ class Session:
         self._noise.note(state.counts)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
+        if self._axes and self.stage == Stage.DISARMED:
+            if wrong := self._axes.note(state.counts):
+                return self._end(Stage.REFUSED, wrong)
+            self.request = self._axes.request
         return self._answer(state, wire.Command.IDLE)
 
     def _on_state_after_the_end(self, state: wire.State) -> Said:

@@ -58,6 +58,7 @@ class Fault:
     counted: tuple[str, ...] = ()  # counters that must not be zero
     first_tick: int = 0
     free: bool = False  # nobody holds the handles, and the session knows it
+    shown: bool = False  # a person moves each axis in its + direction before arming
     deadman: bool = False  # forces act only while the dead-man switch at the device is held
     period: float = 1.0  # one tick by the device's clock, in T
     lasts: float = _LASTS  # [s] after arming
@@ -315,6 +316,18 @@ CASES = (
         Fault(f"motor 2 makes {part} of force 1, too", G.STOPPED, "moves encoder 2, too", (f"cross={part}",), _AT_ONCE)
         for part in (1.0, 0.5, -1.0)
     ),
+    Fault("axes moved by hand", A, free=True, shown=True),
+    Fault("axes 1 and 2 exchanged", G.REFUSED, "axis 2 moved .* instead of axis 1", ("exchange",), shown=True),
+    *(
+        Fault(
+            f"axis {i} all reversed",
+            G.REFUSED,
+            f"axis {i} moved .* not",
+            (f"axis{i}:motor=-1", f"axis{i}:reverse"),
+            shown=True,
+        )
+        for i in (1, 2)
+    ),
     Fault("axes swapped before", G.STOPPED, "force on axis 1 moves encoder 2", ("swap",), _AT_ONCE),
     Fault("axes swapped and reversed before", G.STOPPED, "encoder 2", ("swap", "reverse", "axis2:reverse"), _AT_ONCE),
     *(
@@ -452,11 +465,15 @@ def _rehearse_case(
     session = Session(
         scenario,
         SafetyLimits(cap, continuous=tuple(map(min, case.continuous, cap)), thermal=1.0),
-        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not case.free),
+        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not case.free, check_axes=case.shown),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(nobody(scenario) if case.free else scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick
+
+    def show(session: Session) -> None:
+        if asked := re.match(r"move axis (\d)", session.request or ""):
+            emulator.plant.s[int(asked[1]) - 1 : 4 : 2] += 2e-4  # motor and handle
 
     def frozen(session: Session, now: int) -> Said:
         rehearsal.freeze(case.host_stall)
@@ -469,6 +486,7 @@ def _rehearse_case(
         faults,
         actions=[(case.acts, case.action)] if case.action else [(_WHEN, frozen)],
         clock=case.period,
+        watch=show,
     )
     rehearsal.run_until_armed(case.lasts)
     timed = case.within is not None and rehearsal.armed_us is not None

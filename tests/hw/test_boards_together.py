@@ -216,7 +216,7 @@ def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypat
         return made
 
     monkeypatch.setattr(bridge, "certified_couplings", certified)
-    options = ["--arm", "--no-dead-man", "--no-preflight", "--no-plot", "--case=I", "--measure=450"]
+    options = ["--arm", "--no-dead-man", "--no-axis-check", "--no-preflight", "--no-plot", "--case=I", "--measure=450"]
     code = bridge.main([*options, f"--port={','.join(ports)}", "--duration=0.3", f"--out={tmp_path}", "--json=-"])
     told = capsys.readouterr()
     report = json.loads(told.out)

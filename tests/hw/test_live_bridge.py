@@ -75,7 +75,17 @@ def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
 def commanded(capsys, scenario):
     """Run short sessions of the command, slower and slower until one is armed, and return its report."""
     for pace in PACES:
-        options = ["--arm", "--no-dead-man", "--scenario", scenario, "--measure", "60", "--duration", "0.1"]
+        options = [
+            "--arm",
+            "--no-dead-man",
+            "--no-axis-check",
+            "--scenario",
+            scenario,
+            "--measure",
+            "60",
+            "--duration",
+            "0.1",
+        ]
         with emulated("--nobody", f"--pace={pace}", f"--scenario={scenario}") as path:
             live = ["--pace", str(pace), "--port", path, "--no-preflight", "--no-plot", "--json", "-"]
             code = bridge.main([*options, *live])
@@ -131,6 +141,7 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
         options = [
             "--arm",
             "--no-dead-man",
+            "--no-axis-check",
             "--case",
             "I",
             "--duration",

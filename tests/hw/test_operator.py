@@ -1,10 +1,13 @@
 """Check in virtual time who arms a live session, and when."""
 
+import re
+
 import pytest
 
 from haptic_loop.hw.driver import Operator
-from haptic_loop.hw.emulator import Emulator, FaultInjection
-from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
+from haptic_loop.hw.encoders import AxisCheck
+from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
@@ -100,3 +103,79 @@ def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
     assert rehearsal.run(1.0).stage == Stage.DISARMED
     Operator(False, 5.0).press("q", session, session.now)
     assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")
+
+
+# axes that a person moves before the first arming
+
+
+def shown(scenario, rungs, monkeypatch, *faults, mm=6.0, seconds=8.0):
+    """Run a session whose person moves each axis by `mm` when asked, and then lets go of it."""
+    monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 300_000)
+    free, faults, requests = nobody(scenario), tuple(map(FaultInjection.parse, faults)), []
+    session = Session(free, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100, held=False, check_axes=True))
+    emulator = Emulator(free, faults)
+
+    def move(session):
+        asked = re.match(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
+        if asked and session.request not in requests:
+            emulator.plant.s[int(asked[1]) - 1 : 4 : 2] += 1e-3 * mm  # motor and handle
+            requests.append(session.request)
+
+    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, operator=Operator(True, 5.0), watch=move)
+    rehearsal.run_until_armed(0.6) if seconds is None else rehearsal.run(seconds)
+    return session, rehearsal, [int(request[10]) for request in requests]
+
+
+def test_axes_moved_as_asked_arm(scenario, rungs, monkeypatch):
+    session, rehearsal, axes = shown(scenario, rungs, monkeypatch, seconds=None)
+    assert session.stage == Stage.ARMED, session.cause
+    assert axes == [1, 2]
+    assert rehearsal.armed_us > 1e6 * (0.1 + 2 * 0.5 + 0.3)  # the measurement, two rests, the time to let go
+
+
+@pytest.mark.parametrize(
+    ("faults", "mm", "words"),
+    [
+        (["exchange"], 6, r"axis 2 moved by \+6 mm instead of axis 1: the axes are exchanged"),
+        (["exchange"], -6, "axis 2 moved by -6 mm instead of axis 1"),
+        (["motor=-1", "reverse"], 6, r"axis 1 moved by -6 mm, not in \+ direction: reverse both its motor"),
+        (["axis2:motor=-1", "axis2:reverse"], 6, r"axis 2 moved by -6 mm, not in \+ direction"),
+        ([], -6, "axis 1 moved by -6 mm, not in"),
+    ],
+)
+def test_axes_moved_otherwise_are_refused(scenario, rungs, monkeypatch, faults, mm, words):
+    session, rehearsal, _ = shown(scenario, rungs, monkeypatch, *faults, mm=mm)
+    assert session.stage == Stage.REFUSED
+    assert re.match(words, session.cause), session.cause
+    assert rehearsal.armed_us is None
+
+
+@pytest.mark.parametrize("faults", [["exchange"], ["motor=-1", "reverse"]])
+def test_no_force_shows_exchanged_axes(scenario, rungs, faults):
+    """Without the person the motor test passes, because motors and encoders are exchanged or reversed together."""
+    assert rehearsal_of(scenario, rungs, None, *faults).run_until_armed(0.6).stage == Stage.ARMED
+
+
+def test_small_motions_show_no_axis(scenario, rungs, monkeypatch):
+    session, _, axes = shown(scenario, rungs, monkeypatch, mm=4.9, seconds=3.0)
+    assert (session.stage, axes) == (Stage.DISARMED, [1])
+    session.arm(session.now)
+    assert session.stage == Stage.DISARMED
+    assert session.log[-1].cause == "move axis 1 by 5 mm or more in its + direction"
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("lever", [1.0, 0.02])
+def test_one_axis_shows_its_direction(direction, lever):
+    """A knob held at 20 mm must turn by 5 mm / 20 mm = 0.25 rad."""
+    T, q, far = 1e-3, 1e-5, 5e-3 / lever
+    check = AxisCheck(Units((q,), (1e-3,), (10**9,)), T, lever)
+    counts = [round(direction * min(1.0, max(0, k - 600) / 300) * 1.01 * far / q) for k in range(1000)]
+    answers = [check.note((n,)) for n in counts]
+    first = next((k for k, n in enumerate(counts) if abs(n) * q >= far), None)
+    if direction > 0:
+        assert not any(answers)
+        assert check.request is None
+    else:
+        assert re.match("axis 1 moved by -.*, not in", answers[first])
+        assert not any(answers[:first])

@@ -148,6 +148,21 @@ def test_live_sessions_use_a_deadman_unless_refused(scenario, monkeypatch):
         assert args.deadman == asked
 
 
+def test_live_sessions_check_axes_unless_refused(monkeypatch):
+    asked = []
+
+    def seen(scenario, settings, **limits):
+        asked.append(settings.check_axes)
+        raise InputError("seen")
+
+    monkeypatch.setattr(bridge, "session_for", seen)
+    live = ["--port", "x", "--arm", "--no-dead-man"]
+    for options in (live, [*live, "--no-axis-check"], ["--rehearse"]):
+        with pytest.raises(InputError, match="seen"):
+            bridge.main(options)
+    assert asked == [True, False, False]
+
+
 def test_a_reset_device_keeps_the_deadman_held(scenario):
     emulator = Emulator(scenario, (FaultInjection.parse("reset"),))
     before = emulator.device
