@@ -1,1 +1,1 @@
-"""Conditions, figures of merit and designs of couplings. Most conditions describe a device by its damping alone."""
+"""Conditions, figures of merit and designs of couplings. Most conditions use only the damping of a device."""

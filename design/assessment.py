@@ -421,7 +421,7 @@ class EncoderSteps:
 
     @property
     def suffix(self) -> str:
-        """The same restriction for the end of a guarantee in a table or a title."""
+        """The restriction by the encoder steps for the end of a guarantee in a table or a title."""
         return ", encoder steps with this object only" if self.covered else ", for exact positions only"
 
     @classmethod
@@ -554,7 +554,7 @@ class Assessment:
         condition: The name of the condition that must hold for `holds`; another condition of the package may give the
             guarantee, but a user's own must give it itself, because others leave out the user's facts.
         own: The user's own condition, or None.
-        encoder: Whether friction covers the devices' encoder steps; None without them, and where only a loop is given.
+        encoder: Whether friction covers the devices' encoder steps; None without steps, or if only a loop was given.
     """
 
     loop: Loop
@@ -576,7 +576,7 @@ class Assessment:
 
     @property
     def guarantee_words(self) -> str | None:
-        """The guarantee in one line for tables and titles, with what it says of encoder steps; None without one."""
+        """The guarantee with its restriction by encoder steps, in one line; None without a guarantee."""
         if self.guarantee is None:
             return None
         limits = self.encoder.suffix if self.encoder and self.guarantee.counts_positions else ""

@@ -325,7 +325,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Return the least reduction of the delays `name` that certifies, or else that with the least requirement.
+    """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
 
     The delays of all channels fall by the same number of samples, but not below 0. The changed loop has lam = 0.
     """

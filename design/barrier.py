@@ -83,7 +83,7 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
-    The unknowns are the entries of the X_n (for each entry those of all n), followed by the x_a. At each frequency the
+    The unknowns are the entries of the X_n, sorted by entry and then by n, followed by the x_a. At each frequency the
     second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
     S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)
     times (pairs of entries).

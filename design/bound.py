@@ -173,7 +173,10 @@ class _Dual:
         return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.cost
 
     def imposed(self) -> Array:
-        """Return the first frequencies at which D > 0 is imposed, dense at the band's ends, modes and delays."""
+        """Return the first frequencies at which D > 0 is imposed.
+
+        They are dense at the band's ends and the modes of E, and include the zeros of the delays' windows (`turns`).
+        """
         low, high = self.grid[0], self.grid[-1]
         steps = np.arange(4 * self.knots.size - 3) / 4
         within = np.exp(np.interp(steps, np.arange(self.knots.size), np.log(self.knots)))

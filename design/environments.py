@@ -513,12 +513,12 @@ def _half_widths(loop: Loop) -> Array:
 # environment together are passive. So any-environment covers limited forces without a further proof. This does not
 # hold if the environment has a delay.
 
-BETA = 0.01  # default lag of a limiter under this-environment, relative to the device's least damping over T
+BETA = 0.01  # default rho of a limiter under this-environment, relative to the device's least damping over T
 
 
 @dataclass(frozen=True)
 class LimitedForces(ThisEnvironment):
-    """The condition this-environment for forces behind a limiter of lag rho_i = beta lambda_min(Delta_i)/T."""
+    """The condition this-environment for forces behind a limiter with rho_i = beta lambda_min(Delta_i)/T [N/m]."""
 
     beta: float = BETA
     lags: int = 1  # number of weights c_ij per device
@@ -549,7 +549,7 @@ class LimitedForces(ThisEnvironment):
         return (*super().facts(loop), Limited(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """Return c with one row per device and one entry per lag; c is at the end of the multipliers."""
+        """Return c (devices, lags), which is at the end of the multipliers."""
         devices = len(loop.devices)
         c = tuple(multiplier)[len(multiplier) - devices * self.lags :] if multiplier else ()
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))

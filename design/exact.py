@@ -301,7 +301,7 @@ def _whitening(W: Array) -> _Integers | None:
 
 _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; the package stores a few hundred
 _STORED_BITS = 48  # bits of each entry of P, relative to its diagonal
-_EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision has fewer
+_EXTENDED_BITS = 96  # bits of the largest entry of a factor of exact products; extended precision on x86 has 64
 _LEAST_MOVED = 1e-10  # smaller eigenvalues of a normalised covariance, relative to the largest, are raised to this
 _LEFT = 0.02  # Newton's steps end if the residual of the Riccati equation is below this share of e (`find_storage`)
 _UNIT = 2.0**-53  # unit roundoff of double precision

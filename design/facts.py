@@ -725,7 +725,7 @@ _SPARE = 0.02  # margin, relative to rho, that a search subtracts from the block
 
 
 class Limited(Fact):
-    """Forces that are sent through the limiter of controller.law, which has the lag rho > 0 [N/m] on each device.
+    """Forces that are sent through the limiter of controller.law, with the stiffness rho > 0 [N/m] on each device.
 
     The multiplier has weights c_1, c_2, .. for the past ticks. All axes of a device share rho and these weights, so
     that the force of a device may be limited to a ball or to a box.

@@ -355,7 +355,7 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """The loop with limited forces: x = (log K, B/delta, c), with the limiter's weight c of lag 1 per channel."""
+    """The loop with limited forces: x = (log K, B/delta, c), with the limiter's weight c_1 of each channel as c."""
 
     bounds = (0.0, 5.0)
     _first = 0.5  # first value of c

@@ -159,7 +159,7 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
 
 @dataclass(frozen=True)
 class Slip:
-    """Lag and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
+    """Stiffness and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
 
     beta: float  # rho of a device is beta/T times its least damping (LimitedForces.rho)
     c: tuple[tuple[float, ...], ...]  # (devices, lags)
