@@ -1,7 +1,7 @@
 """Rehearse every fault of a link, a device, a controller or a person that we could think of, in virtual time.
 
 Each case is a whole session of bridge and emulated device: the fault, the stage that it must end in, and how soon. The
-time to zero force is counted from the fault to the first tick after which no motor has a force.
+time to zero force is counted from _WHEN, when most faults begin, to the first tick after which no motor has a force.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
-_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick
+_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick; sessions that ended before _WHEN have zero force there
 _STOP = 8 * _T_MS  # the frame that shows the fault, the STOP, 5 ticks of ramp
 _WATCHDOG = 12 * _T_MS  # theta, 4 ticks with a held force, 5 of ramp, one to notice
 _TESTED = 2 * (12.0 + 120.0)  # the final test of two motors
@@ -46,7 +46,7 @@ class Fault:
     stage: Stage
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
-    within: float | None = None  # [ms] from the fault to zero force; None: not measured
+    within: float | None = None  # [ms] from _WHEN to zero force; None: not measured
     action: _Call | None = None  # what a person or a faulty controller does
     acts: float = _WHEN  # [s] from arming to the action
     host_stall: float = 0.0  # [s] that the host freezes at _WHEN
@@ -422,7 +422,7 @@ class _FaultOutcome:
     cause: str
     peak_force_n: float  # of any motor
     peak_speed: float  # [m/s] of any handle
-    zero_force_ms: float | None  # from the fault on; None: not measured, or forces go on
+    zero_force_ms: float | None  # from _WHEN on; None: not measured, or forces go on
     allowed_ms: float | None
     wrong: tuple[str, ...]  # empty if all went as required
 

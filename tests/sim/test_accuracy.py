@@ -78,7 +78,7 @@ def test_runs_say_when_they_stop_being_credible():
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
     assert part.transmission_force_n == pytest.approx(force.max(axis=0))
-    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # differences err by 7 % at 84 Hz
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # np.gradient errs by 7 % at 84 Hz
     assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
     assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)

@@ -40,6 +40,7 @@ def test_the_search_destabilises_loops_below_the_requirement():
 
 @pytest.mark.slow
 def test_the_search_fails_against_sufficient_damping():
+    """With 0.1 % more damping than required, the search destabilises no loop."""
     rows = attempts(LOOPS, np.array([-1e-3]), generations=3)
     assert not any(row.worst.destabilises for row in rows)
     # The growth with lossless hands approaches 0 from below, up to the rounding of eigenvalues.

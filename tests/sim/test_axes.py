@@ -59,7 +59,7 @@ def scenario(first: str = "", second: str = "", more: str = "") -> Scenario:
 
 
 def line() -> Scenario:
-    """Return the loop of `scenario()` with devices of one axis."""
+    """Return `scenario()` with devices of one axis."""
     return parse(TEXT.replace("axes = 3", "").replace("FIRST", "").replace("SECOND", "").replace("MORE", ""))
 
 

@@ -383,7 +383,7 @@ def test_unreachable_errors_are_refused(scenario, error, message):
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
-    """After two runs, the estimate for all runs is 512 steps of 4 evaluations in each of 100 ticks: no third begins."""
+    """After two runs the estimate for all is 512 steps of 4 evaluations in 100 ticks, over 2e5, so no third begins."""
     monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
     words = r"requires RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"

@@ -207,6 +207,7 @@ def test_no_trace_contradicts_its_eigenvalues():
     assert [row for row in found if not row.holds] == []
     assert found[11].not_excited
     assert found[11].exact_per_s > 100
+    # 8 is a third of the traces.
     assert sum(row.not_excited for row in found) < 8 < sum(row.exact_per_s > 0 for row in found)
 
 

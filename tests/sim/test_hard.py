@@ -99,7 +99,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 @pytest.mark.slow
 def test_certified_loops_may_keep_clipping_with_lossless_hands():
-    """From a fifth of far starts or more, a loop certified without limits keeps clipping; with damped hands, never."""
+    """From over a fifth of far starts, a loop certified without limits keeps clipping, but never with damped hands."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=30)
     print(f"lossless hands: {far:.1%} of 60 far and {near} of 30 near starts clip after 48 s, at {frequency:.2f} Hz")
@@ -109,7 +109,7 @@ def test_certified_loops_may_keep_clipping_with_lossless_hands():
 
 
 def test_encoder_steps_move_traces_less_than_a_step():
-    """With encoder steps, motions stay within a step of those with ideal ones, and idle devices within a step of 0."""
+    """With encoder steps, motions stay within a step of those with ideal encoders, and idle devices near 0."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (run(assemble(s, PUBLISHED["I"]), "exact") for s in (scenario, coarse))

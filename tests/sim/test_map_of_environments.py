@@ -30,7 +30,7 @@ def around(scenario, coupling):
 
 @pytest.fixture(scope="module")
 def optimal():
-    """Return the optimal coupling of each scenario; the one of the scenario with three channels has a small basis."""
+    """Return the optimal coupling of each scenario; that of three channels has a small basis, so that it is quick."""
     small = design(STAR.loop("I"), Options(bases=((6, 4),)))
     return {PAIR.name: choose(PAIR, "I", "optimal").coupling, STAR.name: small.coupling}
 
@@ -84,9 +84,9 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
 
 
 def test_a_kept_model_is_the_scenarios_environment():
-    """In the row "model kept" the coupling is V = Q (I - E0 Q)^-1 with the scenario's E0 in every cell.
+    """The map's third case keeps the coupling V = Q (I - E0 Q)^-1 with the scenario's E0 in every cell.
 
-    Where a cell's environment is not E0, the ratio therefore differs from that of this-environment.
+    Where a cell's environment is not E0, its ratio therefore differs from that of this-environment.
     """
     coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)

@@ -157,7 +157,7 @@ class Muscles:
 
 
 def test_own_hand_populations_agree_in_both_engines():
-    """Without coupling some hands make the loop unstable; both engines name the same ones, as does a repetition."""
+    """Without coupling some hands make the loop unstable; both engines agree which, and a repetition gives the same."""
     scenario = SCENARIO.replace(population=Muscles())
     found = validate(scenario, None, humans=40, duration=0.5)
     assert 0 < (found.exact > 0).sum() < 40
@@ -331,7 +331,7 @@ def test_a_state_space_is_no_coupling():
 
 @pytest.mark.slow
 def test_engines_agree_on_a_population_at_walls():
-    """Both engines' verdicts are those of the worst frozen contact state; traces touch the wall and give no energy."""
+    """The engines agree, traces touch the wall and give no energy, and a hand's growth is that of its worst contact."""
     scenario = load("one-wall")
     coupling = design_coupling(scenario.loop("I"), "spring-damper", "any-environment")
     found = validate(scenario, coupling, humans=20, duration=2.0)

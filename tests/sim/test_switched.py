@@ -232,7 +232,7 @@ def validated(tmp_path, *options):
 
 @pytest.mark.validate
 def test_only_designs_for_switching_withstand_the_worst_switching(tmp_path):
-    """The design for constant delays fails for half the humans or more, the one for switching delays for none."""
+    """The design for constant delays is unstable with 10 or more of 20 humans, that for switching delays with none."""
     coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10

@@ -591,7 +591,7 @@ def test_the_window_loop_ends_at_its_time(none):
         time[0] += 0.1
 
     _loop(LiveLoop(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
-    assert window.synced == 7
+    assert window.synced == 7  # frames at 0, 0.1, .., 0.6 s
 
 
 def test_keys_may_come_from_another_thread(none):

@@ -446,7 +446,7 @@ def linear_tray(tmp_path):
 
 @pytest.mark.parametrize("change", [TRAY.replace("0.3", "0.4"), TRAY])
 def test_scenes_that_changed_void_their_linear_network(tmp_path, linear_tray, change):
-    """After a change of the scene the claim names the network as stale, and a loaded scenario is refused."""
+    """Only after a change of the scene, the claim calls the network stale, and a loaded scenario is refused."""
     before, design = linear_tray
     after = scenario(tmp_path, change)
     said = Claim.of(assessed(after, "I", choose_given(design), energy_budget=START_J), design.certified_for)
