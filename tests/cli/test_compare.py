@@ -26,7 +26,7 @@ def compared(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_each_coupling_has_its_price_and_error(compared):
+def test_each_coupling_has_its_guarantee_and_error(compared):
     rows, place = compared
     assert list(rows)[:2] == [("none", None), ("published", None)]
     none, free = rows["none", None], rows["spring-damper", "any-environment"]

@@ -73,7 +73,10 @@ RUN = ["sim.run", "--coupling", "published", "--duration", "3"]
     [([*RUN, "--cross-check"], 2), ([*RUN, "--cross-check"], 3), (["design.compare"], 1), (["design.compare"], 2)],
 )
 def test_interrupted_secondary_runs_give_no_report(command, simulation, tmp_path, monkeypatch):
-    """sim.run then simulates the exact loop and the cross-check; design.compare simulates every coupling."""
+    """Ctrl-C interrupts a simulation other than the reported run.
+
+    sim.run also simulates the exact loop and the cross-check, and design.compare every coupling.
+    """
     interrupt(monkeypatch, simulation)
     with pytest.raises(KeyboardInterrupt):
         finish(command, tmp_path)

@@ -1,4 +1,4 @@
-"""Numbers in tables keep every digit on narrow terminals."""
+"""Tables keep every digit of their numbers on narrow terminals, and names are printed as they are."""
 
 import ast
 import io

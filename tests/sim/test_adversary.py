@@ -1,4 +1,7 @@
-"""The search for the worst passive human destabilises loops with too little damping, and none with enough."""
+"""The search for the worst passive human destabilises loops with too little damping, and none with enough.
+
+Tolerances without a comment cover rounding.
+"""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""Growth rates from displacements equal known ones; voluntary motion and encoder steps count as no oscillation."""
+"""Growth rates from displacements equal known ones; voluntary motion and encoder steps count as no oscillation.
+
+When measured, the rate of a single mode erred by up to 4e-5 1/s in the tests without a comment.
+"""
 
 import json
 
@@ -71,7 +74,7 @@ def test_reasons_say_how_brief_oscillations_ended(size, rate, end):
 def test_decaying_modes_do_not_hide_growing_ones():
     found = growth(motion(6.0, (3e-4, 20.0, -0.8), (2e-5, 90.0, 1.0)), T, STEP)
     assert found.trend == "grows"
-    assert found.frequency_hz == pytest.approx(90.0, abs=1.5)
+    assert found.frequency_hz == pytest.approx(90.0, abs=1.5)  # the spectrum's lines are 1 Hz apart
 
 
 def test_a_limit_cycle_neither_grows_nor_decays():

@@ -1,4 +1,4 @@
-"""The ideal environment's forces for a run's motion equal those of equations written out here."""
+"""The ideal environment's forces for a run's motion equal those of equations written out here, up to rounding."""
 
 import json
 

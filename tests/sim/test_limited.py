@@ -1,4 +1,4 @@
-"""Runs with limited forces have the right guarantee in the report, and are equal in both engines."""
+"""Runs with limited forces have the right guarantee in the report, and are equal in both engines up to rounding."""
 
 import json
 
