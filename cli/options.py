@@ -252,7 +252,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_details(self) -> None:
         """Add --details."""
-        what = "also print what no certificate covers, and how the computation went"
+        what = "also print what no certificate covers; of a run also its speed and position error"
         self.add_argument("--details", action="store_true", help=what)
 
     def add_json(self, to: _Group | None = None) -> None:

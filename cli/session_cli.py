@@ -66,7 +66,7 @@ def add_link_options(parser: options.Parser) -> None:
     add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
     count = "number of answers that are timed (default 800)"
     add("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
-    share = "share of the measured answers that theta or the latency must cover by their age (default 0.99)"
+    share = "share of the measured answers whose age must be within theta or the latency (default 0.99)"
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to the measured age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)

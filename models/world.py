@@ -668,10 +668,10 @@ class Rows:
 
 _NONE = "no energy (lemma)"
 _BOUNDED = "lemma, up to what contacts create (printed by a run)"
-_ROW = "lemma with the row term: may create energy; the shell"
-_SMALL = "measured: small; the shell"
-_VARYING = "measured: small unless contact is made fast; the shell"
-_TURNING = "measured: small for slow motion; the shell"
+_ROW = "lemma with the row term: may create energy; the shell bounds it"
+_SMALL = "small in measurements; the shell bounds it"
+_VARYING = "small in measurements unless contact is made fast; the shell bounds it"
+_TURNING = "small in measurements of slow motion; the shell bounds it"
 _SHELL = "the shell only"
 
 

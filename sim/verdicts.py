@@ -81,7 +81,9 @@ def disagreement_words(question: Validation, findings: Findings) -> str:
         if findings.trace_decides[k]:
             rates += f" and {findings.trace[k]:+.3g} ± {findings.trace_error[k]:.2g} on its trace"
         index = int(findings.index[k])
-        replay = f"; replay disagreement-{index}.toml with sim.run --error 1e-6" if question.can_store(index) else ""
+        replay = (
+            f"; repeat: sim.run --human disagreement-{index}.toml --error 1e-6" if question.can_store(index) else ""
+        )
         words.append(f"index {index}: {rates}{replay}")
     return "; ".join(words)
 

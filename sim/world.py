@@ -137,8 +137,8 @@ def _energy(joules: float) -> str:
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError for a coupling without V, or whose direct part D_V is not symmetric and positive definite or
-    couples devices, and for a scene that is invalid or has changed since the scenario was loaded.
+    Raises InputError for a coupling without V, and for one whose direct part D_V is not symmetric and positive definite
+    or couples devices. Raises it also for a scene that is invalid or has changed since the scenario was loaded.
     """
     world = scenario.environment.world
     assert world is not None

@@ -2,9 +2,9 @@
 
 With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
 against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact.
-For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with the humans of a population: a
-few first, and the others if none of these is unstable. For a few cells it runs MuJoCo with the encoder steps, friction
-and walls of the scenario.
+For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with humans of a population: with a
+few humans first, and with all others if none of these is unstable. For a few cells it runs MuJoCo with the encoder
+steps, friction and walls of the scenario.
 """
 
 from __future__ import annotations

@@ -250,12 +250,12 @@ def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
     unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
-    parts = [f"null at {unreached.sum()} cells: {_NOT_REACHED}"] if unreached.any() else []
+    parts = [f"no figure at {unreached.sum()} cells: {_NOT_REACHED}"] if unreached.any() else []
     if infinite.size:
         first = infinite[0]
         why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the required damping is infinite"
         at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
-        parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
+        parts.append(f"no figure at {infinite.size} cells: no damping is enough; {at}")
     return "; ".join(parts) or None
 
 
@@ -268,7 +268,7 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
         drawn.unstable.reshape(shape),
         int((known & (drawn.growth <= MARGINAL)).sum()),
         int(known.sum()),
-        f"null: {_NOT_REACHED}" if np.isnan(drawn.growth).any() else None,
+        f"null in some cells: {_NOT_REACHED}" if np.isnan(drawn.growth).any() else None,
     )
 
 

@@ -568,6 +568,6 @@ def test_inaccurate_traces_are_no_disagreement():
     grows = replace(slow, mujoco=np.array([-0.331, 0.2, -0.331, -0.331]))
     assert grows.disagreements.tolist() == [False, True, False, False]
     words = disagreement_words(question, grows)
-    for part in ("index 1", "exact -0.331 1/s", "MuJoCo +0.2 on its map", "replay disagreement-1.toml"):
+    for part in ("index 1", "exact -0.331 1/s", "MuJoCo +0.2 on its map", "--human disagreement-1.toml"):
         assert part in words
     assert "trace" not in words
