@@ -424,7 +424,7 @@ def unsound(system: Lti, delta: Sequence[float]) -> str | None:
     if reason := too_long(system):
         return reason
     radius = float(np.abs(system.poles()).max(initial=0.0))
-    return f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle" if radius >= 1 else None
+    return f"the map F or V has a pole at radius {radius:.6f}, on or outside the unit circle" if radius >= 1 else None
 
 
 def unsound_static(system: Lti, demand: Demand[Lti], delta: Sequence[float]) -> str | None:

@@ -651,7 +651,7 @@ class Walls(Fact):
         stiff, damped = tuple(float(k) for k, _ in laws), tuple(float(k) if b else 0.0 for k, b in laws)
         ones = tuple(1.0 if b else 0.0 for _, b in laws)
         none = (0.0,) * len(laws)
-        expected = f"a number >= 0 for each of {len(laws)} walls"
+        expected = f"a number >= 0 for each of {len(laws)} walls, 0 (except in a) for those without damper"
         return (
             Unknowns("a", stiff, expected, 0.0, 1e3),
             Unknowns("a + c", damped, expected, 0.0, 1e3),

@@ -330,7 +330,7 @@ def _spare(path: Path) -> None:
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):
-            raise InputError(f"cannot write {path}: it was read, as {known}")
+            raise InputError(f"cannot write or remove {path}: it was read, as {known}")
         if not places.isdisjoint(ledger.written) and (option := _met(places, ledger.named)):
             raise InputError(f"cannot write {path} twice: it is the file of {option} and another output of the command")
 

@@ -237,7 +237,7 @@ def design(
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
             any-environment uses only the first, known-device-any none.
-        limiter: Whether the proof covers limited forces, too; proofs of any-environment do if psi = 0.
+        limiter: Whether the design must cover limited forces, too; any-environment does if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
         W1: The output weight of (23).
         W2: The input weight of (23).
@@ -245,15 +245,15 @@ def design(
     Raises:
         Infeasible: Theorem 4 admits no gains.
         DesignFailed: No gains were found, or any-environment or known-device-any does not certify them.
-        ValueError: The condition does not cover the limiter, varying delays, or another argument.
+        ValueError: No design of the condition exists for the limiter, for varying delays, or for another argument.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if loop.varying_delay or limiter:
-            raise ValueError(f"{condition}: its spring-dampers cover neither limited forces nor delays that vary")
+            raise ValueError(f"{condition}: no spring-dampers are designed for limited forces or delays that vary")
         return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
     if named(condition).extensible:
         if loop.varying_delay and limiter:
-            raise ValueError("limiter: limited forces are proved for constant delays only; leave out the limiter")
+            raise ValueError("limiter: gains for limited forces are designed for constant delays only; leave it out")
         return _for_this_environment(loop, starts, limiter, band_hz)
     if loop.varying_delay:
         raise ValueError(
@@ -286,7 +286,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     """
     if not named(condition).extensible:  # With psi = 0 any-environment covers limited forces.
         if limiter and named(condition) is KNOWN_DEVICE:
-            raise ValueError("limiter: known-device designs do not cover limited forces; use this-environment")
+            raise ValueError("limiter: known-device spring-dampers are not for limited forces; use this-environment")
         _require_few(
             loop, _MOST_ANY, "Theorem 4 or Theorem B: use a moving average, which needs no search, or this-environment"
         )

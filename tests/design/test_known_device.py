@@ -774,7 +774,7 @@ def test_spring_dampers_before_walls_use_the_device():
 
 
 def test_known_device_designs_refuse_limiter_or_missing_bounds():
-    with pytest.raises(ValueError, match="not cover"):
+    with pytest.raises(ValueError, match="not for limited forces"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
         design_coupling(PAIR, "spring-damper", "known-device")
