@@ -69,7 +69,7 @@ def test_one_diagonal_spring_leaves_its_perpendicular_free(period):
     assert np.abs(np.linalg.eigvals(E.A)).max() < 0.999
 
 
-def test_oblique_wall_touches_free_body():
+def test_an_oblique_wall_obeys_its_equation():
     """Along its normal n the wall obeys (m s^2 + B s) y = B s n'x - p, with the wall's force p."""
     wall = Wall(("body", GROUND), 1000.0, normal=OBLIQUE)
     network = Network(PLANE["hand"], (Spring(("hand", "body"), 0.0, 5.0),), {"body": 0.1}, (wall,), points=PLANE)

@@ -222,7 +222,8 @@ def test_maxwell_elements_are_passive_despite_rounding():
 def test_a_scenario_takes_an_own_environment():
     own = load().replace(environment=Gel())
     same = load().replace(environment=Network(Gel.contacts, (Spring(Gel.contacts, 600.0, 2.0),)))
-    np.testing.assert_allclose(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE), rtol=2e-6)  # Block's spring
+    # A block adds a spring of at most 2e-6 of its gain.
+    np.testing.assert_allclose(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE), rtol=2e-6)
     with pytest.raises(InputError, match=r"environment int: expected a class with contacts, and E\(T\) or parts\(\)"):
         load().replace(environment=3)
     with pytest.raises(InputError, match=r"^environment Scalar.E\(T\) is 3.0, expected .*Lti with 2 inputs and 2 out"):

@@ -149,7 +149,7 @@ def test_delays_cover_every_channel():
         Process(Law(F), *free, delays=delays[:, :1])
 
 
-def test_a_step_of_an_encoder_is_finite():
+def test_encoder_steps_are_finite_and_not_negative():
     for step in (np.inf, np.nan, -1e-6):
         with pytest.raises(ValueError, match="encoder_step"):
             process(wall(1000.0), step=step)

@@ -82,7 +82,7 @@ def test_an_energy_account_covers_no_latency():
 
 @pytest.mark.slow
 def test_the_limiter_is_judged_with_switching_delays():
-    """The limiter needs 0.70 of the damping with constant delays, and 1.04 of it with switching delays."""
+    """The limiter needs 0.70 of the damping with constant delays, 1.04 if they switch, also for a given environment."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
     for runs in ({}, {"environment": loop.environment}):
         limits = assess(loop, coupling, **runs).force_limits
@@ -365,7 +365,7 @@ ALONE = Loop(1.2e-3, (1,), (0,), (0,), (1.37,), SPRING)
 
 
 def test_a_search_of_other_ranges_is_repeated():
-    """A spring k alone needs 3/2 k T: for 505 N/m, the most within 1 %, 0.66 of the damping, and for 700 N/m 0.92."""
+    """Alone a spring k needs 3/2 k T: 0.66 of the damping for 505 N/m (1 % more), 0.92 for 700 N/m (40 % more)."""
     narrow, wide = (change(ALONE, ranges=ranges_around(SPRING, percent)) for percent in (1.0, 40.0))
     needs, searched = THIS_ENVIRONMENT.required(narrow, NoCoupling()), search_ranges(narrow, NoCoupling())
     proof = prove(narrow, NoCoupling(), THIS_ENVIRONMENT)
@@ -376,7 +376,7 @@ def test_a_search_of_other_ranges_is_repeated():
 
 
 def test_a_search_of_another_condition_is_repeated(monkeypatch):
-    """The ranges of known devices are judged by known-device, whose search a design for this-environment lacks."""
+    """Known-device judges these ranges, but the search that is passed in was for this-environment."""
     for name, few in (("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)):
         monkeypatch.setattr(budgets, name, few)
     bounds = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),)

@@ -107,7 +107,7 @@ def test_impossible_rigid_walls_are_refused():
         msgspec.structs.replace(loop, ranges=Ranges(masses={"tip": (1.0, 2.0)}))
 
 
-def test_a_rigid_wall_is_the_stiff_limit():
+def test_a_rigid_wall_needs_what_stiff_springs_need():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))  # softens K = 2000 N/m by 2e-6 of K
     loop, coupling = wall(2000, 0.4, 1)
     ratio = requirement(loop.at(ground), coupling, "this-environment").ratio
@@ -448,7 +448,7 @@ def test_the_catalogue_has_a_source_for_every_number(run):
 
 @pytest.mark.parametrize("B", [0.0, 0.37])
 def test_a_rigid_audit_names_the_stiffest_wall(run, B):
-    """Without delay a wall behind K and B needs K T/2 + B of damping, Colgate and Schenkel's condition."""
+    """Without delay a wall behind K and B needs K T/2 + B (Colgate and Schenkel), so none is certified with B = 2."""
     _, out, _ = run(*f"--rigid --K 5000 --B {B} --T 1e-3 --theta 0 --delta 1.37".split())
     named = float(re.search(rf"The stiffest wall with B = {B:g} N s/m: ([\d.]+) N/m", out.replace("\n", " "))[1])
     assert named == pytest.approx(2 * (1.37 - B) / 1e-3, rel=1e-4)
@@ -482,7 +482,7 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 
 
 def test_long_computations_are_refused_or_ended(monkeypatch):
-    """A sweep of the pair is estimated at .16 ms, and a search at sixty times as much."""
+    """A sweep of the pair is estimated at 0.16 ms, and a search at sixty times as much."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
     told = report(PAIR, SOFT)
     part, need = told["margins"]["this-environment"], needs(told, "this-environment")

@@ -132,7 +132,7 @@ ONE = np.eye(2)
 SPRINGS = between(rotated(30, [900, 300]), rotated(-50, [700, 200]), np.array([[50.0, 10.0], [10.0, 80.0]]))
 MASS = Plane(4, np.diag([0, 0, 0, 0, 0.5, 0.5]), between(0.5 * ONE, 0.4 * ONE, 0.2 * ONE), SPRINGS)
 LOOP = _with(environment=MASS)
-#: the environment of one device: springs of 900 N/m along x and 300 N/m along y hold a mass of 0.5 kg
+#: one device's environment: springs (900 N/m along x, 300 along y) to 0.5 kg, and a fifth as stiff from it to ground
 CORNER = Plane(
     2,
     np.diag([0, 0, 0.5, 0.5]),
@@ -584,7 +584,7 @@ def test_axes_of_a_device_share_one_limit() -> None:
 
 
 def most_energy(share: float, seed: int, count: int = 60, ticks: int = 400) -> np.ndarray:
-    """Return the largest energy of each of `count` lossless hands in the limited LOOP, over its first energy, (count,).
+    """Return the largest energy of each of `count` lossless hands in the limited LOOP, divided by its first energy.
 
     M x'' + share Delta x' + K x = -f with full random M and K is sampled with held forces by the matrix exponential.
     """
@@ -623,7 +623,7 @@ def test_limited_force_vectors_give_no_energy() -> None:
 
 
 def test_an_energy_budget_takes_matrix_levels() -> None:
-    """The budget reserves r(f) = T f' Delta^-1 f/4 for a force, and does not scale a force that it can pay."""
+    """The budget reserves T f' Delta'^-1 f/4, Delta' = (1 - EPS) Delta, and scales no force that it can pay."""
     budget = EnergyBudget(LOOP.Delta(), LOOP.T, Packets(np.zeros(4, dtype=int)), start=1.0)
     force = np.array([[3.0], [-2.0], [1.0], [4.0]])
     np.testing.assert_allclose(budget.limit(force, 0 * force), force, rtol=1e-12)

@@ -90,7 +90,7 @@ def test_the_charged_matrix_is_nowhere_negative(name):
 
 @pytest.mark.validate
 @pytest.mark.parametrize(("name", "rms_db"), [("I", -35.137), ("II", -13.839)])
-def test_packaged_bounds_are_those_worked_out_separately(name, rms_db):
+def test_bounds_equal_those_of_separate_code(name, rms_db):
     found, _ = judged(name)
     assert found.rms_db == pytest.approx(rms_db, abs=0.006)
     assert found.sampled_rms > found.rms

@@ -357,7 +357,7 @@ def test_proof_and_run_agree_near_sharp_resonances():
     assert certified(loop, coupling, "this-environment").certificate.proof == "rational"
 
 
-def test_a_failed_sweep_refuses_the_proof(monkeypatch):
+def test_a_sweep_above_the_damping_refuses_proofs(monkeypatch):
     good = certified(DEFAULT, STIFF, "this-environment")
     worse = this_environment(DEFAULT.F(STIFF), (1.0, 1.0))
     ratio = worse.required[0] / 1.37 * 1.01

@@ -52,7 +52,7 @@ def symmetric_integers(rng: np.random.Generator, n: int) -> np.ndarray:
     return S + S.T + rng.integers(0, 4 * n) * np.eye(n, dtype=int)
 
 
-def test_a_stored_float_is_its_shortest_decimal():
+def test_a_float_counts_as_its_shortest_decimal():
     assert rational(0.0012) == Fraction(12, 10000)
     assert rational(np.float64(0.1)) == Fraction(1, 10)
 

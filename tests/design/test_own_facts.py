@@ -43,7 +43,7 @@ class Less(Fact):
 
 
 class Searched(Less):
-    """The same fact with a multiplier that it does not use."""
+    """The fact `Less` with a multiplier that it does not use."""
 
     def unknowns(self, loop):
         return (Unknowns("c", (1.0,), "a positive number", 1e-6, 1e3),)
@@ -94,7 +94,7 @@ def test_files_name_the_bounds_of_own_known_devices():
 @pytest.mark.parametrize("fact", FACTS)
 @pytest.mark.parametrize("shipped", [KNOWN_DEVICE, KNOWN_DEVICE_ANY])
 def test_known_devices_keep_an_own_fact(shipped, fact):
-    """With a constant speed L is at most s delta dx^2/T, which bounds the damping from below; beta -> 0 from above."""
+    """At constant speed L <= s delta dx^2/T, which bounds the damping from below; beta -> 0 bounds it from above."""
     own = condition(type(shipped), fact)
     needs, plain = required_damping(KNOWN, SOFT, own), required_damping(KNOWN, SOFT, shipped.plain)
     assert fact.less * KNOWN.T <= needs.required[0] * (1 + 1e-9)

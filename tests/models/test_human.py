@@ -273,7 +273,7 @@ def test_crowds_stack_each_hands_matrices():
         np.testing.assert_allclose(together.B[i], alone.B, rtol=1e-14)
 
 
-def test_chains_equal_their_classes():
+def test_crowds_equal_their_humans_one_by_one():
     links = np.exp(np.random.default_rng(1).uniform(-1, 4, (5, 2, 2, 3)))
     bodies = np.exp(np.random.default_rng(2).uniform(-1, 4, (5, 1, 5)))
     crowd = Crowd(links, ((1, 2),), bodies)

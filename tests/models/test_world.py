@@ -53,7 +53,7 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
 def test_a_linear_scene_is_the_network(tmp_path, coupling):
     """Behind a coupling the scene sends the network's forces for three seconds, and u = x - V f.
 
-    Tendon springs are longer by 1e-12 of their 0.1 m, which is 8e-11 N; rounding of the lengths adds 1e-14 N a tick.
+    Tendon springs are longer by 1e-12 of their 0.1 m, which is 9e-11 N; rounding of the lengths adds 1e-14 N a tick.
     """
     V = coupling.compliance(T)
     port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
@@ -304,7 +304,7 @@ def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
     theirs = np.zeros((n, n))
     mujoco.mjd_transitionFD(model, data, 1e-7, True, theirs, None, None, None)
     unit = np.repeat([1.0, T], model.nv)  # our states are (q, h v)
-    assert np.abs(A - unit[:, None] * theirs / unit).max() < 1e-7  # rounding of 0.1 m over differences of 1e-7
+    assert np.abs(A - unit[:, None] * theirs / unit).max() < 1e-7  # 0.1 m rounded over steps of 1e-7 makes 1e-10
     assert B.shape == (n, 2)
 
 
