@@ -45,7 +45,8 @@ RANGED_BASES = 3
 
 #: Largest number of states of a proved block. A proof takes 0.3 s at 100, 1 s at 200, 5 s at 400 and 30 s at 800.
 PROOF_STATES = 800
-#: Rounds of cutting planes for a multiplier (one-wall takes 8), and rounds without progress after which they end.
+#: Rounds of cutting planes for a multiplier (sim/scenarios/one-wall.toml takes 8), and rounds without progress after
+#: which they end.
 MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
 #: Largest number of rows of a block whose multiplier is searched. Twelve devices with limited forces have 24 rows.
 MULTIPLIER_ROWS = 24
@@ -57,7 +58,8 @@ GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains. Case I takes 2.
 SEQUENCE_STEPS = 60
-#: Designs, each for less damping, until the coupling satisfies a second condition. one-wall takes 2.
+#: Designs, each for another share of the damping, until the coupling satisfies a second condition. one-wall.toml takes
+#: 2.
 LESS_DAMPING_ROUNDS = 6
 #: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6

@@ -176,6 +176,7 @@ def _least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
     If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
+    If gain is 0, the result is inf.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if gain.shape[-1] == 2 and (own > 0).all():
@@ -223,7 +224,7 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """Return the least s (n,) with H + s diag(0, I) >= 0, where 0 has r rows; inf if H is not positive there."""
+    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there or I is empty."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size
@@ -527,7 +528,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
-_ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; a lossless E has 2e-13 by rounding
+_ROUNDING = 1e-9  # allowed shortage of E-hat + Phi, relative to the damping; for a lossless E rounding causes 2e-13
 _VANISHES = 1e-5  # size of V, relative to V(1), up to which V counts as vanishing in a direction
 #: passivity, relative to V(1), that is added where V vanishes; ratio above which V counts as not passive there
 _SOFTENED, _NEVER = 1e-12, 1e6

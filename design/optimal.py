@@ -262,7 +262,7 @@ class _Search:
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
         if loop.varying_delay and loop.latency:
-            raise ValueError("an optimal coupling covers delays that switch or a latency, not both: remove one")
+            raise ValueError("an optimal coupling is designed for switching delays or a latency, not both: remove one")
         cases: list[program.Case] = []
         for member in loop.members():
             there = loop.at(member.network).switching(None)
