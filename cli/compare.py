@@ -87,7 +87,10 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Name the guaranteed coupling of least force error; if errors are equal, that with dc_ratio nearest to 1."""
+    """Return a sentence that names the guaranteed coupling of least force error, or says that there is none.
+
+    If errors are equal, the coupling with dc_ratio nearest to 1 is named.
+    """
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."

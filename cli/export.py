@@ -146,7 +146,10 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
 
 
 def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ...], tuple[slice, ...]]:
-    """Return limits (m,) [N] and the channels of each force vector that they limit; () limits each channel alone."""
+    """Return limits (m,) [N] and the channels of each force vector that they limit; () limits each channel alone.
+
+    Raises InputError for a wrong number of limits.
+    """
     vectors = tuple(own for own in loop.devices if own.stop > own.start + 1)
     if not vectors or len(given) == loop.channels:
         return options.per_channel("--force-limit", given, loop.channels), ()

@@ -188,7 +188,10 @@ def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tup
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
-    """Return (channel, place [m], name) of each wall from a contact to ground, and which ticks (N,) touch any wall."""
+    """Return (channel, place [m], name) of each wall from a contact to ground, and a mask (N,) of ticks in contact.
+
+    Without walls the mask is None.
+    """
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None

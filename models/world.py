@@ -394,7 +394,8 @@ def _name(contact: Contact, axis: int) -> str:
 def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
     """Add slides and springs to a contact, give it a mass if the scene states none, and compensate its weight.
 
-    `turn` is the body's quaternion. All settings are explicit, so that the scene's defaults do not apply.
+    `turn` is the body's quaternion. All settings are explicit, so that the scene's defaults do not apply. Raises
+    ValueError if the scene has a joint with the name of a slide.
     """
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))

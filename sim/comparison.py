@@ -46,7 +46,7 @@ class Alternative:
     """One coupling in the loop, or the reason why there is none."""
 
     coupling: str  # kind of the coupling
-    condition: str | None
+    condition: str | None  # the condition of the design; None for no coupling and for the paper's gains
     guarantee: str | None = off_table(default=None)
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None

@@ -143,10 +143,10 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating. Plant and process start in the dominant fast mode of that loop,
-# scaled so that the motor or handle that moves most is displaced by _START. With walls or a limiter only the plant
-# starts in it, and the process at rest. Each hand presses with a force that starts smoothly and then stays constant.
-# The second half of the trace gives the verdict.
+# whose exact linear loop is nearest to oscillating or running away. Plant and process start in the loop's dominant mode
+# that a trace can show, scaled so that the motor or handle that moves most is displaced by _START. With walls or a
+# limiter only the plant starts in it, and the process at rest. Each hand presses with a force that starts smoothly and
+# then stays constant. The second half of the trace gives the verdict.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
@@ -251,7 +251,7 @@ class _Trial:
 
 
 def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:
-    """Return one trial for each cell, with the human nearest to oscillating, and the growth with that human."""
+    """Return one trial for each cell, with the human nearest to oscillating or running away, and the growth with it."""
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)

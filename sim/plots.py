@@ -248,7 +248,7 @@ def draw_run(
 
 
 def _shown_parts(result: Run, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
-    """Return the whole run, and the part of the zoom if the loop grows or the forces stand out in this part."""
+    """Return slices of ticks: the whole run, and the zoom if the loop grows or the forces stand out there."""
     last, grows = result.t.size, onset is not None and onset.growth is not None
     if onset and onset.until is not None:
         last = int(np.searchsorted(result.t, onset.until))
@@ -448,7 +448,7 @@ def _turns(f: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The picture of one of several runs with the same hands."""
+    """The data of one panel: one of several runs with the same hands."""
 
     title: str
     trace: Run
@@ -538,7 +538,7 @@ def draw_population(mass: Array, damping: Array, growth: Array, title: str) -> F
 # ----------------------------------------------------------------------------------------------------
 # Couplings over frequency, from the report of `python -m design.compare`.
 
-#: E, F and M in every panel of singular values
+#: (field, label, style) of E, F and M in every panel of singular values
 _PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_E", "E, the environment", _IDEAL),
     ("sigma_F", "F, felt at the devices", STYLES[0]),

@@ -583,7 +583,7 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 
 
 def _humans_of(text: str, source: str) -> _HumanFile:
-    """Return the humans of a file: measured hands (A, B, C, D) and chains."""
+    """Return the humans of a file: measured hands (A, B, C, D) and chains. Raises InputError for other humans."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     if people.population is not None:
         raise InputError(f"{source}: [population] belongs in a scenario; a file of humans has [[human]] and [[person]]")
@@ -605,6 +605,7 @@ def _own_humans(text: str) -> _HumanFile:
     """Return the people of FILE.py:NAME.
 
     NAME is a list of hands and persons, a population with draw(rng, n), or a function or class that makes one of them.
+    Raises ValueError for any other value.
     """
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):

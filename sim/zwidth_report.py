@@ -109,7 +109,7 @@ class FixedCoupling:
 
     @classmethod
     def of(cls, chosen: Chosen, assessment: Assessment, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
-        """Describe a coupling with its assessment in the scenario's environment, a network."""
+        """Describe a coupling with its assessment in the scenario's environment, which is `network`."""
         springs = [_ContactSpring(s.between, s.stiffness, s.damping) for s in contact_springs(network)]
         return cls(chosen.kind, springs, assessment, remarks)
 
