@@ -1,4 +1,4 @@
-"""Measure the cost of a frame and of a device's tick, and check their results.
+"""Measure the cost of a frame of the serial protocol and of a device's tick, and check their results.
 
 make bench    (or: python -m pytest tests/benchmarks/test_frame_cost.py --benchmark-only -s)
 """

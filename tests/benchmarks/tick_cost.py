@@ -1,10 +1,11 @@
 """PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure the CPU time of a tick of the host.
 
-A whole tick is one pass of the armed bridge's loop over a pseudo-terminal. It begins when a STATE can be read, and ends
-at the next wait, after all checks and records and after writing FORCE. A bare tick decodes a STATE, steps the
-controller, and encodes a FORCE. Every tick runs the whole loop. Blocks of 200 ticks alternate: in one the whole tick is
-timed, in the next an added bare tick and the writing of FORCE. Times are CPU times of this thread with its system
-calls. The emulated device runs in this thread while the host waits, and leaves the caches as cold as another process.
+A whole tick is one pass of the armed bridge's loop over a pseudo-terminal. It begins when the device's STATE frame can
+be read, and ends at the next wait, after all checks and records and after writing the FORCE frame. A bare tick decodes
+a STATE, steps the controller, and encodes a FORCE. Every tick runs the whole loop. Blocks of 200 ticks alternate: in
+one the whole tick is timed, in the next an added bare tick and the writing of FORCE. Times are CPU times of this thread
+with its system calls. The emulated device runs in this thread while the host waits, and leaves the caches as cold as
+another process.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Rehearse every fault of a link, a device, a controller or a person that we could think of, in virtual time.
 
-Each case is a whole session of bridge and emulated device: the fault, the stage that it must end in, and how soon. The
-time to zero force is counted from _WHEN, when most faults begin, to the first tick after which no motor has a force.
+Each case is a whole session of bridge and emulated device: the fault, the stage that it must end in, and how soon. In
+every tick the device sends positions in a STATE frame, and the host answers with forces in a FORCE frame. The time to
+zero force is counted from _WHEN, when most faults begin, to the first tick after which no motor has a force.
 """
 
 from __future__ import annotations

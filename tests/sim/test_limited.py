@@ -1,4 +1,7 @@
-"""Runs with limited forces have the right guarantee in the report, and are equal in both engines up to rounding."""
+"""Runs with limited forces have the right guarantee in the report, and are equal in both engines up to rounding.
+
+docs/theory.md defines rho, beta and c of the limiter.
+"""
 
 import json
 

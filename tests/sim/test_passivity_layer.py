@@ -1,4 +1,7 @@
-"""The energy budget, and the shell around a user's environment, bound the energy that loops give to hands."""
+"""The energy budget, and the shell around a user's environment, bound the energy that loops give to hands.
+
+W0 [J] is the energy that a budget or shell may give at the start. Tolerances without a comment cover rounding.
+"""
 
 import json
 from dataclasses import replace

@@ -504,7 +504,7 @@ def test_a_film_shows_how_the_mass_moves(none):
     still, later = running.frame(0.0), running.frame(0.9)
     scale = (middle(still, "contact") - middle(still, "mass")) / 0.07
     assert abs(later.nodes[2]) > 0.005
-    assert middle(later, "mass") - middle(still, "mass") == pytest.approx(scale * later.nodes[2], abs=1.5)
+    assert middle(later, "mass") - middle(still, "mass") == pytest.approx(scale * later.nodes[2], abs=1.5)  # pixels
 
 
 class FakeWindow:
@@ -571,7 +571,7 @@ def arrows(stage, frame):
 
 
 def test_arrows_show_what_devices_feel(none):
-    """A device feels -f, and the bar shows the range of -f since the last frame."""
+    """A device feels -f, and the bar's middle is that of the range of -f since the last frame."""
     scene, limit = none.simulation.scene, none.simulation.process.force_limit
     stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
     told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}

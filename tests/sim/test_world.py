@@ -1,4 +1,4 @@
-"""MuJoCo worlds give hands no more than W0 and the released energy; unfit scenarios and couplings are refused."""
+"""MuJoCo worlds give hands no more than W0 = START_J and the released energy; unfit scenarios are refused."""
 
 import json
 from dataclasses import replace as replace_fields
