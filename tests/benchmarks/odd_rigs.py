@@ -161,7 +161,7 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
 
 
 def excitation(seconds: float = 2.5) -> Array:
-    """Return the excitation of the command with these `--seconds` (ticks,) [N], in whole force steps."""
+    """Return the excitation of hw.identify with these `--seconds` (ticks,) [N], in whole force steps."""
     swing = Swing.of(scenario_of(), 0.5, 0.03)
     signal = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds, Swing(swing.force[:1], swing.hz)).signal[:, 0]
     return FORCE_STEP * np.round(signal / FORCE_STEP)
@@ -179,7 +179,7 @@ def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
 
 
 def main() -> None:
-    """Print the estimate of each rig, and how close the bounds are."""
+    """Print the estimate of each rig, and how close the bounds are to the truth."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--workers", type=int, default=2)

@@ -44,7 +44,7 @@ def star(n: int) -> str:
 
 
 def limits(loop: Loop, design: Design) -> str:
-    """Return what limited forces need, with the design's multiplier or else the best one, and whether it is proved."""
+    """Return required over available damping for limited forces, with the design's multiplier or else the best one."""
     try:
         return f"{1 / prove_limiter(loop, design.coupling, c=design.c).margin:.4f}, proved"
     except NotProved as refused:

@@ -115,6 +115,7 @@ def test_speed_and_error_side_by_side(benchmark, scene):
             end="",
         )
     print()
+    # [1/s] When measured, the default scene had errors of 2e-12 and 2e-4.
     assert abs(errors["exponential x 1"]) <= 1e-9
     assert abs(errors[f"RK4 x {substeps}"]) <= 1e-3
 

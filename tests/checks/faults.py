@@ -459,7 +459,7 @@ def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
 def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case; with `free` nobody holds the faulty device. `made` are couplings for one tick, and softer ones."""
+    """Run one case; with `free` nobody holds the faulty device. `made` cover a delay of one tick, or are softer."""
     info = info_of(scenario)
     scenario = _without_hand(scenario, case) if free and not case.free else scenario
     cap = tuple(d.force_limit for d in scenario.device)

@@ -99,7 +99,7 @@ class _TraceVerdict:
     number: int
     engine: str
     exact_per_s: float  # growth by the eigenvalues
-    trace_per_s: float | None  # growth in the trace, None where there is none
+    trace_per_s: float | None  # growth in the trace, None if the trace gives no rate
     verdict: str | None
     reason: str | None
     not_excited: bool
@@ -107,7 +107,7 @@ class _TraceVerdict:
 
 
 def _scenario(rng: np.random.Generator) -> Scenario:
-    """Return a random scenario; in one of three all delays, devices, hands and motions are alike."""
+    """Return a random scenario; in a third of them all delays, devices, hands and motions are alike."""
     loop = _delayed(rng)
     m, alike = loop.channels, rng.random() < 1 / 3
     device, human = [], []

@@ -60,7 +60,7 @@ class Shortage:
     found: bool
     growth_rate_per_s: float
     frequency_hz: float
-    held_together: bool  # by one person
+    held_together: bool  # whether one person holds all devices
     evaluated: int
 
     @property

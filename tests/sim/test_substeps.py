@@ -1,4 +1,4 @@
-"""`default_substeps` picks enough substeps; the one-period map of an engine checks this."""
+"""`default_substeps` picks enough substeps; the one-period map of an engine checks this, up to rounding."""
 
 import json
 

@@ -1,4 +1,7 @@
-"""Products of mode matrices equal the simulated loop with switching delays; the search finds delays with growth."""
+"""Products of mode matrices equal the simulated loop with switching delays; the search finds delays with growth.
+
+Tolerances without a comment cover rounding.
+"""
 
 import json
 from dataclasses import replace
