@@ -1,4 +1,7 @@
-"""sim.run reports the expected figures, writes its files, and answers bad input with one line and exit code 2."""
+"""sim.run reports the expected figures, writes its files, and answers bad input with one line and exit code 2.
+
+Expected figures are rounded, and tolerances of figures without a comment allow for this.
+"""
 
 import json
 import subprocess

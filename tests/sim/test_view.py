@@ -1,4 +1,7 @@
-"""The live loop runs without a window; the tests supply the clock, the keys and the mouse."""
+"""The live loop runs without a window; the tests supply the clock, the keys and the mouse.
+
+Tolerances without a comment cover rounding, in pictures that of single precision.
+"""
 
 import contextlib
 import json
@@ -548,7 +551,7 @@ def test_the_window_loop_follows_an_injected_clock(none):
 
     _loop(running, stage, window, lambda: time[0], sleep)
     assert window.synced == len(window.said) == 40
-    assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)
+    assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)  # a tick
     assert running.pace.overruns == 0
     assert "coupling\ndelays\ngrowth" in window.said[-1][0][2]
     assert "push" in window.said[-1][0][2]
@@ -624,7 +627,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
     ]
     assert [round(e["exact_growth_rate_per_s"], 2) for e in told["events"]] == [1.48, 3.13, 0.69]
     assert [round(e["t_s"], 2) for e in told["events"]] == [0, 0.2, 0.3]
-    assert told["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)
+    assert told["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)  # a tick
     assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 6, "fps": 10}
     assert "NOT certified" in capsys.readouterr().out
 

@@ -1,4 +1,7 @@
-"""MuJoCo worlds give hands no more than W0 = START_J and the released energy; unfit scenarios are refused."""
+"""MuJoCo worlds give hands no more than W0 = START_J and the released energy; unfit scenarios are refused.
+
+Tolerances without a comment cover rounding.
+"""
 
 import json
 from dataclasses import replace as replace_fields
