@@ -76,10 +76,10 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 
     The default of a spring-damper or a user's own function is this-environment, which gives the least transparency
     error. In loops with walls, worlds, ranges or varying delays, but without a latency, the default is any-environment.
-    Each of the other kinds has one condition besides the two that need bounds of the devices. If these bounds are
-    known, the two take precedence where KINDS allows them, because they never require more damping: known-device
-    replaces this-environment in loops without a latency, and known-device-any is chosen if walls exist and it covers
-    the loop.
+    Each of the other kinds has one condition besides known-device and known-device-any. If the bounds of the devices
+    that these two need are known, they take precedence where KINDS allows them, because they never require more
+    damping: known-device replaces this-environment in loops without a latency, and known-device-any is chosen if walls
+    exist and it covers the loop.
     """
     conditions = kind_of(kind).conditions
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay

@@ -114,9 +114,9 @@ def design(
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
-    With ranges around the environment, a proved coupling satisfies this-environment at every vertex (of more than 128,
-    at 128) and at every point that the search between the vertices visits. With a range of delays, any switching within
-    the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
+    With ranges around the environment, a proved coupling satisfies this-environment at every vertex (at 128 if there
+    are more) and at every point that the search between the vertices visits. With a range of delays, any switching
+    within the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
     candidates, too: the environment scaled down (R = kappa I) and the best spring-damper. The function returns the best
     candidate.
 
@@ -354,7 +354,10 @@ class _Search:
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
-        """Return the design without a coupling; None if it has a mismatch, is not safe, or has further constraints."""
+        """Return the design without a coupling, or None.
+
+        It is None if the design has a mismatch, is not safe, has further constraints, or lacks the limiter's proof.
+        """
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)

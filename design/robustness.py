@@ -94,9 +94,9 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """Return `robustness`, with changes of ten percent, or None.
 
-    Returns None if the condition holds in any environment, is not evaluated for varied loops (`not_varied`) or does not
-    cover the loop, if the environment is no network, has walls or has a block, or if a stiffness or mass plus ten
-    percent is too large.
+    Returns None in three cases. The condition holds in any environment, is not evaluated for varied loops
+    (`not_varied`) or does not cover the loop. The environment is no network, has walls, or contains a block E(z). A
+    stiffness or mass plus ten percent is too large.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None
