@@ -209,7 +209,7 @@ def test_the_folder_of_an_output_must_exist(tmp_path):
 
 
 @pytest.mark.parametrize("command", [["design"], ["design.export", "coupling.json"]])
-def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, capsys):
+def test_design_and_export_make_no_folder(command, tmp_path, monkeypatch, capsys):
     from haptic_loop.cli.design import main as design
     from haptic_loop.cli.export import main as export
 
@@ -224,7 +224,7 @@ def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, c
 
 
 @pytest.mark.parametrize("asked", [pytest.param("osmesa", marks=pytest.mark.validate), "bogus"])
-def test_only_drawing_commands_need_mujoco_gl(asked, tmp_path):
+def test_runs_without_pictures_need_no_mujoco_gl(asked, tmp_path):
     command = [
         sys.executable,
         "-m",

@@ -44,7 +44,7 @@ def parser():
         ("--conut 3", "unknown option --conut, did you mean --count?"),
     ],
 )
-def test_bad_options_get_one_line(words, message):
+def test_bad_options_are_named(words, message):
     with pytest.raises(InputError) as caught:
         parser().parse_args(words.split())
     assert str(caught.value).startswith(message)

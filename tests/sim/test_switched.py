@@ -209,7 +209,7 @@ def test_reports_give_recorded_delays_and_lost_packets(tmp_path):
         (["--varying-delay", "1,2", "--playout", "--theta", "1"], "varying_delay.playout makes it the largest delay"),
     ],
 )
-def test_bad_ranges_are_refused_in_one_line(options, message):
+def test_bad_ranges_are_refused(options, message):
     with pytest.raises(InputError) as error:
         main(options)
     assert message in str(error.value)

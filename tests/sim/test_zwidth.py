@@ -499,7 +499,7 @@ def test_the_parts_of_a_map_agree(audit):
     assert report["simulation"]["differ_from_linear"] == 0
     for error in report["error"].values():
         assert error["figure_relative"] < 3e-8
-        # Interpolation is exact for this straight edge; the search for the true edge stops at 1e-7.
+        # Interpolation is exact for this straight edge; the true edge is searched to 1e-7 in K and in the damping.
         assert error["edge_relative_in_K"] < 1e-6
 
 
