@@ -182,8 +182,8 @@ def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
     return (
         f"{program.chosen.kind}, theta = {', '.join(map(str, program.scenario.theta))}{late}",
         *(listed(gains[name], 5) if name in gains else "-" for name in "KB"),
-        f"{listed(certified.required, 5)} ({certified.condition}, {certified.proof})",
-        listed(certified.available, 5),
+        f"{listed(certified.required, 5, once=True)} ({certified.condition}, {certified.proof})",
+        listed(certified.available, 5, once=True),
         assessment.guarantee_words or "none",
     )
 

@@ -414,10 +414,10 @@ def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], li
     """Return the tables, and a line that names the rows left out of the first table, if any."""
     title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
-    rows, left_out = render.shortened(rows, _LESS)
+    rows, left_out = render.shortened(rows, _LESS, len(report.price or ()))
     shown = [render.facts(title, rows)]
     if report.price:
-        title = "in the nominal environment / at the worst vertex"
+        title = "by this-environment, in the nominal environment / at the worst vertex"
         shown.append(render.columns(title, _OVER_RANGES, report.price, left=range(5)))
     return shown, left_out
 

@@ -196,16 +196,16 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
     return table
 
 
-def shortened(rows: Rows, less: Sequence[str]) -> tuple[list[tuple[str, str | None]], list[str]]:
+def shortened(rows: Rows, less: Sequence[str], others: int = 0) -> tuple[list[tuple[str, str | None]], list[str]]:
     """Return the rows of a table, and a line that names those left out, if any.
 
-    While there are more than _MOST_ROWS rows, rows named in `less` are left out, the least important first. A row
-    without a name belongs to the row before it.
+    While there are more than _MOST_ROWS rows, with `others` of further tables, rows named in `less` are left out, the
+    least important first. A row without a name belongs to the row before it.
     """
     kept, out = [row for row in rows if row[1] is not None], []
     names = list(accumulate((name for name, _ in kept), lambda before, name: name or before))
     for name in less:
-        if len(kept) > _MOST_ROWS and name in names:
+        if len(kept) + others > _MOST_ROWS and name in names:
             kept = [row for row, of in zip(kept, names, strict=True) if of != name]
             names = [of for of in names if of != name]
             out.append(name)

@@ -98,7 +98,8 @@ class Requirement(Generic[C]):
     def amounts(self, digits: int = 6) -> str:
         """Return the required and the available damping; for an infinite requirement the reason in a few words."""
         if math.isfinite(self.ratio):
-            return f"{listed(self.required, digits)} of {listed(self.available, digits)} N s/m"
+            required, available = (listed(values, digits, once=True) for values in (self.required, self.available))
+            return f"{required} of {available} N s/m"
         return "no damping is enough" if self.applies else "does not apply"
 
     def words(self, digits: int = 6) -> str:
@@ -194,9 +195,13 @@ class Infeasible(DesignFailed):
 # Figures as text.
 
 
-def listed(values: Iterable[float | None], digits: int = 6) -> str:
-    """Return the values as "1.37, 0.5", with `digits` significant digits; None is printed as inf."""
-    return ", ".join("inf" if v is None else f"{v:.{digits}g}" for v in values)
+def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) -> str:
+    """Return the values as "1.37, 0.5", with `digits` significant digits; None is printed as inf.
+
+    With `once`, three or more values with the same digits are printed as one.
+    """
+    texts = ["inf" if v is None else f"{v:.{digits}g}" for v in values]
+    return texts[0] if once and len(texts) > 2 and len(set(texts)) == 1 else ", ".join(texts)
 
 
 # ----------------------------------------------------------------------------------------------------

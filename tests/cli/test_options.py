@@ -245,3 +245,4 @@ def test_long_tables_leave_out_less_important_rows():
     assert kept == [row for row in rows if row[0] not in ("row 3", "spare", "", "absent")]
     assert line.endswith(": row 3; spare.")
     assert render.shortened(rows[:15], ("row 3",)) == (rows[:15], [])
+    assert len(render.shortened(rows, ("row 3", "spare", "row 5"), others=1)[0]) == 14

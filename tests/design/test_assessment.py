@@ -24,7 +24,7 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.coupling_file import Stored, digest, save, sealed
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, ThisEnvironment
-from haptic_loop.design.result import HERE, Design, NotProved
+from haptic_loop.design.result import HERE, Design, NotProved, listed
 from haptic_loop.design.robustness import ranges_around
 from haptic_loop.design.worst_member import search_ranges
 from haptic_loop.sim.api import simulate
@@ -385,3 +385,11 @@ def test_a_search_of_another_condition_is_repeated(monkeypatch):
     assessed = assess(loop, NoCoupling(), certificate=proof, searched=searched, ranges_samples=0)
     assert assessed.ranges.worst[1].condition == "known-device"
     assert assessed.ranges.searched is not searched
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [((1.37, 1.37, 1.37), "1.37"), ((1.37, 1.37), "1.37, 1.37"), ((1.37, 1.37, 1.36), "1.37, 1.37, 1.36")],
+)
+def test_three_equal_dampings_print_once(values, text):
+    assert listed(values, once=True) == text
