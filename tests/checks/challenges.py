@@ -245,6 +245,7 @@ _FREE = np.full(2, np.inf), np.zeros(2)  # actuator limits and encoder steps wit
 
 
 def _limits(rng: np.random.Generator, factor: float) -> _Case:
+    """Return a case of limited forces in this environment."""
     loop, coupling = _pair(rng)
     needed = LIMITER.required(loop, coupling).required
     process = Process(loop.law(coupling, (2.0, 1.0), LIMITER.rho(loop)), *_FREE)
@@ -286,6 +287,7 @@ def _budget(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _walls(rng: np.random.Generator, factor: float) -> _Case:
+    """Return a case of two walls, one at the tip and one at a mass behind it."""
     K, B, mass = (float(np.exp(rng.uniform(np.log(a), np.log(b)))) for a, b in ((800, 3000), (0.3, 1), (0.02, 0.1)))
     springs = (Spring(("tip", "mass"), 800.0, 0.3), Spring(("mass", GROUND), 20.0, 0.3))
     damping = rng.choice([0.0, 0.3, 3.0], 2).tolist()

@@ -25,7 +25,7 @@ from haptic_loop.sim.stability import close, dominant_mode
 from tests.checks.tightness import attempts, shortages
 
 SCENARIO = load()
-DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
+DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])  # for any environment, rounded
 LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, PUBLISHED["I"]), "designed": (SCENARIO, DESIGNED)}
 
 

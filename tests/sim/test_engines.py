@@ -51,6 +51,7 @@ def test_traces_hold_encoder_positions_and_handle_speeds(exact):
 
 
 def error(record, exact) -> float:
+    """Return the relative rms error of the device positions."""
     m = record.f.shape[1]
     return np.sqrt(np.mean((record.s[:, :m] - exact.s[:, :m]) ** 2) / np.mean(exact.s[:, :m] ** 2))
 

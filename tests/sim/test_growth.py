@@ -123,6 +123,7 @@ def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
 
 
 def made(x, meta):
+    """Return a trace of displacements x with this metadata and without forces."""
     n = len(x)
     unknown = np.full((n, 2), np.nan)
     return Trace(T * np.arange(n), x, np.zeros((n, 2)), unknown, unknown, np.zeros((n, 0)), meta)

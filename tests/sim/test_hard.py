@@ -75,6 +75,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     A run lasts 48 s, and its end is the last 1.2 s. Far starts are random within 0.5 m and 10 m/s, near starts within a
     fifth of this. The frequency [Hz] is that of the strongest motion at the end.
     """
+    # tests/design/test_claims.py has the same hands: test_clipping_lets_a_certified_loop_swing_forever.
     humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
     limits = (CompliantDevice(), CompliantDevice(force_limit=5.657))
     scenario = load().replace(human=humans, device=limits, tap=None)

@@ -75,6 +75,7 @@ def held_by(*hands):
 
 
 def rms(a, b):
+    """Return the rms of a - b over that of b."""
     return np.sqrt(np.mean(np.square(a - b)) / np.mean(np.square(b)))
 
 
@@ -150,7 +151,7 @@ def test_impedance_populations_agree_in_both_engines():
 
 @dataclass(frozen=True)
 class Muscles:
-    """A user's own population."""
+    """A user's own population: fields of `kind`, in their order, are uniform in their logarithms."""
 
     kind: type[Muscle] = Muscle
 

@@ -234,6 +234,8 @@ def k_b_map():
 
 
 def told(**changes):
+    """Return the report of a map with three simulated points; `changes` replace its fields."""
+
     def point(B, K, verdict, differs=False):
         return SimpleNamespace(B=B, K=K, verdict=verdict, differs_from_linear=differs)
 

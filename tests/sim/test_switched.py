@@ -48,6 +48,7 @@ def with_delays(simulation, delays):
 
 
 def one(held: HeldPlant) -> HeldPlant:
+    """Return the plant as a stack of one."""
     return HeldPlant(held.A[None], held.B[None], held.C, held.T)
 
 

@@ -32,7 +32,7 @@ from haptic_loop.sim.stability import Balance, close, dominant_mode, stability_o
 from tests.asked import needs
 from tests.checks import uneven
 
-SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])
+SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])  # the design for any environment, rounded
 PAIR = load("omega-pair").replace(duration=0.3)
 DRAWN, LATE = Periods(0.6e-3, 1.5e-3), ((1e-4, 1.3e-4), (0.0, 5e-4))
 

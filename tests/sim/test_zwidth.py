@@ -53,6 +53,7 @@ def rigid(theta=0, **changes):
 
 
 def of(scenario, theta, psi=None, network=None, **changes):
+    """Return the sweep of a scenario's loop with other delays, or another network."""
     psi = psi or (0,) * scenario.channels
     network = network or scenario.environment
     loop = Loop(scenario.T, theta, psi, theta, scenario.delta, network)

@@ -140,6 +140,7 @@ def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str
 
 
 def content(path: Path) -> str:
+    """Return a link's target, a file's hash, or whether something else is a folder."""
     if path.is_symlink():
         return os.readlink(path)
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(path.is_dir())
