@@ -216,7 +216,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         return tuple(float(np.linalg.eigvalsh(np.array(level))[0]) for level in self.levels)
 
     def Delta(self, exact: bool = False) -> Any:
-        """Return the guaranteed damping Delta_D = blockdiag(Delta_1, ..) (3) [N s/m], (m, m)."""
+        """Return the guaranteed damping Delta_D = blockdiag(Delta_1, ..) (10) [N s/m], (m, m)."""
         T = self.period(exact)
         out = numbers(np.diag(self.delta), T)
         for own, level in zip(self.devices, self.levels or (), strict=self.levels is not None):

@@ -213,9 +213,9 @@ def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
 
 
 def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
-    """Return [[Y, R'], [R, S]] of (3), which is affine in A, B, C, D, so that these may be unknowns.
+    """Return [[Y, R'], [R, S]] of Lemma 2, which is affine in A, B, C, D, so that these may be unknowns.
 
-    With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is equivalent to Lemma 1. Sigma = None means Delta = 0.
+    With Q > 0, Y = Q^-1 and Sigma = Delta^-1 the inequality is equivalent to (2). Sigma = None means Delta = 0.
     """
     A, B, C2, D2, C1, D1 = G
     n = Q.shape[0]
