@@ -145,7 +145,7 @@ def test_the_live_window_is_rotary():
 
 
 def test_sessions_ask_for_the_radius():
-    """Limits are those of a hand: 2 N at 0.15 m are 0.3 N m, 0.7 m/s there is 4.7 rad/s."""
+    """Limits are those of a hand at 0.15 m: 2 N are 0.3 N m, 0.7 m/s are 4.7 rad/s, and 3 mm are 0.02 rad."""
     limits = session_for(load(WHEEL), LinkSettings(), cap=2.0).limits
     assert limits.cap == (0.3,)
     assert limits.speed == pytest.approx(0.7 / 0.15)

@@ -17,7 +17,8 @@ assert _spec.loader
 peers = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(peers)
 
-#: tool -> allowed relative rms error of positions and forces in a transient run, and the package that it needs
+#: tool -> allowed relative rms error of positions and forces in a transient run, and the package that it needs; the
+#: error is rounding, or that of the tool's integrator
 ALLOWED = {
     "exponential x 1": (1e-11, None),
     "RK4 x 4": (1e-5, None),

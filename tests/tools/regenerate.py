@@ -103,7 +103,7 @@ _ROUNDING = 1e-6  # a smaller error may be rounding, which depends on the machin
 def same_line(shown: str, line: str, measured: bool = False) -> bool:
     """Return whether the words are equal, and the numbers to two units in the last place shown or two thousandths.
 
-    In measured output times do not count, and errors (`1.2e-05`) may differ by a factor of two.
+    In measured output times do not count, and errors (`1.2e-05`) may differ by a factor of two or be below 1e-6.
     """
     if measured:
         shown, line = _TIMES.sub("", shown), _TIMES.sub("", line)
