@@ -1,12 +1,12 @@
 """Test this-environment under uneven ticks, whose periods and latencies are drawn or chosen by an adversary.
 
-Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what
-this-environment requires for periods up to T_max, for forces that latch late, or for both. 40 sets of lossless hands
-start with random speeds, everything else at rest. The adversary chooses the tick that leaves hands and devices most
+Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what this-
+environment requires for periods up to T_max, for forces that latch late, or for both. 40 sets of lossless hands start
+with random speeds, everything else at rest. The adversary chooses the tick that leaves hands and devices most
 mechanical energy. With 1.02 times the required damping this energy may never exceed that at the start. The work of the
 forces plus the least dissipation delta a^2/tau_max + delta b^2/(T_max - tau_min), with the motions a and b before and
-after the latch of each tick, may never be negative. With half of the damping the energy of at least one set of hands
-should exceed 100 times that at the start.
+after the latch of each tick and latencies from tau_min to tau_max, may never be negative. With half of the damping the
+energy of at least one set of hands should exceed 100 times that at the start.
 """
 
 from __future__ import annotations

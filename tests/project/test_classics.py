@@ -23,7 +23,7 @@ def test_energy_bounding_clips_to_the_published_interval():
         else:
             b = np.sort([c1, -c1 - 2 * before / dx])
             assert force == pytest.approx(before + np.clip((wanted - before) / dx, *b) * dx, abs=1e-12)
-        # T f^2/(4 delta) rises by at most the energy f_- dx that flows in, plus the device's dissipation.
+        # T f^2/(4 delta) rises by at most the last force's work, which flows in, plus the device's dissipation.
         assert T * force**2 / 4.8 <= T * before**2 / 4.8 + before * dx + 1.2 * dx**2 / T + 1e-15
         before = force
 

@@ -462,7 +462,7 @@ def test_the_drawn_springs_carry_the_forces(psi, K, B):
 
 
 def test_the_drawn_tip_feels_the_walls_force():
-    """A wall at 5 mm with K = 3000 N/m, B = 2 N s/m pushes by max(0, K h + B (h - h_-)/T) at depth h, one tick late."""
+    """A wall at 5 mm pushes by max(0, 3000 h + 2 dh/T) [N], h its depth and dh the change of h, one tick late."""
     scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
     h = np.maximum(q[:, 0] - 0.005, 0.0)
     force = np.maximum(3000 * h + 2 * np.diff(h, prepend=0.0) / scenario.T, 0.0) * (h > 0)

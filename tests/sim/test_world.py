@@ -498,7 +498,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_default_couplings_of_slow_worlds_do_not_ring(every):
-    """If a scene steps every few ticks, the alternating part of f, (f - 2 f_- + f_--)/4, is below 0.1 N rms."""
+    """If a scene steps every few ticks, a quarter of the forces' second differences is below 0.1 N rms."""
     loop = load("world-cube").replace(duration=0.8)
     world = replace(loop.environment.world, every=every)
     slow = loop.replace(environment=replace(loop.environment, world=world))
