@@ -60,7 +60,7 @@ def case(seed: int) -> Case:
 
 
 def estimated(c: Case) -> Estimate:
-    """Return the estimate from a simulated record. Raises ValueError if there is none."""
+    """Return the estimate from a simulated record. Raises ValueError if the record gives no estimate."""
     base, draw = load("omega-pair"), np.random.default_rng((c.seed, 1))
     if c.rigid:
         device = RigidDevice(mass=c.mass, damping=c.viscous)

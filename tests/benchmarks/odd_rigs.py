@@ -198,7 +198,7 @@ def main() -> None:
         b = 100 * (found.viscous / rig.viscous - 1)
         print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
     above, none = sum(part > 0 for part in off), sum(part == -100 for part in off)
-    print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, {none} of them 0")
+    print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, and {none} bounds of 0")
     print(f"median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
 
 

@@ -29,7 +29,7 @@ _LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
-_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick; sessions that ended before _WHEN have zero force there
+_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick; sessions that ended before _WHEN have zero force then
 _STOP = 8 * _T_MS  # the frame that shows the fault, the STOP, 5 ticks of ramp
 _WATCHDOG = 12 * _T_MS  # theta, 4 ticks with a held force, 5 of ramp, one to notice
 _TESTED = 2 * (12.0 + 120.0)  # the final test of two motors
@@ -459,7 +459,7 @@ def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
 def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case; with `free` nobody holds the faulty device. `made` cover a delay of one tick, or are softer."""
+    """Run one case; with `free` nobody holds the faulty device. The couplings `made` cover a delay of one tick."""
     info = info_of(scenario)
     scenario = _without_hand(scenario, case) if free and not case.free else scenario
     cap = tuple(d.force_limit for d in scenario.device)

@@ -52,7 +52,7 @@ def _delayed(rng: np.random.Generator) -> Loop:
             m = len(network.contacts)
             theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
             return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
-        except ValueError:  # no element holds one of the nodes
+        except ValueError:  # some node has no element
             continue
 
 

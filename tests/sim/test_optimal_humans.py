@@ -68,7 +68,7 @@ def test_random_and_lossless_hands_are_stable(scenario, lossless):
 
 @pytest.mark.parametrize("scenario", DEVICES)
 def test_the_same_hands_destabilise_the_loop_without_coupling(scenario):
-    """Without coupling most of these hands destabilise the loop; on rigid devices only some lossless ones do."""
+    """Without coupling most of these hands destabilise the loop; on rigid devices only some lossless hands do."""
     F = assemble(load(scenario), NoCoupling()).F
     upset = {}
     for lossless in (False, True):

@@ -343,7 +343,7 @@ def test_engines_agree_on_a_population_at_walls():
     assert not found.disagreements.any()
     assert found.contacts.sum() > 10
     assert (found.energy >= -1e-9 * found.audited).all()
-    # The growth is the larger one of the open and the touching loop with this human.
+    # The growth is the larger growth of the open and the touching loop with this human.
     simulation = assemble(scenario, coupling.coupling)
     crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
     plant = hold(variants(scenario.device, crowd).plants(), scenario.T)

@@ -266,7 +266,7 @@ def test_validations_with_lost_packets_are_not_covered(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_both_engines_agree_on_growth_under_adversarial_delays():
-    """MuJoCo's growth rates under adversarial delays are within 0.01 1/s of the exact ones."""
+    """MuJoCo's growth rates under adversarial delays are within 0.01 1/s of the exact rates."""
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"))
     held_by = variants(scenario.device, held_alike((1.0, 20.0, 500.0), (0.3, 6.0, 300.0)))
     other = partial(_batch, held_by, scenario.T, 1)
