@@ -1,4 +1,4 @@
-"""A lower bound of the least eigenvalue of He G = (G + G*)/2 on the whole unit circle, not only on a grid."""
+"""Bound the least eigenvalue of He G = (G + G*)/2 from below on the whole unit circle, and |G| near points of it."""
 
 from __future__ import annotations
 

@@ -159,6 +159,7 @@ class Device:
                 self.take(frame)
 
     def configure(self, config: wire.Config) -> None:
+        """Accept or refuse a CONFIG, and store its ACK for the next tick."""
         refused = self._refuse(config)
         self.ack = wire.encode(wire.Ack(wire.config_crc(config), refused))
         if not refused:

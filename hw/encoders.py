@@ -134,7 +134,7 @@ class Expected:
             scenes = [build(devices, [Human((Link(i * w, 0.0, 0.0),)) for w in weights]) for i in (0, 1)]
         plants = [hold(scene.plant, scenario.T) for scene in scenes]
         (own, heavy), n = ([-p.B[:, s.outside :] for p, s in zip(plants, scenes, strict=True)]), len(plants[0].A)
-        # one state for three plants: free or held, in heavy hands, and again free or held, under absolute forces
+        # one state for three plants: free or held, in heavy hands if free, and the first again under absolute forces
         self._A = scipy.linalg.block_diag(plants[0].A, plants[1].A, plants[0].A)
         self._B = np.vstack([own, heavy, 0 * own]), np.vstack([0 * own, 0 * heavy, own])
         self._places = np.array([0, n, n + len(heavy)])
@@ -147,7 +147,8 @@ class Expected:
     def advance(self, axis: int, force: float) -> Array:
         """Apply the force [N] of the motor of `axis` for a tick, and return three positions [m] of this axis.
 
-        They are the expected position, that in a heavy hand, and that under the absolute value of all forces so far.
+        They are the expected position, that in a hand as heavy as the device (if the handles are free), and that under
+        the absolute value of all forces so far.
         """
         signed, absolute = self._B
         self._state = self._A @ self._state + signed[:, axis] * force + absolute[:, axis] * abs(force)

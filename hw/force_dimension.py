@@ -89,6 +89,7 @@ class ForceDimension:
             name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
             self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
             self._sdk.enableExpertMode()  # the watchdog needs expert mode
+            #: whether every device has set its watchdog
             self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
             opened.pop_all()
         self._device, self._decoder = Device(self._info), wire.Decoder()

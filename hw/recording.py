@@ -123,10 +123,10 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     scenario: Scenario
     coupling: Form
-    link_delay: int
+    link_delay: int  # [ticks]
     limits: SafetyLimits
-    force_step: tuple[float, ...]
-    cap: tuple[int, ...]
+    force_step: tuple[float, ...]  # (m,) [N]
+    cap: tuple[int, ...]  # (m,) [steps]
     energy_budget: BudgetPlan | None = None
     behind: tuple[int, ...] = ()  # (m,) [ticks] that several boards add to the link
     lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, if there was one

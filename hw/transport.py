@@ -264,6 +264,7 @@ def _interruptible() -> Iterator[None]:
 
 @contextmanager
 def _no_collections() -> Iterator[None]:
+    """Freeze all objects, and switch the garbage collector off in this context."""
     gc.collect()
     gc.freeze()
     was_on = gc.isenabled()

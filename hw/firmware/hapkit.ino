@@ -20,7 +20,7 @@ static const float METRES_PER_RADIAN = 0.09f * 0.005f / 0.073f;
 static const float METRES_PER_COUNT = METRES_PER_RADIAN * 3.14159265f / SPAN;
 static const float FULL_TORQUE = 0.03f; /* [N m] of the motor at full PWM: 4.9 N at the handle */
 static const float HOME = -0.045f;      /* [m] position of the handle when it is homed */
-static const ha_limits LIMITS = {0.05f, 1.0f, 4.8f, METRES_PER_COUNT, 0.07f};
+static const ha_limits LIMITS = {0.05f, 1.0f, 4.8f, METRES_PER_COUNT, 0.07f}; /* range, speed, cap, count, mass */
 static const uint16_t PERIOD_CYCLES = (uint16_t)(F_CPU / 8 * PROCESS_PERIOD); /* counts of timer 1, every 8 cycles */
 
 static ha_runner runner;

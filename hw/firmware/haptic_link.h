@@ -65,10 +65,10 @@ typedef struct {
 typedef struct {
     hl_info info;
     hl_config config;
-    bool configured, asked, answered, latched, deadman;
-    uint8_t phase, cause, refused, rejected, misses, held, ramp_left;
-    uint16_t k, echo, run;
-    uint32_t now, config_crc;
+    bool configured, asked, answered, latched, deadman; /* asked: INFO is due; answered: an ACK is due */
+    uint8_t phase, cause, refused, rejected, misses, held, ramp_left; /* held: missed ticks in a row; ramp_left: ticks */
+    uint16_t k, echo, run; /* k: this tick; run: FORCEs since arming, at most ramp_in */
+    uint32_t now, config_crc; /* now: the clock at tick k [us] */
     int16_t margin, applied[HL_MAX_AXES], ramp_from[HL_MAX_AXES];
     hl_slot slot[HL_SLOTS];
     hl_receiver in;

@@ -129,7 +129,7 @@ def test_a_fault_of_one_board_stops_both(scenario, alone, made, board, fault):
         (1.01, 300.0, "board 2: its clock is 0.99 % slower"),
     ],
 )
-def test_clocks_that_are_not_covered_are_refused(scenario, alone, made, clock, begin_us, cause):
+def test_clocks_that_are_not_covered_prevent_forces(scenario, alone, made, clock, begin_us, cause):
     rehearsal = rehearsal_of(scenario, alone, made, clock, begin_us=begin_us)
     rehearsal.run_until_armed(0.1)
     assert rehearsal.session.stage == Stage.STOPPED
