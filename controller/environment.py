@@ -555,7 +555,7 @@ def environment(network: Network, T: Number) -> Lti:
     return E + network.block.at(T) if network.block else E
 
 
-#: E(z), without blocks, of the last networks. A design needs the same E(z) about eighty times.
+#: E(z), without blocks, of the last networks. A design needs the same E(z) about twenty times.
 _computed: dict[Any, Lti] = {}
 _MOST_COMPUTED = 32
 

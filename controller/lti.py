@@ -112,7 +112,7 @@ class Lti(ReadOnly):
             matrix = own[name]
             if matrix.shape[-2:] != shape:
                 raise ValueError(f"{name} has shape {matrix.shape}, expected {shape}")
-            # If the sum of squares is finite, so are all entries. Testing the sum takes a tenth of np.isfinite's time.
+            # If the sum of squares is finite, so are all entries. Testing the sum is faster than np.isfinite.
             if not exact and not isfinite(np.vdot(matrix, matrix)) and not np.isfinite(matrix).all():
                 raise ValueError(f"{name} has entries that are not finite")
         if not 0 < self.T < np.inf:
@@ -499,7 +499,7 @@ def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) 
     total = residues @ (1 / (points - poles[:, None]))
     if weights.size:
         late = _powers(1 / points, weights.shape[1])
-        total.real += weights @ late.real.copy()  # OpenBLAS is 50 times slower with complex matrices of few rows
+        total.real += weights @ late.real.copy()  # OpenBLAS may be far slower with complex matrices of few rows
         total.imag += weights @ late.imag.copy()
     return total
 

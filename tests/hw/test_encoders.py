@@ -207,7 +207,7 @@ def test_friction_and_weight_are_no_faults(friction, weight):
 @pytest.mark.parametrize("share", [0.0, 0.15, 0.5, 0.7])
 @pytest.mark.parametrize("q", [1e-6, 1e-5])
 def test_a_motor_weak_in_one_direction_is_named(sign, share, q):
-    """The axis moves 0.5 to 0.85 times as far as expected. The two directions differ by (1 - share) / (1 + share).
+    """The axis moves 0.54 to 0.88 times as far as expected. The two directions differ by (1 - share) / (1 + share).
 
     For a share of 0.7 this is 0.18, and 0.2 is allowed.
     """
