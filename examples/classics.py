@@ -1,6 +1,6 @@
 """Compare classic passivity layers (PO/PC, energy bounding) with our couplings, in half a minute.
 
-Columns: the rms error of the applied force, relative to the ideal one; the force's rms above 40 Hz and its peak; the
+Columns: the rms error of the applied force, relative to the ideal force; the force's rms above 40 Hz and its peak; the
 share of ticks in which the layer changed a force. The last two are about 100 pairs of lossless hands that start at
 0.1 m/s: how many exceed this speed in the tenth second, and the largest speed in that second.
 """

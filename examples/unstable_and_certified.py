@@ -37,7 +37,7 @@ def main(path: str) -> None:
             shown = trace.t <= frame / FRAMES_PER_SECOND
             line.set_data(trace.t[shown], trace.f[shown, CHANNEL])
         figure.canvas.draw()
-        figure.set_layout_engine("none")  # every frame has the layout of the first
+        figure.set_layout_engine("none")  # every frame has the layout of the first frame
         size = figure.canvas.get_width_height()
         frames.append(Image.frombuffer("RGBA", size, figure.canvas.buffer_rgba()).convert("P", palette=1, colors=32))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_SECOND, loop=0)

@@ -150,7 +150,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     @property
     def bodies(self) -> dict[str, float]:
-        """The masses [kg] by the names of the bodies; a hand holds the last one."""
+        """The masses [kg] by the names of the bodies; a hand holds the last body."""
         return {"motor": self.motor_mass, "handle": self.handle_mass}
 
     @property

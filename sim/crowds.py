@@ -146,7 +146,7 @@ class Findings:
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
         frequency: (n,) frequency of the exact loop's dominant mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
-        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's engine, else on the exact one; nan with walls.
+        trace: (n,) growth rate [1/s] on the trace of MuJoCo or a user's engine, or on the exact trace; nan with walls.
         witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
         trace_error: (n,) error of `trace` [1/s]; a rate of smaller size gives no verdict.
         clipped: (n,) number of ticks with a force at its limit, or with an active limiter, on that trace.
@@ -225,7 +225,7 @@ def _examine(
 ) -> Findings:
     """Judge and simulate the humans of `indices`, who all touch the same environment.
 
-    `ticked` is called after each block of ticks that the other engine simulates, with their number.
+    `ticked` is called after each block that the other engine simulates, with the number of ticks in it.
     """
     simulation = validation.simulation
     if member := validation.environment(indices[0]):

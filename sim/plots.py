@@ -571,7 +571,7 @@ def plot_singular_values(report: Comparison, path: Path) -> Path:
 
 
 def plot_required_damping(report: Comparison, path: Path) -> Path:
-    """Plot the damping that each condition requires at each frequency, the available one, and where conditions bind."""
+    """Plot each condition's required damping over frequency, the available damping, and where conditions bind."""
     from haptic_loop.design.result import ANY, TITLES
 
     title = "required damping over frequency; o: where it binds, ^: above the picture"
@@ -604,7 +604,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
 
 
 def plot_perceived(report: Comparison, path: Path) -> Path:
-    """Plot the effective impedance of each channel as a stiffness and a damping, beside the ideal one."""
+    """Plot the effective impedance of each channel as a stiffness and a damping, beside those of E itself."""
     title = "felt by each user, the other devices held still; vertical axes are linear near zero"
     figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
     hz = report.frequency_hz

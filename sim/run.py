@@ -3,7 +3,7 @@
     trace = run(assemble(scenario, coupling), "mujoco")
 
 A tick samples the positions, computes the forces, limits and holds them, and advances the plant by one period: see
-controller.tick for the order of these steps, and sim.engines for the last one.
+controller.tick for the order of these steps, and sim.engines for the last step.
 """
 
 from __future__ import annotations

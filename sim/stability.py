@@ -250,7 +250,7 @@ def exact_growth(simulation: Simulation) -> float:
 
 
 _NOT_EXCITED = "not excited: the motion does not follow the dominant mode; the verdict is that of the eigenvalues"
-_VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest
+_VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest entry
 _UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
 _AT_ONCE = 1 << 16  # ticks that are projected at a time, because a long trace may exceed the memory
 

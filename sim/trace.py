@@ -5,8 +5,8 @@ a nonlinear loop has no eigenvalues. The slow motion is subtracted, and the rest
 
 oscillation   Does an oscillation last in the second half of a trace? The half is cut into two windows. The oscillation
               lasts if in some octave the amplitude in the last window exceeds a threshold and is at least SUSTAINED
-              times that in the first. Octaves are judged separately, so that a slow mode that decays does not hide a
-              fast one that grows.
+              times the amplitude in the first window. Octaves are judged separately, so that a slow mode that decays
+              does not hide a fast mode that grows.
 growth        How fast does an oscillation grow? If it grows like exp(g t), the logarithm of the amplitude over the
               windows is a line of slope g. The slope describes a motion and is no verdict on a loop: the motion of a
               person who shakes the handle harder and harder grows, too.
@@ -237,7 +237,7 @@ class Oscillation:
     """The strongest oscillation of positions, with one entry per simulation."""
 
     sustained: NDArray[np.bool_]  # (nsim,) whether the oscillation lasts
-    amplitude: Array  # (nsim,) [m] amplitude of the strongest lasting octave, else of the strongest; inf: diverged
+    amplitude: Array  # (nsim,) [m] amplitude of the strongest octave, of a lasting one if there is any; inf: diverged
     frequency_hz: Array  # (nsim,) [Hz] frequency of the strongest line in the same octave; nan: diverged
 
 

@@ -34,7 +34,7 @@ class Unstable:
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
-        """Return the record of two counts; `other` is that of the engine that is compared with the exact one."""
+        """Return the record of two counts; `other` is by the engine that is compared with the exact one."""
         if other is None or question.engine == "exact":
             return cls(exact, None)
         if isinstance(question.engine, str):

@@ -532,7 +532,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
 
 
 def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
-    """Compare up to _COLUMNS columns in which K crosses the edge with single sweeps; None if there are none."""
+    """Compare up to _COLUMNS columns in which K crosses the edge with single sweeps; None without such columns."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = suffices(ratio)
     crossing = inside[:-1] & ~inside[1:] & np.isfinite(ratio[1:])
