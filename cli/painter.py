@@ -52,7 +52,7 @@ def _started() -> subprocess.Popen[bytes] | None:
     import subprocess  # Commands without a picture do not need it.
 
     # The second process finds modules in the same folders as this one.
-    command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
+    command = [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     try:  # In a new session, Ctrl-C does not end the process: an interrupted run still draws its picture.
@@ -103,7 +103,7 @@ class Painter:
         return plots.save(getattr(plots, function)(*arguments), path)
 
 
-def serve() -> None:
+def _serve() -> None:
     """Read what `ask` sends from standard input, and write its picture to standard output, in the second process.
 
     A thread reads while matplotlib is loaded, so that `ask` does not wait. It ends this process if the first process

@@ -101,7 +101,7 @@ def world_start(args: argparse.Namespace) -> float:
 _OPTIONS = {"limiter": "no-limiter", "band_hz": "band"}  # options whose name differs from their argument's
 
 
-def refuse(args: argparse.Namespace, why: str, **defaults: object) -> None:
+def _refuse(args: argparse.Namespace, why: str, **defaults: object) -> None:
     """Raise InputError if an argument differs from its default, because it has no effect in a world."""
     for name, default in defaults.items():
         if (value := getattr(args, name)) != default:
@@ -150,9 +150,9 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path, painter: Painte
         if getattr(args, name, None):
             shown = name.replace("_", "-")
             raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
-    refuse(args, "no transparency error is computed", band_hz=None)
-    refuse(args, _SHELL, limiter=None)
-    refuse(args, _WHOLE, details=False)
+    _refuse(args, "no transparency error is computed", band_hz=None)
+    _refuse(args, _SHELL, limiter=None)
+    _refuse(args, _WHOLE, details=False)
     from haptic_loop.models.world import files_of  # loads MuJoCo
     from haptic_loop.sim.view.drawn_object import scene_xml
 
@@ -219,12 +219,12 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         raise InputError("--adversary: for a world, `design.audit` reports the energy that adversaries gained")
     if args.duration == 0:
         raise InputError("--duration 0: a world has no eigenvalues, give the length of the traces [s]")
-    refuse(
+    _refuse(
         args, "the engine of the scene simulates all hands in one process", engine="both", traces="sampled", shards=1
     )
-    refuse(args, "the scenario's population sets the number of masses", links=None)
-    refuse(args, "there are no ranges", environments="nominal")
-    refuse(args, _SHELL, limiter=None)
+    _refuse(args, "the scenario's population sets the number of masses", links=None)
+    _refuse(args, "there are no ranges", environments="nominal")
+    _refuse(args, _SHELL, limiter=None)
     began, chosen = time.perf_counter(), _chosen(args, scenario)
     report = _reported(args, scenario, chosen, START_J)
     with render.progress("validating") as move:
@@ -265,9 +265,9 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Map
 
     `further` are the options of the design by argument name.
     """
-    refuse(args, "there is no network whose parameters could vary", ranges=None)
-    refuse(args, "delays are constant", varying_delay=None)
-    refuse(args, _SHELL, limiter=None)
+    _refuse(args, "there is no network whose parameters could vary", ranges=None)
+    _refuse(args, "delays are constant", varying_delay=None)
+    _refuse(args, _SHELL, limiter=None)
     loop, kind = scenario.loop(args.case), args.coupling
     condition = args.condition or ANY_ENVIRONMENT.name
     with options.refused(args=args), render.designing(loop, kind, condition) as progress:
@@ -281,9 +281,9 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Map
 
 def check_audit(args: argparse.Namespace) -> None:
     """Raise InputError for options of design.audit that have no effect in a world."""
-    refuse(args, f"the audit judges {ANY_ENVIRONMENT.name}, and no other condition", condition=None)
-    refuse(args, "the audit judges constant delays only", varying_delay=None)
-    refuse(args, _WHOLE, details=False)
+    _refuse(args, f"the audit judges {ANY_ENVIRONMENT.name}, and no other condition", condition=None)
+    _refuse(args, "the audit judges constant delays only", varying_delay=None)
+    _refuse(args, _WHOLE, details=False)
 
 
 def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Path) -> int:

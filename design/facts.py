@@ -76,10 +76,10 @@ def even_level(loop: Loop, T: Number | None = None) -> Any:
     return level if loop.T_max is None else level * (T / numbers(loop.T_max, T))
 
 
-Weights = Sequence[Any]  # coefficients of w_0 + w_1/z + .. (in a row) or of w_0 + w_1 z + .. (in a displacement)
+_Weights = Sequence[Any]  # coefficients of w_0 + w_1/z + .. (in a row) or of w_0 + w_1 z + .. (in a displacement)
 
 
-def _product(p: Weights, q: Weights) -> list[Any]:
+def _product(p: _Weights, q: _Weights) -> list[Any]:
     """Return the weights of the product of two polynomials."""
     out: list[Any] = [0] * (len(p) + len(q) - 1)
     for i, a in enumerate(p):
@@ -88,7 +88,7 @@ def _product(p: Weights, q: Weights) -> list[Any]:
     return out
 
 
-def less_advance(p: Weights, follows: Any) -> list[Any]:
+def _less_advance(p: _Weights, follows: Any) -> list[Any]:
     """Return the weights of (p(1/z) - follows z)/(z - 1), which has no pole at z = 1 because p(1) = follows.
 
     For p = z^-theta this is -(1 + 1/z + .. + z^-theta), the negative window of a delay.
@@ -106,7 +106,7 @@ class Input:
 
     name: str
     channel: int
-    moved: Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
+    moved: _Weights = (1,)  # weights w_0 + w_1 z + .. of the input in the displacement that the force f[k] multiplies
     follows: int = 1  # 1 for a displacement, to which the environment responds; 0 for a speed
     slips: bool = True  # whether the limiter's slip, if there is one, is subtracted from the input
 
@@ -115,7 +115,7 @@ class Collected(Generic[Block]):
     """The entries of the hands' side and the facts: inputs, weights of forces, rows, and constant terms."""
 
     def __init__(
-        self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
+        self, T: Number, path: Sequence[_Weights], walls: int, hands: Sequence[Input], any_object: bool = False
     ) -> None:
         """Add the hands' inputs and their rows; `path` has the weights of each channel's nominal delay.
 
@@ -125,10 +125,10 @@ class Collected(Generic[Block]):
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> number of the input
-        self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
-        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) of steps added to the response
-        self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
-        self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of the steps of f_e, scale)
+        self._into: list[tuple[int, int, _Weights]] = []  # (output of the inputs' filter, input, weights)
+        self._force: list[tuple[int, int, _Weights]] = []  # (channel, input, weights) of steps added to the response
+        self._sums: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of f_e, scale)
+        self._steps: list[tuple[int, int, _Weights, Any]] = []  # (row, channel, weights of the steps of f_e, scale)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight, y itself instead of its steps)
         self._terms: list[tuple[int, int, Any]] = []  # (row, input, weight)
         self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
@@ -137,7 +137,7 @@ class Collected(Generic[Block]):
         for i in hands:
             row, weights = self.input(i.name, i.channel), _product(path[i.channel], i.moved)
             if any_object or not i.follows:  # The weights of a speed add up to 0, so there is no pole.
-                self.steps(row, i.channel, less_advance(weights, i.follows))
+                self.steps(row, i.channel, _less_advance(weights, i.follows))
             else:
                 self.sums(row, i.channel, weights)
                 self._into.append((i.channel, row, (1,)))
@@ -175,9 +175,9 @@ class Collected(Generic[Block]):
         """Return the number of the limiter's slip of a channel."""
         return self.places["de", channel]
 
-    def moving(self, channel: int) -> list[tuple[int, Weights]]:
+    def moving(self, channel: int) -> list[tuple[int, _Weights]]:
         """Return the inputs that add up to the displacement that a channel's force multiplies, with weights in z."""
-        parts: list[tuple[int, Weights]] = [
+        parts: list[tuple[int, _Weights]] = [
             (self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel
         ]
         return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
@@ -193,21 +193,21 @@ class Collected(Generic[Block]):
 
     # -- effects of inputs
 
-    def press(self, i: int, wall: int, weights: Weights) -> None:
+    def press(self, i: int, wall: int, weights: _Weights) -> None:
         """Let input i add to the steps of a wall's force."""
         self._into.append((self.channels + wall, i, weights))
 
-    def force(self, i: int, channel: int, weights: Weights) -> None:
+    def force(self, i: int, channel: int, weights: _Weights) -> None:
         """Let input i add to the steps of a channel's sent force f_e, besides the environment's response."""
         self._force.append((channel, i, weights))
 
     # -- terms of rows
 
-    def sums(self, row: int, channel: int, weights: Weights) -> None:
+    def sums(self, row: int, channel: int, weights: _Weights) -> None:
         """Add the weighted sent force to a row. The force sums up its steps, so the row has a pole at z = 1."""
         self._sums.append((row, channel, weights, 1))
 
-    def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
+    def steps(self, row: int, channel: int, weights: _Weights, scale: Any = 1) -> None:
         """Add the weighted steps of the sent force to a row."""
         self._steps.append((row, channel, weights, scale))
 
@@ -250,12 +250,12 @@ class Collected(Generic[Block]):
     def gain(self) -> Any:
         return self._matrix(self._gain)
 
-    def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, Weights]]]:
+    def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, _Weights]]]:
         """Return (row, scale, whether the force is summed) of each term with forces, and its (channel, weights)."""
         kinds = [*((r, True) for r in self._sums), *((r, False) for r in self._steps)]
         return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
 
-    def _bank(self, reads: Sequence[tuple[int, Weights]]) -> Lti:
+    def _bank(self, reads: Sequence[tuple[int, _Weights]]) -> Lti:
         """Return the block from sent forces (m,) to the weighted forces, with one delay line per channel."""
         order = sorted(range(len(reads)), key=lambda r: reads[r][0])
         parts = [_taps([w for c, w in reads if c == channel], self.T) for channel in range(self.channels)]
@@ -321,7 +321,7 @@ class Collected(Generic[Block]):
         return times(sums, static), free, self.gain()
 
 
-def _taps(rows: Sequence[Weights], T: Number) -> Lti:
+def _taps(rows: Sequence[_Weights], T: Number) -> Lti:
     """Return the block from one channel to w_0 + w_1/z + .. for each row, with one delay line."""
     n = max((len(row) for row in rows), default=1) - 1
     table: Any = numbers(np.zeros((len(rows), n + 1), dtype=int), T) + 0
@@ -333,7 +333,7 @@ def _taps(rows: Sequence[Weights], T: Number) -> Lti:
     return Lti(np.eye(n, k=-1, dtype=int), first, table[:, 1:], table[:, :1], T)
 
 
-def _of_weights(entries: Sequence[tuple[int, int, Weights]], outputs: int, inputs: int, T: Number) -> Lti:
+def _of_weights(entries: Sequence[tuple[int, int, _Weights]], outputs: int, inputs: int, T: Number) -> Lti:
     """Return a block of weighted and delayed inputs, with one delay line per input."""
     length = [max((len(w) for _, j, w in entries if j == i), default=1) for i in range(inputs)]
     starts = np.cumsum([0, *(n - 1 for n in length)])
@@ -716,7 +716,7 @@ class Switching(Fact):
                 block.term(block.places["w", i], block.places["w", j], 2 * weight)
 
 
-def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
+def _correlation(p: _Weights, q: _Weights) -> list[tuple[int, Any]]:
     """Return (power of 1/z, weight) of the terms of p(1/z) q(z) with powers >= 0."""
     return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
 
@@ -745,7 +745,7 @@ class Limited(Fact):
             c = [numbers(v, block.T) for v in values["c"][d * self.lags : (d + 1) * self.lags]]
             e, rho = block.slip(i), numbers(self.rho[d], block.T)
             block.force(e, i, (-rho, rho))
-            block.steps(e, i, less_advance(block.path[i], 1))
+            block.steps(e, i, _less_advance(block.path[i], 1))
             for j, weight in enumerate(c, start=1):
                 block.steps(e, i, tuple(range(j, 0, -1)), -weight)
 
@@ -794,7 +794,7 @@ def compose(
         hands: The hands' side; None for `hands_side(loop)`.
     """
     values = values or {}
-    path: list[Weights] = [(1,)] * loop.channels
+    path: list[_Weights] = [(1,)] * loop.channels
     if late:
         path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))
     hands, T = hands or hands_side(loop), G.T
@@ -830,7 +830,7 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
     block.take(damping, rest)
 
 
-def _paths(loop: Loop, switch: bool) -> list[Weights]:
+def _paths(loop: Loop, switch: bool) -> list[_Weights]:
     """Return the weights of Theta for each channel; for switching delays the mean of z^-lo and z^-hi."""
     spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
     return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]

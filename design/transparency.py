@@ -83,13 +83,17 @@ def silent(E: Lti) -> bool:
     return not E.D.any() and not E.C.any()
 
 
-def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """Compute the figures of the force map F against Lambda E. Raises ValueError if E is zero."""
+def _reference(environment: Lti, lam: Sequence[int], band_hz: tuple[float, float]) -> tuple[Lti, float, float]:
+    """Return Lambda E and the ends of the band [rad/sample]. Raises ValueError if E is zero."""
     if silent(environment):
         raise ValueError(NO_FORCE)
-    target = delay(lam, F.T) @ environment
-    per_hz = 2 * np.pi * F.T
-    low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
+    per_hz = 2 * np.pi * environment.T
+    return delay(lam, environment.T) @ environment, band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
+
+
+def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
+    """Compute the figures of the force map F against Lambda E. Raises ValueError if E is zero."""
+    target, low, high = _reference(environment, lam, band_hz)
 
     def mismatch(w: Array) -> NDArray[np.complex128]:
         z = on_circle(w)
@@ -126,7 +130,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         relative_mismatch=worst,
         rms_mismatch=rms,
         dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])) if static[0] > rounding else np.nan,
-        high_frequency_gain=_high_frequency_gain(F, environment, 100.0 * per_hz),
+        high_frequency_gain=_high_frequency_gain(F, environment, 2 * np.pi * F.T * 100.0),
         band_hz=band_hz,
     )
 
@@ -144,11 +148,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 def rms_mismatch(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> float:
     """Compute the rms mismatch over log frequency; equal maps give about 0. Raises ValueError if E is 0."""
-    if silent(environment):
-        raise ValueError(NO_FORCE)
-    target = delay(lam, F.T) @ environment
-    per_hz = 2 * np.pi * F.T
-    low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
+    target, low, high = _reference(environment, lam, band_hz)
 
     def square(logarithm: Array) -> Array:
         z = on_circle(np.exp(logarithm))
