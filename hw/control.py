@@ -363,6 +363,8 @@ class Drive:
             if test is None:
                 self._test = None
                 self.gain = self.limits.next_gain(self.gain, ticks * self.T)
+                if self.gain == 1.0 and not (self._budget or self.world):  # these accounts count no pulses
+                    test = self.encoders.pulse
         elif direction < 0:
             self.gain = self.limits.next_gain(self.gain, -ticks * self.T)
             if closing and self._last_test and self.gain == 0:

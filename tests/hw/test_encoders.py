@@ -480,6 +480,73 @@ def test_still_encoders_under_force_are_dead(newton, found):
     assert (monitor.dead == "encoder or motor of axis 1 is dead: nothing moves for 0.5 s under a force") == found
 
 
+def pressing(friction, q, side=1, alive=True, seconds=2.0, theta=2):
+    """Press a handle with dry friction [N] in a calm hand against 0.5 N; return the time of a verdict, or None.
+
+    A hand of 0.5 kg, 20 N s/m and 1500 N/m holds 0.25 kg. Friction sticks exactly. The handle is about to slip in the
+    direction of the force, so that a pulse against it moves the handle least.
+    """
+    monitor, x, v, h, far, pulses = monitor_of(q), 0.0, 0.0, T / 64, 0.0, []
+    for k in range(round(seconds / T)):
+        pulses.append((monitor.pulse or (0.0,))[0])
+        force = side * 0.5 - pulses[max(0, k - theta)]
+        monitor.check((round(x / q) if alive else 0,), (round(force / STEP),), 1)
+        if monitor.dead:
+            return k * T, far
+        for _ in range(64):
+            push = force - side * (0.5 - friction) - 20 * v - 1500 * x
+            if v == 0.0 and abs(push) <= friction:
+                continue
+            before, v = v, v + h / 0.75 * (push - friction * np.sign(v or push))
+            v = 0.0 if before * v < 0 else v
+            x, far = x + h * v, max(far, abs(x))
+    return None, far
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(("friction", "whole"), [(0.2, 2.9e-4), (0.5, 7.3e-5)])
+def test_calm_hands_with_friction_stop_nothing(friction, whole, side):
+    """A pulse of 1.3 N for 20 ms moves the handle by `whole` [m], but a pulse ends when the encoder has moved."""
+    for q in (1e-6, 1.5e-5):
+        stopped, far = pressing(friction, q, side)
+        assert stopped is None
+        assert 2 * q < far < whole
+    stopped, far = pressing(friction, 1e-6, side, alive=False)
+    assert stopped == pytest.approx(0.5, abs=3 * T)
+    assert far == pytest.approx(whole, rel=0.05)
+
+
+@pytest.mark.parametrize("cap", [0.4, 12.0])
+def test_a_pulse_is_short_and_within_the_cap(cap):
+    monitor, pulses = monitor_of(1e-6, cap=(cap,)), []
+    for _ in range(round(0.49 / T)):
+        pulses.append((monitor.pulse or (0.0,))[0])
+        monitor.check((0,), (-round(0.35 * min(1.0, cap / 2) / STEP),), 1)
+    (acting,) = (np.flatnonzero(pulses),)
+    assert set(np.array(pulses)[acting]) == {-min(1.3, cap)}  # a motor force of +1.3 N
+    assert acting[0] * T == pytest.approx(0.3, abs=2 * T)
+    assert len(acting) * T == pytest.approx(0.02, abs=T)
+
+
+@pytest.mark.parametrize("budget", [None, (1.0, 1.0)])
+def test_only_unbudgeted_sessions_send_pulses(scenario, rungs, budget):
+    """The encoder of axis 1 dies under a constant force of 0.5 N, and is found after 0.5 s."""
+    tests = []
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, energy_budget=budget))
+    session.record = lambda row: tests.append((row.gain, row.test))
+
+    def hold(session, now):
+        session.drive.controller.step = lambda x: [0.5, 0.5]
+        return ()
+
+    fault = (FaultInjection.parse("freeze@0.6"),)
+    Rehearsal(session, Emulator(scenario, fault), lambda ages: rungs, actions=[(0.6, hold)]).run_until_armed(1.6)
+    assert "encoder or motor of axis 1 is dead" in [e.cause for e in session.log][-2]
+    pulses = [test for gain, test in tests if gain == 1.0 and test]
+    assert all(abs(f) in (0.0, 1.3) for test in pulses for f in test)
+    assert (len(pulses) > 0) == (budget is None)
+
+
 @pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
 def test_coarse_counts_hide_a_calm_tremor(count, dead):
     """A tremor of 30 um always leaves two counts of 15 um, but it fits into two counts of 16 um or more."""
