@@ -107,7 +107,7 @@ def main(argv: list[str]) -> int:
     while len(sittings) < args.sittings and not (sittings and sittings[-1].signals):
         sittings.append(_sitting(args, scenario, settings, out, len(sittings) + 1))
         last = sittings[-1].session.link.last
-        if args.port and not args.same_place and last:
+        if args.port and last:
             settings = replace(settings, elsewhere=last.counts)
     report, clamped = _identified(scenario, sittings), list[_Sitting]()
     if args.transmission and report.bounded and not sittings[-1].signals:
@@ -152,8 +152,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)
     count = "number of sessions; each records every axis with the handles at another place; two must agree (default 2)"
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
-    stay = "leave the handles where they are between sittings (for an emulator, whose handles nobody moves)"
-    add("--same-place", action="store_true", help=stay)
     known = "two more sittings with clamped handles bound motor mass and transmission, for known-device"
     add("--transmission", action="store_true", help=known)
     rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
@@ -161,9 +159,7 @@ def _parser() -> argparse.ArgumentParser:
     add_output_options(parser)
     parser.only("with --rehearse", lambda args: args.rehearse, "hand")
     parser.only("with --rehearse", lambda args: not args.port, "coulomb")
-    parser.only("with --port", lambda args: args.port, "same_place")
-    coupled = "psi", "lam", "reference", "environment", "known_device"
-    parser.only("for commands with a coupling", lambda args: False, *coupled)
+    parser.refuse("for commands with a coupling", "psi", "lam", "reference", "environment", "known_device")
     return parser
 
 
@@ -194,8 +190,8 @@ def _sitting(
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
 
     if args.port and number > 1:
-        told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
-        told += "; then press key a" if not args.arm else "" if args.same_place else ": the sitting begins 5 s later"
+        told = "take every handle 5 mm or more away and let go"
+        told += ": the sitting begins 5 s later" if args.arm else "; then press key a"
         if clamped is not None:
             told = "clamp every handle to a bench; then press key a" if not args.arm else "every handle must be clamped"
         count = args.sittings + len(_LEVELS) * args.transmission

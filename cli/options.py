@@ -71,6 +71,13 @@ class Parser(argparse.ArgumentParser):
         """
         self._only.append((where, acts, names))
 
+    def refuse(self, where: str, *names: str) -> None:
+        """Refuse the options `names`, with an error that ends in `where`, and leave them out of --help."""
+        self.only(where, lambda args: False, *names)
+        for action in self._actions:
+            if action.dest in names:
+                action.help = argparse.SUPPRESS
+
     def format_help(self) -> str:
         """Return the usage in one line, the first options, and the other options by groups."""
         arguments = [action for action in self._actions if not action.option_strings]

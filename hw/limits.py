@@ -15,18 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.hw.protocol import (
-    MAX_RELEASE_NS,
-    MAX_THETA,
-    PROTOCOL,
-    Config,
-    Force,
-    Info,
-    SafetyStop,
-    State,
-    encode,
-    wire_bytes,
-)
+from haptic_loop.hw import protocol as wire
+from haptic_loop.hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Info, SafetyStop
 from haptic_loop.models.device import require
 from haptic_loop.sim.scenario import Scenario
 
@@ -202,7 +192,7 @@ class SafetyLimits:
         if info.axes != m:
             return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]
         try:
-            encode(info._replace(firmware=""))
+            wire.encode(info._replace(firmware=""))
         except ValueError as error:
             return [f"the device reports an impossible value, {error}"]
         reasons, period_ns = [], round(1e9 * scenario.T)
@@ -311,7 +301,7 @@ class Units:
 
 def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     """Return the time [s] that one STATE and one FORCE take on the line, and its computation as text."""
-    up, down = wire_bytes(State, axes), wire_bytes(Force, axes)
+    up, down = wire.wire_bytes(wire.State, axes), wire.wire_bytes(wire.Force, axes)
     seconds = (up + down) * _BITS_PER_BYTE / baud
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 

@@ -19,12 +19,14 @@ import numpy as np
 
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 
+_LATE = 0.1  # largest share of late answers; above it the link is slower than the coupling is certified for
+_MISSED = 0.2  # largest share of missing answers; beyond it loops lose mean-square stability
 _STATES_PER_ANSWER = 8  # most STATEs per measured age: of several FORCEs in a USB frame, only one margin is reported
 _INFERRED = 0.005  # largest share of inferred ages: half of the 1 % that the default quantile leaves out
 _MEASURED_TOLERANCE = 0.01  # largest relative difference between the device's mean tick and T
 _UNTOLD = 0.9  # largest share of STATEs without a margin; USB frames that carry several FORCEs cause some
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
-_BLOCK = 200  # ticks over which a clock is compared
+_BLOCK = 200  # ticks over which clocks are compared, and late and missing answers are counted
 _CLOCK_US = 1.5  # [us] largest error of the difference of two time stamps of the device
 _REMEMBERED = 64  # most forces or latches that are stored; at most the last theta still matter
 _ROUNDING = 1  # [steps] largest difference that a firmware's rounding may cause
@@ -38,9 +40,6 @@ class LinkSettings:
 
     baud: int | None = None  # baud rate of a UART; None for a link without UART (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
-    window: int = 200  # ticks over which misses are judged
-    late: float = 0.1  # largest share of late answers; above it the link is slower than the coupling is certified for
-    missed: float = 0.2  # largest share of missing answers; beyond it loops lose mean-square stability
     test_encoders: bool = True  # whether a small force tests the encoders at every arming
     held: bool = True  # whether the scenario's hands hold the handles in that test (rehearsals), or nobody does
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
@@ -145,8 +144,8 @@ class Measurement:
     are random and at least the longest age (at most theta), so that bursts meet each answer with the same probability.
     """
 
-    def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
-        self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
+    def __init__(self, needed: int, theta: int, T: float) -> None:
+        self._needed, self._theta, self._T_us = needed, theta, 1e6 * T
         self._first: State | None = None
         self._last: State | None = None
         self._tick = 0  # number of the last STATE, without wrap-around
@@ -197,7 +196,7 @@ class Measurement:
         if everything < needed and counted < _STATES_PER_ANSWER * needed:
             return False
         part = 1 - len(ages) / max(1, everything if everything >= needed else counted)
-        if part > self._most_missing:
+        if part > _MISSED:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         self._check_clock(state)
         if self._sent is None and len(self._answers.inferred) > _INFERRED * len(ages):
@@ -261,8 +260,8 @@ class Counters:
 class LinkMonitor:
     """Check the order of STATEs, and count late answers, missed answers and ticks without STATE in a sliding window."""
 
-    def __init__(self, settings: LinkSettings, counters: Counters) -> None:
-        self.settings, self.counters = settings, counters
+    def __init__(self, counters: Counters) -> None:
+        self.counters = counters
         self.needed = 0.0  # [us] least margin of an answer that is not late
         self.restart()
 
@@ -302,7 +301,7 @@ class LinkMonitor:
             counters.misses += tick.missed
             counters.late += tick.late
             self._add(tick, 1)
-        if len(self._window) > self.settings.window and (oldest := self._window.popleft()).odd:
+        if len(self._window) > _BLOCK and (oldest := self._window.popleft()).odd:
             self._add(oldest, -1)
         self.last = state
         return ahead
@@ -323,7 +322,7 @@ class LinkMonitor:
 
         Shares are relative to a full window, also before it is full. Raises SafetyStop where too few messages arrive.
         """
-        window, most = self.settings.window, self.settings.missed
+        window, most = _BLOCK, _MISSED
         late, missed = self._late / window, min(1.0, self._missed / window)
         if missed > most + late:
             raise SafetyStop(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
@@ -334,7 +333,7 @@ class LinkMonitor:
             raise SafetyStop(
                 f"more than {100 * _UNTOLD:g} % of the last {window} STATEs lack a margin: their lateness is unknown"
             )
-        if late > self.settings.late:
+        if late > _LATE:
             return f"{100 * late:.0f} % of the last {window} answers were late"
         return None
 

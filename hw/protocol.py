@@ -77,7 +77,6 @@ class Reason(IntEnum):
     """Why the host sends STOP. Every reason stops the device; after ESTOP it stays stopped until its reset."""
 
     DONE = 0
-    OPERATOR = 1
     FAULT = 2
     ESTOP = 3
 

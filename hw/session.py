@@ -51,8 +51,8 @@ class Session:
         self.scenario, self.limits, self.settings = scenario, limits, settings or LinkSettings()
         self.probe = probe_delay(scenario.T)
         self.counters = Counters()
-        self.link = LinkMonitor(self.settings, self.counters)
-        self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
+        self.link = LinkMonitor(self.counters)
+        self.measurement = Measurement(self.settings.measure, self.probe, scenario.T)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[_Event] = []
         self.info: wire.Info | None = None  # the device's INFO; None before it came

@@ -487,7 +487,7 @@ def _rehearse_case(
         faults,
         actions=[(case.acts, case.action)] if case.action else [(_WHEN, frozen)],
         clock=case.period,
-        watch=show,
+        watch=show if case.shown else lambda session: None,
     )
     rehearsal.run_until_armed(case.lasts)
     timed = case.within is not None and rehearsal.armed_us is not None

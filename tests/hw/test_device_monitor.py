@@ -354,7 +354,7 @@ def test_skipped_answers_are_older_than_the_youngest():
 
 def test_lost_answers_have_no_age():
     """Every tenth FORCE is lost: the next echo skips it, and 15 ticks later its latch is missed."""
-    measurement, misses = Measurement(500, 15, 1e-3, 0.2), 0
+    measurement, misses = Measurement(500, 15, 1e-3), 0
     for k in range(1, 5000):
         lost, latch = k % 10 == 0, k - 15
         missed = int(latch > 0 and latch % 10 == 0)
