@@ -1,9 +1,9 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
 Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. In a loop without
-walls and friction, the scenario's own hands feel every coupling, and couplings.png shows the forces side by side. With
---coupling, the named couplings are drawn over frequency: singular values, required damping, perceived stiffness and
-damping.
+walls and friction, the scenario's own hands feel every coupling, and couplings.png shows the forces side by side,
+except for the paper's gains. With --coupling, the named couplings are drawn over frequency: singular values, required
+damping, perceived stiffness and damping.
 """
 
 from __future__ import annotations

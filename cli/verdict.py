@@ -90,7 +90,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
 
 
 SOFT_END = 1.001 * SOFTEST  # [N/m] a softer spring is at the soft end of the search
-_NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness is no better than no force
+_NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object without stiffness counts as useless
 
 
 def _useless(assessment: Assessment) -> str:

@@ -231,7 +231,8 @@ def _point(row: Row) -> Array:
 class Credible:
     """When a run leaves the range of the devices' linear model, with peak forces and speeds, and their limits.
 
-    Each list has one entry per channel; the transmission force of a rigid device is None.
+    Each list has one entry per channel, but the peaks of a run without ticks are empty. The transmission force of a
+    rigid device is None.
     """
 
     until_s: float | None

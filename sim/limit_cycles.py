@@ -117,7 +117,7 @@ class HeldDevices:
         return (vector / positions[np.argmax(np.abs(positions))]).real
 
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of a tenth of the humans, at least 8.
+        """Return a mask (n,) of a tenth of the humans, at least 8 if there are so many.
 
         First come those who are unstable with most of the force maps `some`, then those whose loops grow fastest.
         """
