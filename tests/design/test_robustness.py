@@ -38,7 +38,7 @@ def test_comparisons_judge_delays_that_switch():
 
 
 def test_tables_over_ranges_count_switching():
-    """Of 1 N s/m the vertex of 500 N/m needs 0.75 at the constant 1, and at least 1.25 if delays switch in [1, 2]."""
+    """The vertex of 500 N/m needs 0.75 N s/m at the constant 1. Switching in [1, 2] needs 1.25, and 1 for 400 N/m."""
     ranges = Ranges((UncertainSpring(("tip", "ground"), (K, 500.0)),))
     for loop, samples, violated in ((CONSTANT, 1.5, 0), (SWITCHING, 2.5, 2)):
         ranged = replace(loop, ranges=ranges)

@@ -185,7 +185,7 @@ def test_six_facts_hold_at_every_transition():
 
 @cache
 def steps_of(damped):
-    """Return 1.01 of the required damping, the map G, the block, its storage P, the residue S on (x, h), and m."""
+    """Return 1.01 of the required damping, the map G, the block, half its storage P, the residue S on (x, h), and m."""
     loop = DAMPED if damped else PAIR
     need = required_damping(loop, BOTH, "this-environment")
     delta = 1.01 * need.ratio * np.array(loop.delta)
@@ -200,7 +200,7 @@ def steps_of(damped):
     S1 = G.dc()
     S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
     m_ = np.array(need.multiplier).reshape(4, -1)[3]
-    return delta, G, block.floats(), P.floats() / 2, S, m_  # P proves twice the balance of Z.
+    return delta, G, block.floats(), P.floats() / 2, S, m_  # P stores twice the balance of Z.
 
 
 class Walled:
