@@ -1,10 +1,9 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
-By default two sittings (sessions) are recorded; with --port and without --same-place, the user moves the handles
-between them. Nobody may hold a handle; if a hand damps a handle in one sitting, the other reveals it. Each sitting
-plays the excitation in a session like that of hw.bridge; its force cap is the excitation's largest force. With
---transmission two sittings with clamped handles follow, for bounds of motor mass and transmission (hw/transmission.py),
-which the known-device conditions need.
+By default two sittings (sessions) are recorded; with --port, the user moves the handles between them. Nobody may hold a
+handle; if a hand damps a handle in one sitting, the other reveals it. Each sitting plays the excitation in a session
+like that of hw.bridge; its force cap is the excitation's largest force. With --transmission two sittings with clamped
+handles follow, for bounds of motor mass and transmission (hw/transmission.py), which the known-device conditions need.
 """
 
 from __future__ import annotations

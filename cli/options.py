@@ -41,7 +41,7 @@ from haptic_loop.sim.scenario import (
 if TYPE_CHECKING:
     from haptic_loop.design.conditions import Condition
 
-DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130  # exit codes
 
 _Number = TypeVar("_Number", int, float)
 _Given = TypeVar("_Given")

@@ -166,7 +166,7 @@ def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
 
 
 def _needs(requirement: Requirement) -> str:
-    """Return required and available damping of the worst channel and the verdict, in words."""
+    """Return in words the required and the available damping of the worst channel, and whether that is certified."""
     if not np.isfinite(requirement.ratio):
         return "no certificate"
     worst = int(np.argmax(np.divide(requirement.required, requirement.available)))
