@@ -1,4 +1,4 @@
-"""Check that memory stays flat over an hour of a session, in virtual time, and over 100,000 hands."""
+"""Check for `make validate` that memory stays flat over an hour of a session (virtual time), and over 100,000 hands."""
 
 from __future__ import annotations
 

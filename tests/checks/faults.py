@@ -1,4 +1,4 @@
-"""Rehearse every fault of a link, a device, a controller or a person that we could think of, in virtual time.
+"""Rehearse faults of a link, a device, a controller or a person in virtual time; `make validate` rehearses all.
 
 Each case is a whole session of bridge and emulated device: the fault, the stage that it must end in, and how soon. In
 every tick the device sends positions in a STATE frame, and the host answers with forces in a FORCE frame. The time to

@@ -1,6 +1,7 @@
 """Numerically hard loops, each with an integrator setting that holds and, but for one loop, a setting that fails.
 
-The rule is `default_substeps`, which picks the substeps of an integrator.
+tests/sim/test_hard.py and `make validate` measure them. The rule is `default_substeps`, which picks the substeps of an
+integrator.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Test this-environment under uneven ticks, whose periods and latencies are drawn or chosen by an adversary.
+"""Test this-environment in `make validate` under uneven ticks, which are drawn or chosen by an adversary.
 
 Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what this-
 environment requires for periods up to T_max, for forces that latch late, or for both. 40 sets of lossless hands start

@@ -1,4 +1,4 @@
-"""The class of a case of bad input, the good files in its folder, and functions that spoil these files."""
+"""For hostile.py: the class of a case of bad input, the good files in its folder, and functions that spoil them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are malformed, overflow, or claim false proofs: scenarios, hands, delays, couplings, traces."""
+"""Cases of hostile.py with files that are malformed, overflow, or claim false proofs: scenarios, hands, traces, .."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad command lines: wrong values and paths, outputs that would replace inputs, contradicting options."""
+"""Cases of hostile.py with bad command lines: wrong values and paths, outputs that would replace inputs, .."""
 
 from __future__ import annotations
 
