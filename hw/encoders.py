@@ -91,7 +91,7 @@ class AxisCheck:
         if self._axis == len(self._step):
             return None
         if self._still < self._rest:
-            return f"let every handle rest: then move axis {self._axis + 1}"
+            return f"let every handle rest, then move axis {self._axis + 1}"
         return f"move axis {self._axis + 1} by {1e3 * self._far:.3g} mm or more in its + direction"
 
     def note(self, counts: tuple[int, ...]) -> str | None:

@@ -528,11 +528,12 @@ def test_a_pulse_is_short_and_within_the_cap(cap):
     assert len(acting) * T == pytest.approx(0.02, abs=T)
 
 
-@pytest.mark.parametrize("budget", [None, (1.0, 1.0)])
-def test_only_unbudgeted_sessions_send_pulses(scenario, rungs, budget):
+@pytest.mark.parametrize(("budget", "tested"), [(None, True), (None, False), ((1.0, 1.0), True)])
+def test_only_unbudgeted_sessions_send_pulses(scenario, rungs, budget, tested):
     """The encoder of axis 1 dies under a constant force of 0.5 N, and is found after 0.5 s."""
     tests = []
-    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, energy_budget=budget))
+    settings = LinkSettings(measure=60, energy_budget=budget, test_encoders=tested)
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
     session.record = lambda row: tests.append((row.gain, row.test))
 
     def hold(session, now):
@@ -544,7 +545,7 @@ def test_only_unbudgeted_sessions_send_pulses(scenario, rungs, budget):
     assert "encoder or motor of axis 1 is dead" in [e.cause for e in session.log][-2]
     pulses = [test for gain, test in tests if gain == 1.0 and test]
     assert all(abs(f) in (0.0, 1.3) for test in pulses for f in test)
-    assert (len(pulses) > 0) == (budget is None)
+    assert (len(pulses) > 0) == (tested and budget is None)
 
 
 @pytest.mark.parametrize(("count", "dead"), [(1.5e-5, True), (1.6e-5, False), (1e-4, False)])
