@@ -83,7 +83,7 @@ def test_a_sampled_split_keeps_digits_near_one():
     np.testing.assert_allclose(split.G.real, -400.0, rtol=1e-15)
 
 
-def test_quotient_at_one(blocks):
+def test_the_quotient_at_one_is_its_definition(blocks):
     G = blocks[0]
     close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
 

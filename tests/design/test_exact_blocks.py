@@ -442,7 +442,7 @@ def test_a_slightly_asymmetric_static_part_is_refused(condition, name):
     assert forged(asked, skew, made) == f"{name} is not exactly symmetric"
 
 
-def test_slight_asymmetry_is_refused_behind_delay_and_switching():
+def test_slight_asymmetry_is_refused_with_delay_switching_limiter():
     asked = loop(to_ground(100.0, 80.0), (0, 0), (1, 1), delta=(5.0, 5.0))
     phi = [0.1, 0.1]
 

@@ -31,7 +31,7 @@ def default(coupling) -> Lti:
         (STIFF, 1.36326),
     ],
 )
-def test_this_environment_figures(coupling, required):
+def test_this_environment_needs_the_known_damping(coupling, required):
     result = this_environment(default(coupling), DELTA)
     assert result.required == pytest.approx((required, required), rel=3e-5)
     assert result.certified == (required < 1.37)

@@ -250,7 +250,7 @@ def test_certify_refuses_switching_for_an_own_condition():
     [(PAIR, LimitedForces, LIMITER), (KNOWN, LimitedKnownDevice, LimitedKnownDevice())],
     ids=["plain", "known-device"],
 )
-def test_an_own_limiter_counts_if_its_block_is_proved(loop, base, shipped):
+def test_an_own_limiter_counts_once_it_is_proved(loop, base, shipped):
     own = condition(base, Less(0.0))
     assessment = assess(loop, SOFT, condition=own, force_limit=(12.0, 12.0))
     assert assessment.force_limits.rho == LIMITER.rho(loop)

@@ -27,7 +27,7 @@ def test_compliant_device_is_a_two_mass_oscillator():
     np.testing.assert_array_equal(got.C, [[1, 0, 0, 0]])
 
 
-def test_rigid_device_with_hand_on_an_arm():
+def test_a_rigid_device_and_arm_match_their_equations():
     d, (hand, arm) = RigidDevice(), ARM.links
     got = plant(build([d], [ARM]).model)
     M = np.diag([d.mass + hand.mass, arm.mass])
