@@ -31,7 +31,7 @@ KNOWN = load("omega-pair-known").loop("I")
 
 
 class Less(Fact):
-    """Forces that return up to `less` dx^2/2 [N/m] more energy per tick, so that `less` T more damping is required."""
+    """Forces that return up to `less` dx^2 more energy per tick, `less` in N/m: `less` T more damping is required."""
 
     def __init__(self, less):
         self.less = less
