@@ -89,7 +89,7 @@ class Row:
     engine: str
     integrator: str | None
     substeps: int | None
-    position_relative_rms: float | None
+    position_relative_rms: float | None  # as in PositionError
     growth_rate_error: float  # [1/s] the error with or without the coupling, whichever is larger in magnitude
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
     cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
@@ -364,7 +364,7 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # error of the encoders' positions, plus the error bound of a refined reference
+    position_relative_rms: float  # error of the positions plus the error bound of a refined reference; inf: ended early
     verdict_correct: bool  # whether the simulated loop has the verdict of the exact loop
     cpu_s: float  # CPU time of the run, for the report only
 

@@ -156,7 +156,7 @@ class ConditionCurve:
     """The damping that one condition requires of a coupling, over frequency."""
 
     requirement: Requirement = off_table("inlined")
-    ratio: float = off_table()
+    ratio: float = off_table()  # largest required over available damping
     demand: Array | None = off_table()  # required over available damping at each frequency
     reason: str | None = off_table("if given")
 
@@ -209,7 +209,7 @@ class Comparison:
     theta: tuple[int, ...]
     psi: tuple[int, ...]
     lam: tuple[int, ...]
-    available_damping: tuple[float, ...]
+    available_damping: tuple[float, ...]  # (m,) [N s/m]
     frequency_hz: Array
     sigma_E: Array  # (k, m) singular values of E [N/m]
     ideal: compare.Perceived

@@ -50,7 +50,7 @@ class EnvironmentsMet:
     """The environments of the loops, and those in which a loop was unstable."""
 
     of: str  # "the nominal environment" or "the ranges"
-    count: int
+    count: int  # number of environments
     names: list[str] | None = off_table("if given", None)
     unstable_in: list[str] | None = off_table("if given", None)
 
@@ -208,7 +208,7 @@ class EnergyAudit:
 
     audited: int  # number of tested traces
     clipped: int  # number of traces that are left out
-    violated: int
+    violated: int  # number of tested traces with W(N) < 0
     least_J: float | None  # least W(N) of the tested traces
     holds: bool
 
@@ -265,8 +265,8 @@ class Attacked:
     spectral_radius: float
     growth_rate_per_s: float
     frequency_hz: float
-    evaluated: int
-    required_over_available_damping: float | None
+    evaluated: int  # number of sets of humans that were tried
+    required_over_available_damping: float | None  # None if no damping is enough
     human: list[_Held]
     person: tuple[Person, ...]
     holds: bool

@@ -496,8 +496,8 @@ _HALVINGS = 20  # bisections, which give an edge of the population with a relati
 class Mark:
     """One point, and the largest safe K at the same B: None if no tried K is safe, inf if the largest tried K is."""
 
-    K: float
-    B: float
+    K: float  # [N/m]
+    B: float  # [N s/m]
     requirement: dict[str, Requirement]
     growth: float  # [1/s] worst over the population
     unstable: int  # number of humans that make the loop unstable

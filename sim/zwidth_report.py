@@ -32,7 +32,7 @@ class _Ratio:
     required_over_available: Array  # (rows, columns) required over available damping
     certified_cells: int
     contradicted_cells: int | None = off_table("if given")  # certified, but unstable with a human of the population
-    reason: str | None = off_table("if given")
+    reason: str | None = off_table("if given")  # why some cells have no figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class Shown:
 class _Point:
     """One simulated cell."""
 
-    K: float
-    B: float
+    K: float  # [N/m]
+    B: float  # [N s/m]
     verdict: str
     amplitude_m: float
     frequency_hz: float
@@ -74,8 +74,8 @@ class _Point:
 class _Marked:
     """The report of a point of --mark."""
 
-    K: float
-    B: float
+    K: float  # [N/m]
+    B: float  # [N s/m]
     requirements: dict[str, Requirement] = off_table("inlined")
     growth_rate_per_s: float = off_table()
     unstable_humans: int = off_table()
@@ -94,8 +94,8 @@ class _ContactSpring:
     """One spring at a contact of the scenario's environment."""
 
     between: tuple[str, str]
-    K: float
-    B: float
+    K: float  # [N/m]
+    B: float  # [N s/m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +134,8 @@ class _Simulated:
     threshold_m: float
     from_hz: float  # lowest frequency of an oscillation that is seen
     points: list[_Point]
-    oscillate: int
-    undecided: int
+    oscillate: int  # number of points that oscillate
+    undecided: int  # number of points with the verdict UNDECIDED
     differ_from_linear: int
 
     @classmethod
