@@ -16,7 +16,7 @@ from haptic_loop.controller.arithmetic import TooLong
 
 #: Exact arithmetic for one coupling. A proof over 100 states takes 0.3, and a proof over 800, the largest, takes 30.
 EXACT = 60.0
-#: A sweep, or a search by many of them. A sweep takes 0.006 for two devices and 0.008 for three.
+#: A sweep, or a search by many of them. A sweep takes 0.003 for two or three devices and 0.007 for eight.
 SWEEPS = 60.0
 #: The search over larger bases of an optimal coupling. The slowest of the 23 loops take 19 (o11), 17 (o08) and 15 (n6,
 #: n7).
@@ -67,7 +67,7 @@ PROGRAM_SWEEPS = 6
 #: (docs/theory.md), and intervals of its integral. Cases I and II take 2 rounds and 568 intervals. With psi = 0 a delay
 #: of theta_i samples makes theta_i sums vanish for each channel.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
-#: Convex problems for a coupling of fixed order. Case I takes 32.
+#: Convex problems for a coupling of fixed order. Case I takes 44.
 FIXED_ORDER_PROBLEMS = 100
 #: Cuts in the search for the least share of the damping at one beta of known-device, and rounds of tangents for beta
 #: and multipliers. The pair of omega.3 with known transmissions takes 4 cuts and 11 rounds.

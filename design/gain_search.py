@@ -391,7 +391,7 @@ class KnownDeviceLoop(SampledLoop):
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # first value of beta over its largest value; the default loops' optima are 0.29 to 0.47
+    _first = 0.35  # first value of beta over its largest value; the least mismatch hardly depends on beta
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(len(loop.devices)), 1 - _SAMPLED_RESERVE
