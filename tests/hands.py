@@ -8,6 +8,7 @@ class Hands:
     """Devices in random passive hands, integrated by the matrix exponential.
 
     `lossless` and `start`, the scale of the first velocities [m/s], are one value or one for each simulation (nsim,).
+    `masses` is the number of masses; the first are the devices, with damping `delta` [N s/m].
     """
 
     def __init__(self, rng, nsim, lossless, start=0.0, masses=None, T=1.2e-3, delta=(1.37, 0.9)):
@@ -37,8 +38,10 @@ class Hands:
         return self.s[:, self.n : self.n + self.m].T
 
     def energy(self):
+        """Return the stored energy (nsim,) [J]."""
         q, v = self.s[:, : self.n], self.s[:, self.n :]
         return (q[:, None] @ self.K @ q[:, :, None] + v[:, None] @ self.M @ v[:, :, None])[:, 0, 0] / 2
 
     def hold(self, f):
+        """Advance by T under forces f (m, nsim) [N]; the devices feel -f."""
         self.s = (self.step @ np.concatenate([self.s, f.T], axis=1)[:, :, None])[:, :, 0]

@@ -15,6 +15,7 @@ def session_with(scenario, settings=FAST):
 
 
 def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **options):
+    """Return a rehearsal with the certified couplings `rungs`, and faults written as for --fault."""
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_with(scenario, settings)
     if recorder is not None:

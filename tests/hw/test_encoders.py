@@ -24,6 +24,7 @@ STEP = 4e-4  # [N]
 
 
 def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step=None, stop=None, **settings):
+    """Run a session until `seconds` after arming, stopped at `stop` [s]; return it and its rehearsal."""
     if encoder_step:
         devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
         scenario = scenario.replace(device=devices)

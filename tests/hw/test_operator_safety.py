@@ -172,6 +172,7 @@ def test_a_reset_device_keeps_the_deadman_held(scenario):
 
 
 def rehearsal_until_finished(scenario, rungs):
+    """Return a session that was armed and has finished."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
     rehearsal.run_until_armed(0.3)

@@ -122,6 +122,7 @@ def test_broken_recipes_are_bad_input(trace, tmp_path):
 
 
 def _spoil(path, to, **changes):
+    """Write a trace with changed arrays and the digest of these arrays to `to`."""
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files}
     changed = arrays | {name: change(arrays) for name, change in changes.items()}

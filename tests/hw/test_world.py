@@ -27,6 +27,7 @@ DRIVEN = """<mujoco><option gravity="0 0 0"/><worldbody>
 
 
 def session(tmp_path, capsys, *words):
+    """Rehearse a session by the command; return exit code, report and output."""
     code = bridge.main(["--rehearse", "--no-plot", "--out", str(tmp_path / "out"), *words])
     return code, json.loads((tmp_path / "out" / "report.json").read_text()), " ".join(capsys.readouterr().out.split())
 
