@@ -539,8 +539,9 @@ def environment(network: Network, T: Number) -> Lti:
 
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
-    previous tick. Every tick solves this equation for v. The states are q- and v-, and the previous displacements and
-    velocities of contacts with dampers or masses. The network's block is added to E(z). The arithmetic is that of T.
+    previous tick. Every tick solves this equation for v. The states are q- and v-, the previous displacements of
+    contacts with dampers or masses, and the previous velocities of contacts with masses. The network's block is added
+    to E(z). The arithmetic is that of T.
     Raises ValueError if an internal node has no mass and nothing holds it, or only the rounding of directions does.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
