@@ -471,7 +471,7 @@ class Guarantee:
     """The hands, environments and forces for which a coupling keeps its loop safe.
 
     Attributes:
-        condition: The condition that gives the guarantee, or "energy-budget".
+        condition: The condition that gives the guarantee, without its facts, or "energy-budget".
         proof: "rational": exact arithmetic, also for limited forces if `forces` names them; "sampled": a refined sweep;
             "account": an energy account at every tick.
         facts: Properties of the loop that the condition covers (Assessment.facts).
@@ -543,7 +543,8 @@ class Assessment:
     Attributes:
         loop: The loop for which the conditions were evaluated.
         coupling: The coupling as it runs.
-        requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition.
+        requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition. With
+            delays that switch, this-environment has two: for the constant delays, and under "switching" for any.
         environment: The environment that runs: a network, or a plugged-in function.
         ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
@@ -878,7 +879,8 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
     hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
     facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)
     origin = own.origin if own else None
-    return Guarantee(by.condition, proof, facts, hands, environments, forces, loop.delays, longest, own=origin)
+    name = SWITCHING.base if by.condition == SWITCHING.name else by.condition  # switching is among the facts
+    return Guarantee(name, proof, facts, hands, environments, forces, loop.delays, longest, own=origin)
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:

@@ -735,11 +735,8 @@ def test_optimal_filters_in_space_take_switching_delays(loop: Loop) -> None:
     certificate = prove(loop, design.coupling, "this-environment")
     guarantee = assess(loop, design.coupling, certificate=certificate).guarantee
     assert guarantee
-    assert (guarantee.condition, guarantee.proof, guarantee.delays) == (
-        "switching",
-        "rational",
-        loop.varying_delay,
-    )
+    assert (guarantee.condition, guarantee.proof, guarantee.delays) == (certificate.condition, "rational", loop.delays)
+    assert "switching" in guarantee.facts
     assert isinstance(design.coupling, ForceFilter)
     alpha = certificate.multipliers["alpha"]
     assert len(alpha) == len(loop.devices)
