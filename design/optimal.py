@@ -95,22 +95,25 @@ def design_with(
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
     **options: Any,
 ) -> Optimal:
-    """Design the optimal coupling under `condition` for Options(**options); call `progress` after each basis."""
-    chosen, done = program.Options(**options), 0
+    """Design the optimal coupling under `condition` for Options(**options).
 
-    def reached(result: _BasisResult) -> None:
-        nonlocal done
-        done += 1
-        progress(f"{result.mismatch_db:z.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
+    `progress` is called before each part of the work with (its name, number of finished bases, number of all bases).
+    """
+    chosen, finished = program.Options(**options), list[_BasisResult]()
+
+    def say(what: str) -> None:
+        last = f" (last filter: {finished[-1].mismatch_db:z.2f} dB)" if finished else ""
+        progress(f"{what}{last}", len(finished), len(chosen.bases))
 
     made = _for_known_devices if condition == KNOWN_DEVICE.name else design
-    return made(loop, chosen, progress=reached)
+    return made(loop, chosen, progress=finished.append, say=say)
 
 
 def design(
     loop: Loop,
     options: program.Options = program.DEFAULT,
     progress: Callable[[_BasisResult], None] = lambda result: None,
+    say: Callable[[str], None] = lambda what: None,
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate if it is proved.
 
@@ -118,25 +121,27 @@ def design(
     are more) and at every point that the search between the vertices visits. With a range of delays, any switching
     within the range is safe. If no optimal coupling can be proved or its mismatch is large, two simpler couplings are
     candidates, too: the environment scaled down (R = kappa I) and the best spring-damper. The function returns the best
-    candidate.
+    candidate. `progress` is called after each basis, and `say` before each part of the work with the part's name.
 
     Raises ValueError for a delta that is not positive, for walls, for switching delays with a latency, for a limiter
     that has no design in this loop, and for a loop that no damping makes safe without a coupling.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    search = _Search.of(loop, options)
+    search = replace(_Search.of(loop, options), say=say)
     if exactly := search.nothing():
         return exactly
     improving, results, hurried = _over_bases(search, progress)
     best = improving[-1] if improving else None
     proved_last = improving[::-1][: budgets.RANGED_BASES if loop.ranges else None] if search.proves_last else ()
     for candidate in proved_last:
+        say("searching the ranges" if loop.ranges else "proving the coupling")
         best = search.between(candidate) if loop.ranges else search.proved_or_smaller(candidate)
         hurried |= best.searched is not None and best.searched.ended == "clock"
         if best.proved:
             break
     if best is None or not best.proved or search.mismatch(best) > _HOPELESS:
+        say("designing simpler couplings to compare")
         rivals = [one for one in (best, search.scaled(), search.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, search.merit(one)))
     return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
@@ -155,6 +160,7 @@ def _over_bases(
         if results and not search.room(taps, poles, max((r.states for r in results if r.reason is None), default=0)):
             continue
         best = improving[-1] if improving else None
+        search.say(f"optimising a filter of {taps} taps and {poles} poles")
         try:
             with within(search.left if results else np.inf, "a larger basis", clock=search.over if results else None):
                 least = _SETTLED_DB if taps > _LARGE else -np.inf
@@ -190,7 +196,10 @@ _SCALINGS = 6  # largest number of scalings of the forces; each reduces them by 
 
 
 def _for_known_devices(
-    loop: Loop, options: program.Options, progress: Callable[[_BasisResult], None] = lambda result: None
+    loop: Loop,
+    options: program.Options,
+    progress: Callable[[_BasisResult], None] = lambda result: None,
+    say: Callable[[str], None] = lambda what: None,
 ) -> Optimal:
     """Return the best coupling under known-device, or under this-environment if that is better.
 
@@ -203,15 +212,16 @@ def _for_known_devices(
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise ValueError(f"{KNOWN_DEVICE.name}: {reason}")
-    search = replace(_Search.of(loop, options), condition=KNOWN_DEVICE)
+    search = replace(_Search.of(loop, options), condition=KNOWN_DEVICE, say=say)
     if exactly := search.nothing():
         return exactly
-    plain = design(loop, options, progress)
+    plain = design(loop, options, progress, say)
     best = search.proved_elsewhere(plain)
     results, eta, multipliers = list(plain.bases), None, search.multipliers(plain.coupling)
     for taps, poles in options.bases:
         if not search.room(taps, poles, 0):
             break
+        say(f"optimising a filter of {taps} taps and {poles} poles for known devices")
         tried = [
             search.over_known(each, multipliers, search.mismatch(best), taps, poles)
             for each in ([eta] if eta else _ETAS)
@@ -255,6 +265,7 @@ class _Search:
     started: float  # clock time [s] of the start, for the report and for --seconds
     spent: int  # counted work at the start
     condition: Condition = THIS_ENVIRONMENT  # the condition that judges and proves couplings
+    say: Callable[[str], None] = lambda what: None  # called before each part of the work with its name
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options) -> _Search:

@@ -28,7 +28,7 @@ from haptic_loop.design.conditions import ratio_in
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.frequency import hermitian, on_circle
-from haptic_loop.design.optimal import _SETTLED, _BasisResult, design
+from haptic_loop.design.optimal import _SETTLED, _BasisResult, design, design_with
 from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from haptic_loop.design.result import NotProved
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
@@ -204,6 +204,15 @@ def test_every_basis_is_reported_as_it_is_finished():
     assert [basis.taps for basis in heard] == [4, 8]
     assert all(basis.certified for basis in heard)
     assert heard[0].seconds < heard[1].seconds <= found.wall_s
+
+
+def test_progress_names_each_part_of_the_work():
+    heard = []
+    design_with(loop_of("n3"), bases=SMALLEST.bases, progress=lambda *words: heard.append(words))
+    assert [(what.split(" (")[0], *count) for what, *count in heard] == [
+        ("optimising a filter of 4 taps and 3 poles", 0, 1),
+        ("proving the coupling", 1, 1),
+    ]
 
 
 @pytest.mark.parametrize(
