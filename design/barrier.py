@@ -67,11 +67,14 @@ class MatrixInequality:
         rows = _turned(_inverse_root(self.at(x))) @ self.slope
         return rows.reshape(-1, rows.shape[2])
 
-    def newton(self, x: Array) -> tuple[Array, Array]:
-        """Return the gradient of -log det S and its Hessian."""
+    def add_newton(self, x: Array, gradient: Array, hessian: Array) -> None:
+        """Add the gradient (n,) of -log det S and its Hessian (n, n) to the arguments."""
         rows = self.directions(x)
         one = packed(np.eye(math.isqrt(self.constant.shape[1]), dtype=complex))
-        return -np.tile(one, len(self.constant)) @ rows, rows.T @ rows
+        gradient -= np.tile(one, len(self.constant)) @ rows
+        used = rows.any(axis=0)
+        own = rows[:, used]
+        hessian[... if used.all() else np.ix_(used, used)] += own.T @ own
 
     def changed(self, U: Array) -> MatrixInequality:
         """Return the inequality in the unknowns y = U x."""
@@ -124,8 +127,13 @@ class EntryInequality:
         along, against = t * u, t * np.conj(u)
         return first, second, np.hstack([along.real, along.imag, against.real]), np.ascontiguousarray(against.imag)
 
-    def newton(self, x: Array) -> tuple[Array, Array]:
-        """Return the gradient of -log det S and the upper triangle of its Hessian."""
+    @cached_property
+    def _own(self) -> Complex:
+        """The matrices slope_a, (k, a, r, r)."""
+        return _unpacked(np.swapaxes(self.slope, 1, 2))
+
+    def add_newton(self, x: Array, gradient: Array, hessian: Array) -> None:
+        """Add the gradient of -log det S and the upper triangle of its Hessian to the arguments."""
         (k, n), r = self.functions.shape, self.left.shape[-1]
         L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
         P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
@@ -139,18 +147,19 @@ class EntryInequality:
         odd = odd @ against.imag
         between = np.empty((one.size, n, n))
         between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
-        hessian, size = np.zeros((x.size, x.size)), r * r * n
-        hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] = between
-        # `turned` has the columns S^-1 and S^-1 slope_a S^-1, whose inner products with the derivatives of S follow.
-        turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
-        through = V[:, None] @ _unpacked(np.swapaxes(turned, 1, 2)) @ L[:, None]
+        size = r * r * n
+        hessian[:size, :size].reshape(r * r, n, r * r, n)[one, :, two] += between
+        # `turned` holds S^-1 and S^-1 slope_a S^-1, whose inner products with the derivatives of S follow.
+        P = P[:, None]
+        turned = np.concatenate([P, P @ self._own @ P], axis=1)
+        through = V[:, None] @ turned @ L[:, None]
         entry = through[:, :, column, row].reshape(k, -1)
         beside = self.functions.real.T @ entry.real - self.functions.imag.T @ entry.imag
         beside = beside.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
-        own = self.slope.reshape(k * r * r, -1).T @ turned.reshape(k * r * r, -1)
-        gradient = -np.concatenate([beside[:, 0], own[:, 0]])
-        hessian[:size, size:], hessian[size:, size:] = beside[:, 1:], own[:, 1:]
-        return gradient, hessian
+        own = np.einsum("ksa,kbs->ab", self.slope, packed(turned))
+        gradient -= np.concatenate([beside[:, 0], own[:, 0]])
+        hessian[:size, size:] += beside[:, 1:]
+        hessian[size:, size:] += own[:, 1:]
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
@@ -241,10 +250,11 @@ def solve_triangular(U: Array, b: Array | Complex, transposed: bool = False) -> 
 
 def _solve_positive(H: Array, b: Array) -> Array:
     """Return H^-1 b for a symmetric H > 0, by its Cholesky factor. Raises LinAlgError if H is not positive definite."""
-    factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(H), lower=False, clean=False)
+    # The transpose is in LAPACK's order of entries, so that H is not transposed in memory.
+    factor, fault = _lapack("dpotrf")(np.asarray_chkfinite(H).T, lower=True, clean=False)
     if fault:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=False)[0]
+    return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=True)[0]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -259,9 +269,7 @@ def centre(program: Program, x: Array, t: float) -> Array:
         gradient = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
         hessian = 2 * t * program.square
         for block in program.blocks:
-            slope, curvature = block.newton(x)
-            gradient += slope
-            hessian += curvature
+            block.add_newton(x, gradient, hessian)
         step = _solved(hessian, -gradient)
         decrement = float(-gradient @ step)
         if not decrement > _CENTRED:
@@ -285,16 +293,17 @@ def towards(start: Array, x: Array, program: Program) -> Array:
 
 
 def _solved(hessian: Array, right: Array) -> Array:
-    """Return hessian^-1 right, with a ridge that grows until the scaled Hessian has a Cholesky factor."""
+    """Return hessian^-1 right, with a ridge that grows until the Hessian, which is scaled in place, has a factor."""
     scale = 1 / np.sqrt(np.diag(hessian))
-    unit = scale[:, None] * hessian * scale
-    diagonal, ridge = unit.diagonal().copy(), 0.0
+    hessian *= scale[:, None]
+    hessian *= scale
+    diagonal, ridge = hessian.diagonal().copy(), 0.0
     while True:
         try:
-            return scale * _solve_positive(unit, scale * right)
+            return scale * _solve_positive(hessian, scale * right)
         except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
-            np.fill_diagonal(unit, diagonal + ridge)
+            np.fill_diagonal(hessian, diagonal + ridge)
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:

@@ -579,7 +579,7 @@ class Problem:
         imposed = [self.grid(case, constraint) for case, constraint in pairs]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
-        _, R = np.linalg.qr(np.column_stack([A, b]))
+        R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
         A, b = R[:, :-1], R[:, -1]
         x, t, gaps = start, None, list(_GAPS)
         inner = start

@@ -537,7 +537,7 @@ def test_matrix_routines_are_those_of_scipy(n):
                 x = scipy.linalg.solve_triangular(stored, b, trans=int(transposed))
                 assert (barrier.solve_triangular(stored, b, transposed) == x).all()
     H, b = rows.T @ rows, rng.standard_normal(n)
-    assert (barrier._solve_positive(H, b) == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H), b)).all()
+    assert (barrier._solve_positive(H, b) == scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, lower=True), b)).all()
     with pytest.raises(np.linalg.LinAlgError):
         barrier._solve_positive(-H, b)
 
@@ -572,8 +572,22 @@ def test_entrywise_and_dense_inequalities_are_equal():
     split = EntryInequality(dense.constant, functions, left, right, dense.slope[:, :, -1:])
     x = np.append(rng.normal(size=2 * r * r), 100.0)
     np.testing.assert_allclose(split.at(x), dense.at(x), rtol=0, atol=1e-12)
-    for one, other in zip(split.newton(x), dense.newton(x), strict=True):
+    derivatives = [(np.ones(x.size), np.ones((x.size, x.size))) for _ in (split, dense)]
+    for block, (gradient, hessian) in zip((split, dense), derivatives, strict=True):
+        block.add_newton(x, gradient, hessian)
+    for one, other in zip(*derivatives, strict=True):
         np.testing.assert_allclose(np.triu(one), np.triu(other), rtol=0, atol=1e-12)
+
+
+def test_a_bound_on_one_unknown_adds_one_derivative():
+    """-log(x_2) has the derivatives -1/x_2 and 1/x_2^2; those of the other unknowns are 0."""
+    slope = np.eye(3, dtype=complex)[1].reshape(1, 3, 1, 1)
+    gradient, hessian = np.zeros(3), np.zeros((3, 3))
+    MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope).add_newton(
+        np.array([3.0, 4.0, 5.0]), gradient, hessian
+    )
+    np.testing.assert_allclose(gradient, [0, -1 / 4, 0], rtol=1e-15, atol=0)
+    np.testing.assert_allclose(hessian, np.diag([0, 1 / 16, 0]), rtol=1e-15, atol=0)
 
 
 @pytest.mark.slow
