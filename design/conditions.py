@@ -168,7 +168,7 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
     if w.size > step:
         return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
     z = on_circle(w)
-    free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
+    free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z if demand.gain.order else z[:1]))
     return _least_multiple(free, gain)
 
 

@@ -228,10 +228,10 @@ class SampledLoop:
         G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu
-        first = hermitian(of_G[:, :m, None] * G + fixed[:, :m, None] * np.eye(m))
-        beside = (fixed[:, m : m + p] + fixed[:, m + p : m + 2 * p].conj()) / 2
-        below = of_G[:, m : m + p, None] * G[:, self.active] / 2 + beside[:, :, None] * np.eye(m)[self.active]
-        return first, below, fixed[:, m + 2 * p :].real
+        first, below = of_G[:, :m, None] * G, of_G[:, m : m + p, None] * G[:, self.active] / 2
+        first[:, range(m), range(m)] += fixed[:, :m]
+        below[:, range(p), self.active] += (fixed[:, m : m + p] + fixed[:, m + p : m + 2 * p].conj()) / 2
+        return hermitian(first), below, fixed[:, m + 2 * p :].real
 
     def _least(self, x: Array) -> tuple[Array, Complex]:
         """Return the least eigenvalue (k,) of the block's Schur complement, and v (k, m + active); cached for one x.
