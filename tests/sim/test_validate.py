@@ -1,6 +1,6 @@
 """Validating many humans at once gives the results of each human alone, in both engines, however the work is split.
 
-Tolerances without a comment cover rounding.
+A crowd is a stack of sets of hands; a person holds several devices. Tolerances without a comment cover rounding.
 """
 
 import json

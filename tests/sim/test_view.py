@@ -1,6 +1,7 @@
 """The live loop runs without a window; the tests supply the clock, the keys and the mouse.
 
-Tolerances without a comment cover rounding, in pictures that of single precision.
+A frame is what the window shows at one time. Tolerances without a comment cover rounding, in pictures that of single
+precision.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """MuJoCo worlds give hands no more than W0 = START_J and the released energy; unfit scenarios are refused.
 
-Tolerances without a comment cover rounding.
+A world is a MuJoCo scene that hands touch through devices. Tolerances without a comment cover rounding.
 """
 
 import json
