@@ -117,7 +117,7 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
 def test_growth_equals_that_of_the_exact_loop(stiffness, coupling):
     loop = assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=stiffness),) * 2), coupling)
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
-    # Four Runge-Kutta steps, which are too few for the stiffer transmission, are less accurate.
+    # Four Runge-Kutta steps, too few for the stiffer transmission, err more than one exponential step.
     if stiffness == 14500.0 and coupling is PUBLISHED["I"]:
         assert abs(simulated_growth(loop, "RK4", 4) - exact_growth(loop)) > 1e-5
 

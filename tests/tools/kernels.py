@@ -82,7 +82,7 @@ def foreign(every: dict[str, dict[str, str]]) -> str:
     """Return a kernel other than the native one, chosen by the commit's hash; "native" if there is no other.
 
     The hash is used because a shallow clone has only one commit to count. PRESCOTT, the kernel of processors before
-    2008, takes a fifth longer and is left to the run of every setting.
+    2008, takes a fifth longer than the others and is left to the run of every setting.
     """
     others = [name for name in every if name in NEEDS and name != "PRESCOTT"]
     return others[_commit() % len(others)] if others else "native"
