@@ -288,7 +288,7 @@ def _exact_cost(
 # inequality, whose least s bounds the required s from below.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least tried ratio; its requirement equals that of the plain condition to five digits
+_LEAST_ETA = 1e-5  # least tried ratio; there the requirement is about 0.1 % below that of the plain condition
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
 _TOGETHER = 100  # A stack of this many matrices takes hardly longer than one, so a step tries several shares at once.
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
