@@ -555,7 +555,8 @@ class Assessment:
         condition: The name of the condition that must hold for `holds`; another condition of the package may give the
             guarantee, but a user's own condition must give it itself, because others leave out its facts.
         own: The user's own condition, or None.
-        encoder: Whether friction covers the devices' encoder steps; None without steps, or if only a loop was given.
+        encoder: Whether friction covers the devices' encoder steps; None without steps, with a shell, or if
+            only a loop was given.
     """
 
     loop: Loop

@@ -217,8 +217,8 @@ class Chosen:
         condition: The name of the condition.
         kind: The kind of the coupling in reports.
         phi: (m,) multiplier Phi of Theorem 4 [N s/m], or None.
-        certificate: The Certificate of the file, if it was proved in this process.
-        limiter: The Certificate for limited forces, or None.
+        certificate: The Certificate of the file, if this process has verified it, or None.
+        limiter: The Certificate of the file, verified or not, if it covers limited forces, or None.
         c: The multipliers of the limiter that the design found, one row per device, or None.
         own: The user's own condition (design.conditions.Condition), or None.
         switching: The range of delays [samples] in which the coupling's file proves any switching, or None.
