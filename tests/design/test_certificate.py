@@ -183,7 +183,7 @@ def test_proof_and_sweep_agree_on_both_sides(count):
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
-    """Return a star of 1 to 3 contacts and a coupling. Delta is 0.5 to 1.5 of the requirement, up to 150 N s/m."""
+    """Return a star of 1 to 3 contacts and a coupling. Delta is 0.5 to 1.5 of the requirement, at most of 100 N s/m."""
     m = int(rng.integers(1, 4))
     tips = tuple(f"tip {i}" for i in range(m))
     spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]

@@ -67,7 +67,7 @@ def he(G):
 
 
 def figure_4(z):
-    """Return E(z) of Figure 4: springs of 800 and 700 N/m with 1 N s/m each hold a mass of 1 kg."""
+    """Return E(z) of Figure 4: springs of 800 and 700 N/m with 1 N s/m each join two contacts to 1 kg."""
     s = (1 - 1 / z) / T
     p, q = 800 + s, 700 + s
     return np.moveaxis(
@@ -94,7 +94,7 @@ def loop(network: Network, theta, psi=None, delta=None, period=T) -> Loop:
 
 
 def to_ground(*stiffness: float, damping: float = 0.0) -> Network:
-    """Return a network of separate tips, each on a spring to ground."""
+    """Return a network of separate tips, each on a spring and a damper to ground."""
     springs = tuple(Spring((f"tip {i}", "ground"), k, damping) for i, k in enumerate(stiffness))
     return Network(tuple(f"tip {i}" for i in range(len(stiffness))), springs)
 

@@ -151,7 +151,7 @@ def test_own_multipliers_are_searched_stored_and_checked():
 
 @pytest.fixture(scope="module")
 def repeats():
-    """Run the example of docs/extending.md: a fact and the condition that uses the fact."""
+    """Run the example of docs/extending.md, and return its fact and its condition by name."""
     page = (Path(__file__).parents[2] / "docs/extending.md").read_text()
     text = re.search(r"```python\n# repeats.py\n(.*?)```", page, re.DOTALL)[1]
     assert sum(bool(line.strip()) and "import" not in line for line in text.splitlines()) <= 15
