@@ -129,7 +129,7 @@ def test_the_best_multiplier_needs_the_known_damping(coupling, expected):
     assert found.ratio <= found.bound * (1 + 2e-5)
     assert required(coupling, [[v] for v in found.multiplier]) == pytest.approx(found.required[0], rel=1e-9)
     linear = this_environment(PAIR.F(coupling), DELTA).required[0]
-    assert found.required[0] >= linear * (1 - 1e-9)  # the block's first row is that of the linear loop
+    assert found.required[0] >= linear * (1 - 1e-9)  # the linear loop's block is a principal part
 
 
 def test_no_multiplier_on_a_grid_is_better():

@@ -423,7 +423,7 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # has no reserve
+    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve exists
     covered = "a force that is held through 1 missed answer is covered by the file's proof"
     assert first.remarks() == [f"{covered} while forces stay below their limits"]
     late = change(LOOP, theta=(2, 2), lam=(2, 2), varying_delay=DelayRange((2, 2), (2, 2)))

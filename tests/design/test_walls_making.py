@@ -45,7 +45,7 @@ NETWORK = Network(
     ),
 )
 PAIR = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), NETWORK)
-#: PAIR with dampers in two of its walls: b/T is 1667 and 417 N/m.
+#: PAIR with dampers in two of its walls: damping/T is 1667 and 417 N/m.
 DAMPED = change(
     PAIR,
     environment=change(
