@@ -213,7 +213,7 @@ def _save(
     kind: str,
     painter: Painter,
 ) -> list[Path]:
-    """Save humans for `sim.run --human`, and the picture."""
+    """Save the worst and the disagreeing humans for `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
     humans = "worst-human.toml", "adversary.toml", *(each.name for each in out.glob("disagreement-[0-9]*.toml"))
     render.remove_earlier(out, "population.png", *humans)
@@ -312,13 +312,13 @@ class _Report:
 
     @property
     def certified_words(self) -> str:
-        """Whether a guarantee covers the simulated loops; the verdict says why there is none."""
+        """Whether a guarantee covers the simulated loops, in words; the verdict says why there is none."""
         stated = self.assessment.guarantee_words
         return "yes" if self.certified else f"no: the guarantee is for {stated}" if stated else "no"
 
     @property
     def holds_words(self) -> str:
-        """Whether a test fails; without a certificate only disagreements and an uncertified condition can fail."""
+        """Whether all tests hold, in words; without a certificate only disagreements or an own condition can fail."""
         if not self.holds:
             return "[red]no[/]"
         return "[green]yes[/]" if self.certified else "nothing is certified that the tests could contradict"
@@ -363,7 +363,7 @@ def _tested(
     searched: _Searched,
     certified: bool,
 ) -> _Tests:
-    """Return the tests besides the growth with random humans."""
+    """Return all tests but that of the growth with random humans."""
     mode = worst_mode(assemble(question.scenario, chosen.coupling))
     own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)

@@ -352,7 +352,7 @@ def _rms(values: Array) -> float:
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
-_MOST_EVALUATIONS = 6e7  # largest number in all runs of a refinement: two minutes, at 2e-6 s each
+_MOST_EVALUATIONS = 6e7  # largest number in all runs of a refinement; these evaluations take two minutes
 _EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
 _FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three
