@@ -63,12 +63,7 @@ _DEVICE = {
     "unplug": ("no value: the cable is pulled", 0.0, 0.0, 0.0),
     "reset": ("no value: the device restarts", 0.0, 0.0, 0.0),
     "leap": ("ticks by which the device's tick number leaps", 1.0, 32000.0, 300.0),
-    "stuck": (
-        "no value: the device ignores its watchdog, its own faults, IDLE and every STOP except ESTOP",
-        0.0,
-        0.0,
-        0.0,
-    ),
+    "stuck": ("no value: the device ignores its watchdog, its faults, IDLE and each STOP but ESTOP", 0.0, 0.0, 0.0),
     "period": ("length of a tick as a multiple of T", 0.5, 4.0, 2.0),
     "estop": ("no value: somebody presses the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: the firmware finds a fault", 0.0, 0.0, 0.0),
@@ -323,9 +318,8 @@ class Emulator:
         self._encoder: dict[int, Callable[[int], int]] = {}
         for fault in faults:
             if fault.kind in _AXIS and fault.axis >= scenario.channels:
-                raise ValueError(
-                    f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
-                )
+                have = f"the scenario has {scenario.channels} channels"
+                raise ValueError(f"--fault {fault.kind} is for {fault.where}, {have}")
             if fault.kind in ("swap", "exchange", "cross") and scenario.channels < 2:
                 raise ValueError(f"--fault {fault.kind} is for two axes, the scenario has one channel")
         self._waiting = list(faults)

@@ -23,7 +23,6 @@ _LATE = 0.1  # largest share of late answers; above it the link is slower than t
 _MISSED = 0.2  # largest share of missing answers; beyond it loops lose mean-square stability
 _STATES_PER_ANSWER = 8  # most STATEs per measured age: of several FORCEs in a USB frame, only one margin is reported
 _INFERRED = 0.005  # largest share of inferred ages: half of the 1 % that the default quantile leaves out
-_MEASURED_TOLERANCE = 0.01  # largest relative difference between the device's mean tick and T
 _UNTOLD = 0.9  # largest share of STATEs without a margin; USB frames that carry several FORCEs cause some
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # largest relative drift in a block; a busy host reads its clock late
 _BLOCK = 200  # ticks over which clocks are compared, and late and missing answers are counted
@@ -63,13 +62,13 @@ class Ages:
 
     def longest_tick(self, T_us: float, q: float = 1.0) -> float:
         """Return the quantile q of the tick lengths [us], or T unless it exceeds T by more than the clock's error."""
-        longest = _entry(sorted(self.ticks), q) or T_us
-        return float(longest) if longest > T_us + _CLOCK_US else T_us
+        longest = float(_entry(sorted(self.ticks), q))
+        return longest if longest > T_us + _CLOCK_US else T_us
 
     def shortest_tick(self, T_us: float, q: float = 1.0) -> float:
         """Return the length [us] that a fraction q of ticks has at least, or T unless this is below T - _CLOCK_US."""
-        shortest = _entry(sorted(self.ticks, reverse=True), q) or T_us
-        return float(shortest) if shortest < T_us - _CLOCK_US else T_us
+        shortest = float(_entry(sorted(self.ticks, reverse=True), q)) or T_us
+        return shortest if shortest < T_us - _CLOCK_US else T_us
 
     def quantile(self, q: float) -> int:
         """Return the least age that a fraction q of forces does not exceed. Raises SafetyStop if fewer arrived."""
@@ -230,7 +229,7 @@ class Measurement:
         assert self._first is not None
         elapsed = (state.t_us - self._first.t_us) & 0xFFFFFFFF
         ticks = distance(state.tick, self._first.tick)
-        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _MEASURED_TOLERANCE:
+        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DEVICE_TOLERANCE:
             each = elapsed / ticks
             raise SafetyStop(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
 

@@ -108,16 +108,6 @@ class _Cable:
         self.data += data
 
 
-@dataclass(frozen=True)
-class _Further:
-    """One more emulated board of a rehearsal, with its own clock (hw/boards.py)."""
-
-    emulator: Emulator
-    clock: float = 1.0  # length of a tick as a multiple of T
-    faults: tuple[FaultInjection, ...] = ()  # faults of its line
-    begin_us: float = 0.0  # time of its first tick
-
-
 @dataclass
 class Rehearsal:
     """A session and its emulated devices in virtual time: the session's ports lead to the emulators.
@@ -137,7 +127,8 @@ class Rehearsal:
     clock: float = 1.0  # length of the device's tick as a multiple of T
     keep: bool = True  # whether to record every tick of every device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
-    further: Sequence[_Further] = ()
+    #: further boards, each with an emulator, length of a tick as a multiple of T, faults of its line, first tick [us]
+    further: Sequence[tuple[Emulator, float, tuple[FaultInjection, ...], float]] = ()
     moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -146,11 +137,10 @@ class Rehearsal:
         self._done: set[int] = set()
         self.now = self._ended = 0.0  # [us]
         self._cables: list[_Cable] = []
-        for board in (_Further(self.emulator, self.clock, self.faults), *self.further):
-            lines = [Line(way, board.faults, self.seed, self.latency_us) for way in ("up", "down")]
-            period = 1e6 * self.session.scenario.T * board.clock
-            self._cables.append(_Cable(self, board.emulator, lines[0], lines[1], period))
-            self.at(board.begin_us, self._cables[-1].tick)
+        for emulator, clock, faults, begin_us in ((self.emulator, self.clock, self.faults, 0.0), *self.further):
+            up, down = (Line(way, faults, self.seed, self.latency_us) for way in ("up", "down"))
+            self._cables.append(_Cable(self, emulator, up, down, 1e6 * self.session.scenario.T * clock))
+            self.at(begin_us, self._cables[-1].tick)
         device = _device_of(self._cables, self.session)
         self._driver = Driver(self.session, device, self.plan, lambda: round(self.now))
 

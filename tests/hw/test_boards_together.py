@@ -18,7 +18,7 @@ from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder, load, replay
-from haptic_loop.hw.rehearsal import Rehearsal, _Further
+from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import outcome, save
 from haptic_loop.sim.scenario import InputError
@@ -46,7 +46,7 @@ def rehearsal_of(scenario, alone, made, clock=1.0, faults=((), ()), begin_us=300
     parsed = [tuple(map(FaultInjection.parse, texts)) for texts in faults]
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=450, behind=BEHIND))
     first, second = (Emulator(*each) for each in zip(alone, parsed, infos, strict=True))
-    further = [_Further(second, clock, parsed[1], begin_us)]
+    further = [(second, clock, parsed[1], begin_us)]
     return Rehearsal(session, first, lambda ages: made, parsed[0], further=further, **options)
 
 
