@@ -159,7 +159,7 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Return a design, proved where a proof is found, and the decay after a knock (None without --decay).
+    """Return a design, proved where a proof is found, and the decay after an impulse (None without --decay).
 
     Raises InputError for contradictory options, DesignFailed if no coupling was found.
     """

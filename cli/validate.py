@@ -318,7 +318,7 @@ class _Report:
 
     @property
     def holds_words(self) -> str:
-        """Whether all tests hold, in words; without a certificate only disagreements or an own condition can fail."""
+        """Whether all tests hold, in words; without a certificate only disagreements or a user's condition can fail."""
         if not self.holds:
             return "[red]no[/]"
         return "[green]yes[/]" if self.certified else "nothing is certified that the tests could contradict"

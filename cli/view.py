@@ -175,7 +175,7 @@ def _parser() -> options.Parser:
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events SECONDS:EVENT (default of a video, unless --coupling, --case none or a world: '{_SCRIPT}')",
+        help=f"events SECONDS:EVENT (default of a video without --coupling, --case none and world: '{_SCRIPT}')",
     )
     until = "length (default: until the window is closed, or 3 s after a video's script; in a world the scenario's)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
