@@ -408,7 +408,7 @@ class EncoderSteps:
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, worlds or known devices: nothing is proved
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, a world or `beyond`: nothing is proved
     covered: bool
     words: str
 
