@@ -544,7 +544,7 @@ class Assessment:
         loop: The loop for which the conditions were evaluated.
         coupling: The coupling as it runs.
         requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition. With
-            delays that switch, this-environment has two: for the constant delays, and under "switching" for any.
+            delays that switch, that of this-environment is for constant delays, and "switching" is for any delays.
         environment: The environment that runs: a network, or a plugged-in function.
         ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
