@@ -124,6 +124,7 @@ def test_impedances_run_in_uneven_late_ticks():
     uneven = {"period": Periods(1e-3, 1.2e-3), "latency": ((1e-4, 5e-4), (0.0, 3e-4)), "duration": 0.3}
     simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), PUBLISHED["I"])
     exact = run(simulation, "exact")
+    # RK4 erred by 7e-7 when measured.
     for integrator, least in (("exponential", 1e-10), ("RK4", 1e-5)):
         assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
 

@@ -783,6 +783,7 @@ def test_a_change_begins_the_scene_anew(ball):
     assert np.abs(running.frame(0.3).pose).max() > 1e-4
     later = running.frame(0.301)
     assert later.prepared.scenario.theta == (2, 3)
+    # One tick after the beginning, devices and bodies have hardly moved [m].
     assert np.abs(later.pose).max() < 1e-4
     assert np.abs(later.q).max() < 1e-4
     running.keys.put(Couple("none"))
