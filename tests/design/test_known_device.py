@@ -666,12 +666,12 @@ def test_impossible_bounds_are_refused_in_one_line(fields, said):
 
 
 def test_the_sampled_conditions_slope_equals_differences():
-    """The slope in gains equals central differences. That in beta is itself taken from differences."""
+    """The slope in the gains equals central differences. That in beta is itself taken from differences."""
     sampled = KnownDeviceLoop(KNOWN)
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
-    steps = 1e-6 * np.eye(x.size)
+    steps = 1e-6 * np.eye(x.size)[:4]
     slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
-    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()
+    assert np.abs(sampled.room_slope(x)[:, :4] - slope).max() < 1e-5 * np.abs(slope).max()
 
 
 @pytest.mark.slow

@@ -341,13 +341,13 @@ def test_designs_that_take_minutes_are_refused_early():
 
 
 def test_one_start_comes_close_to_all_starts(monkeypatch):
-    """Above FEW channels the search has one start. The gains have five digits, and the objective is within 5 %."""
+    """Above FEW channels the search has one start. The gains have five digits, which change the objective by 4e-6."""
     usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)
     monkeypatch.setattr(gain_search, "FEW", 1)
     made = design(asked(CASES["I"]), "this-environment", limiter=True)
     assert made.requirement.certified
-    assert made.objective == pytest.approx(usual, rel=0.05)
+    assert made.objective == pytest.approx(usual, rel=1e-4)
     assert all(float(f"{gain:.5g}") == gain for gain in (*made.coupling.K, *made.coupling.B))
 
 

@@ -98,7 +98,7 @@ def test_the_least_factor_matches_a_convex_solver():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_gives_the_same_requirement(lo, hi):
-    """At 20000 frequencies the condition fails 0.1 % below the requirement and, if all delays vary, holds above it."""
+    """At 20000 frequencies the condition holds 1e-5 above the requirement, and fails 0.1 % below it."""
     G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     alpha, needed, response = np.array(found.multiplier), np.array(found.required), G.at(z)
@@ -106,8 +106,7 @@ def test_a_dense_sweep_gives_the_same_requirement(lo, hi):
     def least(share):
         return np.linalg.eigvalsh(condition(z, response, alpha, lo, hi, share * needed)).min()
 
-    if all(np.subtract(hi, lo)):
-        assert least(1 + 1e-5) > 0
+    assert least(1 + 1e-5) > 0
     assert least(1 - 1e-3) < 0
     assert found.bound == pytest.approx(found.ratio, rel=1e-5)
 

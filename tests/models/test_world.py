@@ -304,7 +304,7 @@ def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
     theirs = np.zeros((n, n))
     mujoco.mjd_transitionFD(model, data, 1e-7, True, theirs, None, None, None)
     unit = np.repeat([1.0, T], model.nv)  # our states are (q, h v)
-    assert np.abs(A - unit[:, None] * theirs / unit).max() < 1e-7  # 0.1 m rounded over steps of 1e-7 makes 1e-10
+    assert np.abs(A - unit[:, None] * theirs / unit).max() < 2e-9  # 0.1 m rounded over steps of 1e-7 makes 1e-10
     assert B.shape == (n, 2)
 
 
