@@ -121,7 +121,7 @@ class EntryInequality:
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """For pairs of functions t, u: both indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
+        """All pairs of functions t, u: two indices, [Re tu, Im tu, Re tu*] (n (n + 1)/2, 3 k), and Im tu* (.., k)."""
         first, second = _upper(self.functions.shape[1])
         t, u = self.functions.T[first], self.functions.T[second]
         along, against = t * u, t * np.conj(u)

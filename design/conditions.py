@@ -260,7 +260,7 @@ class Condition(ABC):
 
     @property
     def extensible(self) -> bool:
-        """Whether `LimitedForces` and the fast sweeps of design.environments.in_each apply to this condition."""
+        """Whether `LimitedForces` and the fast sweeps of `in_each` (design.environments) apply to this condition."""
         return False
 
     @abstractmethod

@@ -52,9 +52,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
-# A channel has V = 1/g with g = k + b (1 - 1/z). The block of `any_environment_demand` is multiplied by g and its
-# conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat g|^2, and the row of a multiplier is
-# 2 (1 - Theta-hat g). By a Schur complement the condition is affine in (k, b), without conservatism.
+# A channel has V = 1/g with g = k + b (1 - 1/z). The block of conditions.any_environment_demand is multiplied by g and
+# its conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat g|^2, and the row of a multiplier
+# is 2 (1 - Theta-hat g). By a Schur complement the condition is affine in (k, b), without conservatism.
 #
 # `lemma1` turns this condition into one matrix inequality, with the entries of a symmetric storage matrix as further
 # unknowns. If these are more than _MOST_STORED, the condition is imposed at sampled frequencies instead, and
