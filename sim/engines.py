@@ -176,7 +176,7 @@ class ExactTimedEngine(_Exact):
 # ----------------------------------------------------------------------------------------------------
 # MuJoCo's engines.
 
-EXPONENTIAL = "exponential"  # our own integrator, which reads MuJoCo's accelerations
+EXPONENTIAL = "exponential"  # this program's integrator, which reads MuJoCo's accelerations
 
 #: name -> integrator of MuJoCo's model; "exponential" never calls MuJoCo's integrator
 INTEGRATORS = {

@@ -47,7 +47,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 # The paper's numbers compared with those computed here.
 
 
-#: The transparency indices (25) [dB] that the paper prints. No reading of its Figure 4 that we tried reproduces them.
+#: The transparency indices (25) [dB] that the paper prints. No reading of its Figure 4 that was tried reproduces them.
 _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
