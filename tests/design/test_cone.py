@@ -47,6 +47,18 @@ def with_known_optimum(rng, p, shapes):
     return ConeProgram(cost, blocks), x
 
 
+def test_stacks_hold_every_matrix_of_a_problem():
+    rng = np.random.default_rng(5)
+    problem, x = with_known_optimum(rng, 7, [(3, 4, True), (4, 1, False), (2, 2, True), (2, 1, False)])
+    problem = ConeProgram(problem.cost, [*problem.blocks, problem.blocks[0]])
+    stacks = cone._stacked(problem)
+    assert len(stacks.blocks) == 4  # the sizes 4, 1, 2 and 14
+    values = [
+        np.sort(np.concatenate([np.linalg.eigvalsh(b.at(x)).ravel() for b in p.blocks])) for p in (problem, stacks)
+    ]
+    np.testing.assert_allclose(*values, rtol=0, atol=1e-13)  # rounding of sums of seven terms of size ten
+
+
 @pytest.mark.parametrize("settings", [SETTINGS, (INTERIOR,)], ids=["Clarabel", "interior"])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_known_optimum_is_found(seed, settings):
