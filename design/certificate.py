@@ -474,8 +474,8 @@ def required_damping(
 ) -> Requirement:
     """Return the requirement of a condition: the least multiple of all devices' damping, by a refined sweep.
 
-    With ranges, a condition on the environment returns the largest requirement of all members. The requirement of a
-    singular loop is infinite.
+    If `multiplier` is None, the condition chooses the multiplier. With ranges, a condition on the environment returns
+    the largest requirement of all members. The requirement of a singular loop is infinite.
     """
     requirement = named(condition).judge(loop, coupling, multiplier)
     if requirement.reason:

@@ -473,7 +473,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _by_force_map(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """Return required over available damping of this-environment from the states of the force map; inf if unstable."""
+    """Return required over available damping of this-environment from the force map; inf if unstable or singular."""
     try:
         F = loop.F(coupling)
         if thin == 1:

@@ -122,7 +122,7 @@ class ConeProgram:
     def solve(
         self, problem: str, accept: Callable[[Array], bool] | None = None, settings: Sequence[_Settings] | None = None
     ) -> Array:
-        """Return the optimal x (p,), verified. `problem` names the problem in error messages.
+        """Return the optimal x (p,), verified, also by `accept`. `problem` names the problem in error messages.
 
         Raises:
             Infeasible: Two settings report that there is no solution.
