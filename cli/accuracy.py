@@ -59,15 +59,19 @@ def main(argv: list[str]) -> int:
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
     defaults = ((EXPONENTIAL, 1), ("RK4", default))
-    right = all(row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults)
-    verdict = None if report.interrupted else _verdict(right, report.rows)
+    judged = [row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults]
+    right = all(judged)
+    which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
+    verdict = None if report.interrupted else _verdict(which, right, report.rows)
     render.publish(args, report, [table], lines, out, files, verdict)
     return options.exit_code(right, report.interrupted)
 
 
-def _verdict(right: bool, rows: Sequence[Row]) -> str:
+def _verdict(which: str, right: bool, rows: Sequence[Row]) -> str:
     """Say whether the default settings judge stability correctly, with the errors of the exponential integrator."""
-    words = "The defaults judge stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
+    if "judge" in which:
+        which = f"{which} stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
+    words = which
     for row in rows:
         if (row.integrator, row.substeps) == (EXPONENTIAL, 1):
             position = render.optional(row.position_relative_rms, "{:.1e}", "unknown")

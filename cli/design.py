@@ -200,7 +200,7 @@ def _that_decays(
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
         decay = ringing(assemble(scenario, design.coupling))
-        assert decay  # `ringing` returns None for worlds only, which `main` refuses.
+        assert decay  # `main` refuses worlds, and the spring of a coupling leaves no loop with free drifts only.
         return design, decay
 
     tried: list[Ringing] = []

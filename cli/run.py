@@ -48,6 +48,8 @@ def main(argv: list[str]) -> int:
 
         return world.run(args, scenario, out, painter)
     environment, simulated = _environment(args, scenario)
+    if args.paper:
+        _require_papers(args, simulated)
     chosen = chosen_by(args, scenario)  # the coupling with its proofs
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
@@ -132,6 +134,14 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and its figures.
 
 
+def _require_papers(args: argparse.Namespace, scenario: Scenario) -> None:
+    """Raise InputError if the loop is not one of the paper's."""
+    from haptic_loop.sim.report import is_papers
+
+    if not is_papers(scenario, args.case):
+        raise InputError("--paper: the paper prints figures of its own loop only; leave the loop as it is")
+
+
 def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:
     """Run the loop with the options' settings. Raises InputError for impossible settings."""
     from haptic_loop.sim.api import run_scenario
@@ -145,13 +155,10 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
-    """Return the paper's figures beside those of this run. Raises InputError for a loop that is not the paper's."""
+    """Return the paper's figures beside those of this run."""
     from haptic_loop.sim.report import beside_the_paper
 
-    rows = beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
-    if not rows:
-        raise InputError("--paper: the paper prints figures of its own loop only; leave the loop as it is")
-    return rows
+    return beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from haptic_loop.cli import options, render
 from haptic_loop.design.files import off_table, write_json
-from haptic_loop.sim.scenario import InputError, is_world, require_even_ticks
+from haptic_loop.sim.scenario import InputError, is_world, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.view.session import (
     COUPLINGS,
     GIVEN,
@@ -49,6 +49,8 @@ def main(argv: list[str]) -> int:
 
     scenario = options.scenario_from(args)
     require_even_ticks(scenario, "sim.view")
+    require_constant_delay(scenario, "sim.view")
+    require_linear(scenario, "sim.view", walls=True)
     if args.video:
         check_film(Path(args.video))
         if args.video.endswith(".gif") and 100 % args.fps:  # A GIF states times in hundredths of a second.

@@ -7,7 +7,7 @@ DESIGNS = [("spring-damper", "any-environment"), ("spring-damper", "this-environ
 
 
 def main() -> None:
-    print(f"{'coupling':28} {'needs N s/m':>12} {'worst dB':>9} {'rms dB':>7}  certified for")
+    print(f"{'coupling':31} {'needs N s/m':>12} {'worst dB':>9} {'rms dB':>7}  certified for")
     for kind, condition in DESIGNS:
         design = design_coupling(LOOP, kind, condition)
         figures = transparency_of(LOOP, design)
@@ -15,7 +15,7 @@ def main() -> None:
         worst, rms = figures.mismatch_db, figures.rms_mismatch_db
         guarantee = assess(LOOP, design).guarantee
         covered = guarantee.environments if guarantee else None
-        print(f"{kind + ', ' + condition:28} {needed:12.4f} {worst:9.2f} {rms:7.2f}  {covered}")
+        print(f"{kind + ', ' + condition:31} {needed:12.4f} {worst:9.2f} {rms:7.2f}  {covered}")
 
 
 if __name__ == "__main__":

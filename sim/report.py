@@ -61,10 +61,13 @@ class PaperRow:
     why: str
 
 
+def is_papers(scenario: Scenario, case: str) -> bool:
+    """Return whether the loop is one of the paper's."""
+    return not scenario.varying_delay and scenario.loop(case) == load().loop(case)
+
+
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Return a row for each number that the paper prints for this case; () for any loop but the paper's."""
-    if scenario.varying_delay or scenario.loop(case) != load().loop(case):
-        return ()
+    """Return a row for each number that the paper prints for this case of its loop (`is_papers`)."""
     figure = _figure(case, stability)
     return (figure,) if case == "none" else (*_printed_gains(scenario, case, coupling), _tau(case), figure)
 

@@ -229,13 +229,18 @@ _FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return the decay after an impulse over all sets of touching walls; None in a world, which has no eigenvalues."""
+    """Return the decay after an impulse over all sets of touching walls.
+
+    Return None in a world, which has no eigenvalues, and for a loop whose modes are all free drifts.
+    """
     if simulation.scenario.environment.world:
         return None
     loops = [close(simulation.plant, F) for F in simulation.process.law.frozen().values()]
     values = np.concatenate([np.linalg.eigvals(loop.A) for loop in loops]).astype(complex)
     modes = np.log(values[np.abs(values) > _FADED]) / simulation.plant.T
     modes = modes[np.abs(modes) > _CLEAR]  # A free drift neither rings nor decays.
+    if not modes.size:
+        return None
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
     if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # Both belong to one conjugate pair.

@@ -383,6 +383,14 @@ def test_cross_checks_say_whether_verdicts_agree():
 
 
 @pytest.mark.slow
+def test_the_papers_table_refuses_other_loops(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "haptic_loop.cli.run.chosen_by", lambda *_: pytest.fail("the loop was designed before the refusal")
+    )
+    with pytest.raises(InputError, match="of its own loop only"):
+        main(["--paper", "--theta", "3,3", "--out", str(tmp_path)])
+
+
 def test_the_papers_table_says_where_runs_differ(tmp_path):
     """Case I without its coupling oscillates, and Figure 6 does not."""
     _, report = run(tmp_path, "--coupling", "none", "--paper", "--no-plot", "--duration", "0.5")

@@ -206,6 +206,13 @@ def test_ringing_is_that_of_the_slowest_contact():
     assert said.least_damping_ratio == pytest.approx(-held.real / abs(held), rel=1e-9)
 
 
+def test_free_drifts_have_no_ringing():
+    """A free hand and device, and a free mass behind a spring of 0 N/m: all eigenvalues are 1, or 0 for the delay."""
+    free = KNOCK.replace("1.5", "0.0").replace("2.0, stiffness = 150.0", "0.0, stiffness = 0.0")
+    free += 'masses = { m = 1.0 }\nsprings = [{ between = ["a", "m"], stiffness = 0.0 }]'
+    assert ringing(assemble(parse(free), NoCoupling())) is None
+
+
 @pytest.mark.slow
 def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys, monkeypatch):
     path = tmp_path / "soft.json"

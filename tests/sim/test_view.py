@@ -30,7 +30,7 @@ from haptic_loop.models.human import Human, Link, Person, Voluntary
 from haptic_loop.models.scene import APART, build, plant
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.view import stage as drawing
 from haptic_loop.sim.view.drawn_object import object_of, scene_xml
@@ -493,6 +493,23 @@ def test_scene_files_show_the_object_beside_devices(name):
     assert drawn.geom_pos[drawn.geom_bodyid == 0][:, 0].max() < -0.09  # left of the motors
     assert np.array_equal(plant(drawn).A, plant(bare).A)
     assert np.array_equal(plant(drawn).B, plant(bare).B)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("mass = 0.3, damping", "mass = 0.3, damping", None),
+        ("motor_mass = 0.06", "motor_mass = 0.06\nfriction = 0.5", "device #1.friction is 0.5 N"),
+        ("psi = [0, 0]", "psi = [0, 0]\nvarying_delay = { lo = [1, 2], hi = [2, 3] }", "varying delays"),
+        ("psi = [0, 0]", "psi = [0, 0]\nperiod = { min = 1e-3, max = 2e-3 }", "period"),
+    ],
+)
+def test_the_window_refuses_what_it_cannot_simulate(tmp_path, old, new, message):
+    text = (SCENARIOS / "omega-pair.toml").read_text()
+    (tmp_path / "loop.toml").write_text(text.replace(old, new))
+    film = str(tmp_path / "film.txt")  # a suffix that no film has, so that nothing runs
+    with pytest.raises(InputError, match=message or "film.txt"):
+        command.main(["--scenario", str(tmp_path / "loop.toml"), "--video", film])
 
 
 def test_a_film_shows_how_the_mass_moves(none):
