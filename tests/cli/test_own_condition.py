@@ -31,6 +31,9 @@ def folder(tmp_path_factory):
     return place
 
 
+CLAIMED = "yours to show"  # words of Condition.claim
+
+
 def run(command: str, *words: str) -> int:
     return import_module(f"haptic_loop.cli.{command}").main([*words, "--condition", OWN])
 
@@ -45,7 +48,7 @@ def test_own_condition_designs_are_proved_and_tight(folder):
     # the devices' joint damping is a full matrix with the eigenvalues 1.37 - .2 and 1.37 + .2
     here = max(report["assessment"]["requirements"]["this-environment"]["required_damping"])
     assert 1.37 * here / 1.57 < max(needs["required_damping"]) < 1.37 * here / 1.17
-    assert "yours to show" in report["claim"]
+    assert CLAIMED in report["claim"]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +79,7 @@ def test_every_command_judges_by_the_own_condition(command, words, folder, monke
         return
     assert f'"{NAME}"' in text
     assert NAME in shown
-    assert "yours to show" in text
+    assert CLAIMED in text
     if "joined.json" in words and command != "check":
         assert "does not hold" not in text
 
@@ -179,7 +182,7 @@ def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder,
     assert import_module(f"haptic_loop.cli.{command}").main([*asked, *words, *JSON]) == code
     text = Path("report.json").read_text()
     assert "fails the condition never: needs 2." in text
-    assert "yours to show" not in text
+    assert CLAIMED not in text
 
 
 def test_only_the_given_condition_arms_a_device(folder, monkeypatch):
@@ -193,6 +196,6 @@ def test_only_the_given_condition_arms_a_device(folder, monkeypatch):
 def test_an_exported_block_says_what_is_proved(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert run("export", "joined.json", "--out", "joined.c", *JSON) == 0
-    assert "yours to show" in capsys.readouterr().out
-    assert "yours to show" in Path("joined.c").read_text().replace("\n *     ", " ")
-    assert "yours to show" in json.loads(Path("report.json").read_text())["claim"]
+    assert CLAIMED in capsys.readouterr().out
+    assert CLAIMED in Path("joined.c").read_text().replace("\n *     ", " ")
+    assert CLAIMED in json.loads(Path("report.json").read_text())["claim"]

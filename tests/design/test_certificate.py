@@ -66,7 +66,7 @@ def test_loops_with_psi_are_proved_with_phi(psi):
 
 def test_loops_too_large_to_prove_are_refused():
     loop = change(DEFAULT, theta=(400, 400), delta=(600.0, 600.0))
-    with pytest.raises(NotProved, match="over 806 states takes long: up to 800 are tried"):
+    with pytest.raises(NotProved, match=r"806 states.* 800 "):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "this-environment")
 
 
@@ -371,7 +371,7 @@ def test_a_sweep_above_the_damping_refuses_proofs(monkeypatch):
 @pytest.mark.parametrize(
     ("loop", "coupling", "said"),
     [
-        (change(DEFAULT, theta=(400, 400), psi=(1, 0)), STIFF, "over 801 states takes long: up to 800 are tried"),
+        (change(DEFAULT, theta=(400, 400), psi=(1, 0)), STIFF, "801 states.* 800 "),
         (DEFAULT, SpringDamper((7806.0, 3137.0), (1e-300, 1.0)), "1e-300 has too many digits for exact arithmetic"),
     ],
 )

@@ -1,6 +1,7 @@
 """Tests for coupling files that prove any switching of the delays: stored, verified, tampered with, used elsewhere."""
 
 import json
+import re
 from itertools import product
 
 import msgspec
@@ -30,7 +31,7 @@ from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.exact import Matrix
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import hermitian
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import NotProved, switching_guarantee
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.run import assemble
@@ -38,6 +39,7 @@ from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.switching import switched_crowd
 
 RANGE = DelayRange((1, 1), (2, 2))
+WITHIN = switching_guarantee(RANGE)
 LOOP = PAIR.switching(RANGE)
 change = msgspec.structs.replace
 
@@ -111,7 +113,7 @@ def test_constant_delays_in_range_need_no_more(coupling):
 
 def test_unsafe_switching_is_not_certified():
     assert prove(PAIR, STIFF, "this-environment").facts == ()
-    with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
+    with pytest.raises(NotProved, match=rf"^{re.escape(WITHIN)}: needs 2\.04"):
         prove(LOOP, STIFF, "this-environment")
 
 
@@ -147,7 +149,7 @@ def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
 
 def test_repaired_digests_do_not_forge_a_proof(stored):
     P, alpha = stored.certificate.matrices["P"], stored.certificate.multipliers["alpha"]
-    begins = "delays switching within [1, 2] samples: "
+    begins = f"{WITHIN}: "
     assert forged(stored, required=(1.0, 1.0)).startswith(f"{begins}required is [1.0, 1.0], the sweep finds [1.07")
     assert forged(stored, margin=2.0).startswith(f"{begins}margin is 2, the sweep finds 1.27")
     assert forged(stored, multipliers={"alpha": (0.0, alpha[1])}).startswith(f"{begins}alpha is [0.0")
@@ -156,8 +158,8 @@ def test_repaired_digests_do_not_forge_a_proof(stored):
     assert "not a rational number" in forged(stored, matrices={"P": (("1/0", *P[0][1:]), *P[1:])})
     negated = tuple(tuple(f"-{v}".replace("--", "") for v in row) for row in P)
     assert forged(stored, matrices={"P": negated}).startswith(begins)
-    other = forged(stored, LOOP.switching(DelayRange((1, 1), (2, 3))))
-    assert other.startswith("delays switching within [1, 2], [1, 3] samples: required is")
+    other = DelayRange((1, 1), (2, 3))
+    assert forged(stored, LOOP.switching(other)).startswith(f"{switching_guarantee(other)}: required is")
     narrow = forged(stored, LOOP.switching(DelayRange((1, 2), (2, 2))))
     assert "positive number where the delay varies and 0 elsewhere" in narrow
 
@@ -273,14 +275,14 @@ def told(capsys, main, *options) -> tuple[int, dict]:
 def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys):
     code, report = told(capsys, check_main, file)
     assert (code, report["proved"]) == (0, True)
-    assert report["switching"]["guarantee"] == "delays switching within [1, 2] samples, in this environment"
+    assert report["switching"]["guarantee"] == f"{WITHIN}, in this environment"
     assert report["switching"]["proof"] == "rational"
     broken = sealed(change(stored.certificate, required=(1.0, 1.0)))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
     code, report = told(capsys, check_main, str(tmp_path / "broken.json"))
     assert (code, report["proved"]) == (1, False)
     assert report["switching"]["guarantee"] is report["switching"]["proof"] is report["proof"] is None
-    assert report["reason"].startswith("delays switching within [1, 2] samples: required is")
+    assert report["reason"].startswith(f"{WITHIN}: required is")
 
 
 @pytest.fixture
@@ -297,7 +299,7 @@ def run(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_run_says_what_the_file_covers(run, file):
-    remark = "the file proves delays switching within [1, 2] samples, which covers "
+    remark = f"the file proves {WITHIN}, which covers "
     assert not any("file" in line for line in run(file)["remarks"])
     outcome = run(file, "--theta", "2,1")
     assert remark + "the constant theta = [2, 1]" in outcome["remarks"]
@@ -307,23 +309,23 @@ def test_a_run_says_what_the_file_covers(run, file):
     assert outcome["varying_delay"]["covered"]
     same = run(file, "--varying-delay", "1,2")["varying_delay"]
     assert same["covered"]
-    assert "proved in the coupling's file for delays switching within [1, 2] samples" in same["covers"]
+    assert f"proved in the coupling's file for {WITHIN}" in same["covers"]
     narrow = run(file, "--varying-delay", "1-2,2-2")
-    assert remark + "delays switching within [1, 2], [2, 2] samples" in narrow["remarks"]
+    assert remark + switching_guarantee(DelayRange((1, 2), (2, 2))) in narrow["remarks"]
     assert narrow["varying_delay"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
 
 
 @pytest.mark.slow
 def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     wide = run(file, "--varying-delay", "0,3")
-    line = "the file covers only delays switching within [1, 2] samples, so delays switching within [0, 3] samples are"
+    line = f"the file covers only {WITHIN}, so {switching_guarantee(DelayRange((0, 0), (3, 3)))} are"
     assert any(remark.startswith(line) for remark in wide["remarks"])
     assert wide["varying_delay"]["on_file"] is None
     other = run(file, "--varying-delay", "1,2", "--delta", "1.5")
     assert any("another loop (different delta)" in remark for remark in other["remarks"])
     assert "proved exactly" in other["varying_delay"]["covers"]
     plain = run(constant_file, "--varying-delay", "1,2")
-    line = "the file covers only constant delays, so delays switching within [1, 2] samples are judged anew here"
+    line = f"the file covers only constant delays, so {WITHIN} are judged anew here"
     assert line in plain["remarks"]
     assert not plain["varying_delay"]["covered"]
     # A playout buffer makes the delay (2, 2), for which these gains need 1.70 N s/m, more than the available 1.37.
@@ -336,7 +338,7 @@ def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
     broken = sealed(change(stored.certificate, margin=9.0))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
     outcome = run(str(tmp_path / "broken.json"), "--varying-delay", "1,2")
-    assert any("does not hold: delays switching within" in remark for remark in outcome["remarks"])
+    assert any(f": {WITHIN}: margin is 9" in remark for remark in outcome["remarks"])
     assert outcome["varying_delay"]["on_file"] is None
     assert outcome["varying_delay"]["covered"]  # The run finds its own proof.
     assert "proved exactly" in outcome["varying_delay"]["covers"]
@@ -364,7 +366,7 @@ def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch)
     assert outcome["switching"]["proof"] == "sampled"
     assert outcome["stored"]["proof"] == "rational"
     assert outcome["stored"]["switching"]["proof"] is None
-    assert "states takes long" in outcome["stored"]["switching"]["reason"]
+    assert "states" in outcome["stored"]["switching"]["reason"]
     assert load(out).loop == PAIR
     assert verify(load(out)).proved
 
@@ -438,7 +440,7 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     (second,) = certified_couplings(later, "I", str(tmp_path / "one.json"), None, 2, spare=0)
     assert second.scenario.theta == (2, 2)
     assert second.remarks() == [
-        "the file proves delays switching within [1, 2] samples, which covers the constant theta = [2, 2]",
+        f"the file proves {WITHIN}, which covers the constant theta = [2, 2]",
         "no certificate covers a force that the device holds because an answer is late",
     ]
     longer = change(LOOP, theta=(2, 2), varying_delay=DelayRange((2, 2), (3, 3)))

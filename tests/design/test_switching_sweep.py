@@ -168,7 +168,7 @@ def test_uncertified_switching_has_no_exact_proof():
     found = judged(loop, STIFF, SWITCHING)
     assert not found.certified
     assert found.proof == "sampled"
-    with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.041"):
+    with pytest.raises(NotProved, match=r"needs 2\.041"):
         prove(loop, STIFF, "this-environment")
 
     def storage(loop: Loop):
