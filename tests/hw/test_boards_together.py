@@ -81,7 +81,7 @@ def test_two_clocks_keep_the_energy_account(scenario, alone, made, tmp_path):
     session, rows = rehearsal.session, []
     session.record = lambda row: (rows.append(row), recorder(row))
     recorder = Recorder(2)
-    ticks = [watched(rehearsal.emulator), watched(rehearsal.further[0].emulator)]
+    ticks = [watched(rehearsal.emulator), watched(rehearsal.further[0][0])]
     rehearsal.run_until_armed(1.2)
     assert session.stage == Stage.ARMED
     assert (made[0].scenario.theta, made[0].link, made[0].scenario.T_max) == ((1, 2), 1, 1.2e-3 * (1 + CLOCK_TOLERANCE))
@@ -118,7 +118,7 @@ def test_a_fault_of_one_board_stops_both(scenario, alone, made, board, fault):
     rehearsal.run_until_armed(0.7)
     assert rehearsal.session.stage in ENDED - {Stage.FINISHED}
     assert max(rehearsal.zero_after(0.6), 0) < 0.05
-    for emulator in (rehearsal.emulator, rehearsal.further[0].emulator):
+    for emulator in (rehearsal.emulator, rehearsal.further[0][0]):
         assert not emulator.applied.any()
 
 
@@ -145,7 +145,7 @@ def test_a_faster_clock_stops_forces(scenario, alone, made, monkeypatch):
     rehearsal.run_until_armed(1.5)
     assert rehearsal.session.cause.startswith("board 2: its clock is faster than that of the board that leads")
     assert rehearsal.session.counters.late == 0
-    assert not any(emulator.applied.any() for emulator in (rehearsal.emulator, rehearsal.further[0].emulator))
+    assert not any(emulator.applied.any() for emulator in (rehearsal.emulator, rehearsal.further[0][0]))
 
 
 def test_each_link_is_timed_by_itself(scenario, alone, made):
@@ -224,7 +224,7 @@ def test_the_command_runs_over_two_serial_ports(scenario, alone, made, monkeypat
     assert report["assessment"]["guarantee"]
     for path in ports:
         assert re.search(f"{path}: answers are (129|130) us old", told.err)
-    assert rehearsal.emulator.device.run == rehearsal.further[0].emulator.device.run > 0
+    assert rehearsal.emulator.device.run == rehearsal.further[0][0].device.run > 0
 
 
 @pytest.mark.parametrize(
