@@ -16,7 +16,6 @@ import json
 import os
 import re
 import resource
-import shlex
 import shutil
 import signal
 import sys
@@ -24,7 +23,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
@@ -32,62 +31,13 @@ from pathlib import Path
 import hostile_files
 import hostile_words
 import numpy as np
-from hostile_cases import BUT, SHORT, Case, furnish, npz, pairs, put
+from hostile_cases import BUT, LEAST, SHORT, Case, furnish, put, streams
 from matplotlib.figure import Figure
 
-from haptic_loop.cli import options
 from haptic_loop.cli.execute import execute
 from haptic_loop.sim import plots
 
 SECONDS = 20  # CPU seconds that a case may take
-RIGID = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))
-STREAMS = {"in": (0,), "out": (1,), "err": (2,), "all": (0, 1, 2)}
-LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the quickest commands
-
-
-def streams() -> Iterator[Case]:
-    """Yield cases with closed, full or ASCII standard streams, with little memory, and with a wrong backend."""
-
-    def closed(*numbers: int) -> Callable[[], None]:
-        def change() -> None:
-            for number in numbers:
-                os.close(number)
-                setattr(sys, ("stdin", "stdout", "stderr")[number], None)
-
-        return change
-
-    def ascii_only() -> None:
-        sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", closefd=False), encoding="ascii", write_through=True)
-
-    def full() -> None:
-        os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
-
-    def little() -> None:
-        now = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        resource.setrlimit(resource.RLIMIT_AS, (now + 100_000_000,) * 2)
-
-    kinds = [
-        *((f": std{name} closed", (), (0, 1), "", closed(*numbers)) for name, numbers in STREAMS.items()),
-        (" --json -: stdout closed", ("--json", "-"), (0, 1), "", closed(1)),
-        (": ASCII", (), (0, 1), "", ascii_only),
-        (": full", (), (BUT,), "No space left", full),
-        (" --json -: full", ("--json", "-"), (BUT,), "No space left", full),
-    ]
-    for words, (name, more, codes, says, before) in pairs(LEAST, kinds):
-        yield Case(words[0] + name, (*words, *more), codes, says, before)
-    yield Case("bad input, stderr closed", ("audit", "--scenario", "n\udcff"), before=closed(2))
-    huge = lambda: (npz("t.npz", x=np.zeros((10_000_000, 1)), t=np.zeros(3)), little())  # noqa: E731
-    yield Case("trace: little memory", ("trace", "t.npz"), (3,), "memory", before=huge)
-
-    def backend() -> None:
-        os.environ["MPLBACKEND"] = "nonsense"
-        script = f"import sys; sys.path.insert(0, {str(Path(options.__file__).parents[1])!r}); "
-        script += "from haptic_loop.cli.main import door; door('trace')"
-        os.execv(sys.executable, [sys.executable, "-c", script, "t.npz", "--plot", "a.png"])
-
-    yield Case("MPLBACKEND=nonsense", ("trace",), (0,), before=backend)
-
-
 #: characters that control a terminal
 STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")
 TOGETHER = 100  # cases per process: starting a process costs more than most cases

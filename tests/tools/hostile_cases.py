@@ -1,9 +1,12 @@
-"""For hostile.py: the class of a case of bad input, the good files in its folder, and functions that spoil them."""
+"""For hostile.py: the class of a case, the good files in its folder, functions that spoil them, and bad streams."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import resource
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -12,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from haptic_loop.cli import options
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save
@@ -113,3 +117,51 @@ def put(name: str, content: str | bytes) -> int:
 
 def written(name: str, content: str | bytes) -> Callable[[], int]:
     return lambda: put(name, content)
+
+
+RIGID = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))
+STREAMS = {"in": (0,), "out": (1,), "err": (2,), "all": (0, 1, 2)}
+LEAST = [RIGID, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]  # the quickest commands
+
+
+def streams() -> Iterator[Case]:
+    """Yield cases with closed, full or ASCII standard streams, with little memory, and with a wrong backend."""
+
+    def closed(*numbers: int) -> Callable[[], None]:
+        def change() -> None:
+            for number in numbers:
+                os.close(number)
+                setattr(sys, ("stdin", "stdout", "stderr")[number], None)
+
+        return change
+
+    def ascii_only() -> None:
+        sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", closefd=False), encoding="ascii", write_through=True)
+
+    def full() -> None:
+        os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+
+    def little() -> None:
+        now = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        resource.setrlimit(resource.RLIMIT_AS, (now + 100_000_000,) * 2)
+
+    kinds = [
+        *((f": std{name} closed", (), (0, 1), "", closed(*numbers)) for name, numbers in STREAMS.items()),
+        (" --json -: stdout closed", ("--json", "-"), (0, 1), "", closed(1)),
+        (": ASCII", (), (0, 1), "", ascii_only),
+        (": full", (), (BUT,), "No space left", full),
+        (" --json -: full", ("--json", "-"), (BUT,), "No space left", full),
+    ]
+    for words, (name, more, codes, says, before) in pairs(LEAST, kinds):
+        yield Case(words[0] + name, (*words, *more), codes, says, before)
+    yield Case("bad input, stderr closed", ("audit", "--scenario", "n\udcff"), before=closed(2))
+    huge = lambda: (npz("t.npz", x=np.zeros((10_000_000, 1)), t=np.zeros(3)), little())  # noqa: E731
+    yield Case("trace: little memory", ("trace", "t.npz"), (3,), "memory", before=huge)
+
+    def backend() -> None:
+        os.environ["MPLBACKEND"] = "nonsense"
+        script = f"import sys; sys.path.insert(0, {str(Path(options.__file__).parents[1])!r}); "
+        script += "from haptic_loop.cli.main import door; door('trace')"
+        os.execv(sys.executable, [sys.executable, "-c", script, "t.npz", "--plot", "a.png"])
+
+    yield Case("MPLBACKEND=nonsense", ("trace",), (0,), before=backend)
