@@ -176,7 +176,7 @@ def _least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
     If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
-    If gain is 0, the result is inf.
+    If gain is 0, the result is 0 or inf.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if gain.shape[-1] == 2 and (own > 0).all():
@@ -224,7 +224,10 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there or I is empty."""
+    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there.
+
+    If I is empty, s is 0 or inf.
+    """
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size
@@ -232,8 +235,7 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     left = rest - np.conj(np.swapaxes(cross, 1, 2)) @ np.linalg.solve(
         np.where(positive[:, None, None], null, np.eye(r)), cross
     )
-    if r < H.shape[-1]:
-        needed[positive] = largest_eigenvalue(-left)[positive]
+    needed[positive] = largest_eigenvalue(-left)[positive] if r < H.shape[-1] else 0.0
     return needed
 
 

@@ -677,7 +677,7 @@ def _of_least_trace_at_frequencies(regular: Lti, most: Array) -> Array:
         shortage, worst = supremum(short, grid)
         if shortage <= _ROOM:
             return np.maximum(phi, 0.0) + max(shortage, 0.0)
-        w = np.append(peaks(short, grid, -np.inf, near=_NEAR)[:_MOST_PEAKS], worst)
+        w = np.append(peaks(short, grid, -np.inf, near=_NEAR)[-_MOST_PEAKS:], worst)
     raise DesignFailed(None, (), f"{_PROBLEM} was not found within {budgets.MULTIPLIER_ROUNDS} rounds")
 
 

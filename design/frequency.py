@@ -248,7 +248,7 @@ _GAIN = 1e-13  # relative gain of a peak that a search neglects
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
     """Return frequencies (peaks,) of local maxima of `response` above `above`, 32 at most, refined between grid points.
 
-    Maxima that are lower than the highest by more than the share `near` are left out.
+    Maxima that are lower than the highest by more than the share `near` are left out. The last ones stand out most.
     """
     spend(_POINT * grid.size)
     values = response(grid)

@@ -258,3 +258,9 @@ def test_a_map_that_cancels_needs_no_damping():
 
 def test_an_indefinite_gain_is_never_enough():
     assert _least_multiple(np.eye(2)[None], np.diag([-1.0, 1.0])[None]) == np.inf
+
+
+def test_blocks_without_damping_need_none_or_fail():
+    """With gain 0 no multiple changes the block, so 0 suffices for a positive block, and no s for another."""
+    for free, least in ((np.eye(2), 0.0), (np.diag([1.0, -1.0]), np.inf)):
+        assert _least_multiple(free[None] + 0j, np.zeros((1, 2, 2)) + 0j) == least
