@@ -238,15 +238,16 @@ def _stacked(problem: ConeProgram) -> ConeProgram:
     """
     stacks: dict[tuple[int, tuple[int, ...]], list[Inequality]] = {}
     for block in problem.blocks:
-        unknowns, slopes = tuple(block.unknowns), block.slopes
+        unknowns, by = tuple(block.unknowns), block.slopes
         if (n := block.constant.shape[-1]) == 1:
-            unknowns, slopes = tuple(range(len(problem.cost))), np.zeros((len(problem.cost), *block.constant.shape))
-            slopes[list(block.unknowns)] = block.slopes
-        stacks.setdefault((n, unknowns), []).append(Inequality(block.constant, slopes, unknowns))
-    blocks = [
-        Inequality(np.concatenate([b.constant for b in alike]), np.concatenate([b.slopes for b in alike], 1), unknowns)
-        for (_, unknowns), alike in stacks.items()
-    ]
+            unknowns, by = tuple(range(len(problem.cost))), np.zeros((len(problem.cost), *block.constant.shape))
+            by[list(block.unknowns)] = block.slopes
+        stacks.setdefault((n, unknowns), []).append(Inequality(block.constant, by, unknowns))
+    blocks = list[Inequality]()
+    for (_, unknowns), alike in stacks.items():
+        constant: Any = np.concatenate([block.constant for block in alike])
+        slopes: Any = np.concatenate([block.slopes for block in alike], axis=1)
+        blocks.append(Inequality(constant, slopes, unknowns))
     return ConeProgram(problem.cost, blocks)
 
 
