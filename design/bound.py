@@ -38,7 +38,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.controller.passivity import sizes_around
 from haptic_loop.design import budgets
-from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
+from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, solve_triangular, towards
 from haptic_loop.design.conditions import even_level
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.files import off_table
@@ -126,16 +126,12 @@ class _Dual:
 
     @classmethod
     def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
-        import scipy
-
         E = loop.E()
         low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)
         span, end = np.log(high / low), min(high, 0.999 * np.pi)  # H is zero above `end`.
         knots = _knots(E, low, end, count)
         grid = np.union1d(knots, frequencies(E, low=low, high=end, points=_GRID))
-        x = np.log(knots)
-        spline = np.concatenate([[x[0]] * _DEGREE, x, [x[-1]] * _DEGREE])
-        hats = scipy.interpolate.BSpline.design_matrix(np.clip(np.log(grid), x[0], x[-1]), spline, _DEGREE).toarray()
+        hats = _splines(np.log(grid), np.log(knots), _DEGREE)
         unit = np.pi / (span * grid * np.linalg.norm(E.at(on_circle(grid)), axis=(1, 2)))
         heights = unit[:, None] * hats[:, 1:-1]  # h is zero at both ends of the band, where H_+ would be unbounded.
 
@@ -147,7 +143,7 @@ class _Dual:
         target = np.sqrt(weight)[:, None] * target.reshape(w.size, -1)
         Q, R = np.linalg.qr((np.sqrt(weight) * span * w * size / np.pi)[:, None] * H)
         target = -np.vstack([Q.T @ target.real, Q.T @ target.imag])
-        heights = scipy.linalg.solve_triangular(R, heights.T, trans=1).T
+        heights = solve_triangular(R, heights.T, transposed=True).T
         forbidden, exact = _forbidden(loop, E)
         return cls(loop, grid, heights, target, knots, forbidden, exact, (low, high))
 
@@ -330,6 +326,21 @@ class _Dual:
             imposed = np.union1d(imposed, missing)
             x, t = path[-2], t / _STEEPER
         return sampled, remains
+
+
+def _splines(x: Array, knots: Array, degree: int) -> Array:
+    """Return the B-splines over the knots at x, (k, knots + degree - 1), by the recursion of Cox and de Boor.
+
+    scipy.interpolate has this function, too, but its import takes a third of a second.
+    """
+    place = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2) + degree
+    t = np.concatenate([[knots[0]] * degree, knots, [knots[-1]] * degree])
+    x, splines = np.clip(x, knots[0], knots[-1])[:, None], np.eye(t.size - 1)[place]
+    for d in range(1, degree + 1):
+        width = t[d:] - t[:-d]
+        rise = (x - t[:-d]) / np.where(width > 0, width, 1.0)
+        splines = splines[:, :-1] * rise[:, :-1] + splines[:, 1:] * (1 - rise[:, 1:])
+    return splines
 
 
 def _gauss(grid: Array) -> tuple[Array, Array, Array]:

@@ -23,7 +23,10 @@ norm of the errors above and of rounding.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
 
 import numpy as np
 
@@ -169,13 +172,21 @@ class DualMatrix:
         return [slice(start, start + step) for start in range(0, count, step)]
 
 
+@cache
+def _clausen() -> list[float]:
+    """Return 2 zeta(n)/((2 pi)^n n (n + 1)) = |B_n|/(n! n (n + 1)) for n = 46, 44, .., 2 and Bernoulli's B."""
+    B = [Fraction(1)]
+    for n in range(1, 47):
+        B.append(-sum((math.comb(n + 1, k) * B[k] for k in range(n)), Fraction(0)) / (n + 1))
+    return [float(abs(B[n]) / (math.factorial(n) * n * (n + 1))) for n in range(46, 0, -2)]
+
+
 def dilogarithm(x: Array) -> Complex:
     """Return Li2(e^jx) for |x| <= 2 pi."""
-    import scipy
-
     short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)
     square, series = short**2, np.zeros_like(short)
-    for n in range(46, 0, -2):
-        series = (series + 2 * scipy.special.zeta(n) / ((2 * np.pi) ** n * n * (n + 1))) * square
+    for coefficient in _clausen():
+        series += coefficient
+        series *= square
     clausen = short * (1 + series - np.log(np.where(short == 0, 1.0, np.abs(short))))
     return np.pi**2 / 6 - np.abs(short) * (2 * np.pi - np.abs(short)) / 4 + 1j * clausen

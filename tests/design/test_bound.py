@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-import scipy.integrate
+import scipy
 
 import haptic_loop
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -18,7 +18,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design import bound as module
 from haptic_loop.design.bound import BoundBeside, bound
 from haptic_loop.design.certificate import required_damping
-from haptic_loop.design.dual_matrix import DualMatrix
+from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.sim.scenario import load
 
@@ -228,3 +228,14 @@ def test_no_bound_exceeds_a_late_loops_mismatch():
     loop = Loop(1e-3, (0,), (0,), (0,), (1.0,), damper, latency=((5e-4, 5e-4),))
     assert required_damping(loop, NoCoupling(), "this-environment").certified
     assert bound(loop, (1.0, 500.0), knots=8).rms == 0
+
+
+def test_splines_and_dilogarithm_equal_those_of_scipy():
+    """The bounds are 1e-14 for sums of products below 1, and the dilogarithm's error of 300 roundings."""
+    knots, x = np.array([0.0, 0.3, 1.0, 1.1, 2.0]), np.linspace(0, 2, 41)
+    every = np.concatenate([[0.0] * 3, knots, [2.0] * 3])
+    expected = scipy.interpolate.BSpline.design_matrix(x, every, 3).toarray()
+    np.testing.assert_allclose(module._splines(x, knots, 3), expected, rtol=0, atol=1e-14)
+    angles = np.linspace(-2 * np.pi, 2 * np.pi, 81)
+    expected = scipy.special.spence(1 - np.exp(1j * angles))
+    np.testing.assert_allclose(dilogarithm(angles), expected, rtol=0, atol=300 * 2.0**-53)
