@@ -285,13 +285,11 @@ def _tables(result: Audit) -> list[render.Table]:
 
 
 def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
-    """Return a sentence on the stiffest wall that is certified with the coupling's damper."""
+    """Return a sentence on the stiffest wall that is certified with the coupling's damper, or why none is named."""
     condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
     margin = result.margins[condition].stiffest
     if None in margin.K:
-        if result.constant[condition].certified:  # The audited K is certified itself.
-            return f"The stiffest wall with {damper} was not found: {margin.reason}."
-        return f"No wall with {damper} was found to be certified: {margin.reason}."
+        return f"No stiffest wall with {damper} is given: {margin.reason}."
     return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."
 
 

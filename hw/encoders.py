@@ -31,7 +31,9 @@ _DEGREE = 5  # degree of the polynomials that remove a hand's own motion; they l
 _FIT = 0.8  # least share of power in the expected shape: loosely moved handles 0.93, held compliant devices at most 0.5
 _LATE = 0.75  # [ticks] largest hidden delay: amplifiers have a short delay, but no certificate covers a whole tick
 _CROSS = 0.25  # largest motion of another axis, as a share of the expected motion; a common table transmits less
-_ALIVE = 0.06  # least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09, dead motors 0.03
+#: least share of the expected swing: firm hands (0.5 kg, 20 N s/m, 1500 N/m) leave 0.09 with a rigid device of
+#: 40 g, 0.22 with those of omega-pair and 0.38 with a rigid device of 0.25 kg; dead motors leave 0.03
+_ALIVE = 0.06
 _UNEVEN = 0.2  # largest difference of the two directions of motor or encoder, as a share of their sum: a factor of 1.5
 _ZONE = 0.8  # least ratio of a motion's relative size to that under twice the force; 1 without a dead zone
 _CLEAN, _RUBBED = 0.15, 0.25  # for _ZONE: largest one-sided share, largest friction as a share of the force

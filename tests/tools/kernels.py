@@ -117,10 +117,16 @@ def tested(name: str, variables: dict[str, str], workers: int, quick: bool) -> t
         sep="\n",
         flush=True,
     )
-    counts = [
-        sum(int(n) for n in re.findall(rf"(\d+) {word}", lines[-1])) for word in ("passed", "failed|error", "skipped")
+    passed, failed, skipped = counted(lines[-1])
+    return passed, failed or int(code != 0), skipped, time.monotonic() - began
+
+
+def counted(summary: str) -> list[int]:
+    """Return the numbers of passed, failed and skipped tests in pytest's last line; an error counts as failed."""
+    return [
+        sum(int(n) for n in re.findall(rf"(\d+) (?:{words})", summary))
+        for words in ("passed", "failed|error", "skipped")
     ]
-    return counts[0], counts[1] or int(code != 0), counts[2], time.monotonic() - began
 
 
 def main() -> int:
