@@ -1,5 +1,6 @@
 """A second process draws the same picture, and this process draws if there is no second one."""
 
+import io
 import os
 import pickle
 import subprocess
@@ -85,17 +86,27 @@ def test_a_painter_without_picture_ends_its_process(monkeypatch):
     assert started[0].returncode < 0
 
 
-def test_a_begun_process_draws_for_the_next_painter(monkeypatch):
-    monkeypatch.delitem(sys.modules, "matplotlib")
+class Answers:
+    """A second process that answers every request with the same bytes."""
+
+    returncode = None
+
+    def __init__(self):
+        self.stdin = io.BytesIO()
+
+    def communicate(self):
+        self.returncode = 0
+        return b"its picture", None
+
+
+def test_a_begun_process_draws_for_the_next_painter(monkeypatch, tmp_path):
+    monkeypatch.setattr(painter_module, "_started", Answers)
     begin()
-    begun = painter_module._begun
     first, second = Painter(wanted=False), Painter(wanted=False)
-    assert begun
-    assert begun.poll() is None
-    assert first._process is begun
-    assert second._process is None
-    del first
-    assert begun.returncode < 0
+    for painter in (first, second):
+        painter.ask("draw_run", *SHOWN)
+    assert first.save(tmp_path / "a.png").read_bytes() == b"its picture"
+    assert second.save(tmp_path / "b.png").read_bytes() == plots.png(plots.draw_run(*SHOWN))
 
 
 LEFT = """

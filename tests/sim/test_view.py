@@ -72,6 +72,9 @@ from haptic_loop.sim.view.stage import (
     pictures_for,
     stage_for,
 )
+from haptic_loop.sim.world import START_J
+from tests.sim.test_world import TRAY, UP
+from tests.sim.test_world import scenario as world_scenario
 
 SCENARIO = load()
 
@@ -651,7 +654,10 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
 
 
 def test_flat_pictures_show_a_handles_displacement(none):
-    """The first device's handle, found by its colour, moves by its displacement in pixels."""
+    """The first device's handle, found by its colour, moves by its displacement in pixels.
+
+    520 pixels show 0.42 m: 0.09 m on each side of the handle and two arrows.
+    """
     painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)
 
@@ -661,8 +667,8 @@ def test_flat_pictures_show_a_handles_displacement(none):
         ]  # between the words and the plots
         return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
 
-    # 520 pixels show 0.42 m: 0.09 m on each side of the handle and two arrows; both ends of a motion are rounded.
-    assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
+    # Edges are rounded to pixels, both ends of a motion by whole pixels alike.
+    assert middle(60 * 0.42 / 520) - middle(0.0) == pytest.approx(60, abs=1e-9)
 
 
 def test_flat_pictures_show_the_force_that_is_felt(none):
@@ -784,15 +790,17 @@ def ball():
     return first_loop(Menu("I"), load("world-ball"), "moving-average")
 
 
-def test_live_worlds_feel_as_in_a_run(ball):
-    """The live loop delays forces itself, and sim.run delays them as packets; the forces are equal."""
-    running = LiveLoop(ball, Inline(), (), math.inf)
-    trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")
+def test_live_worlds_feel_as_in_a_run(tmp_path):
+    """The live loop delays forces itself, and sim.run delays them as packets; forces and energies are equal."""
+    tray = first_loop(Menu("I"), world_scenario(tmp_path, TRAY, more=UP, duration=0.5), "moving-average")
+    running = LiveLoop(tray, Inline(), (), math.inf)
+    trace = simulate(tray.scenario, tray.coupling, engine="exact")
     frame = running.frame(0.5)
     np.testing.assert_allclose(frame.history, trace.f, rtol=0, atol=1e-9)
     np.testing.assert_allclose(frame.q[:2], trace.x[-1], rtol=0, atol=1e-4)  # [m] the frame is a tick later
     assert frame.world.ticks == 500
     assert frame.world.given_J == pytest.approx(trace.meta["world"]["given_J"], abs=1e-12)
+    assert frame.world.given_J > START_J  # the tray sinks
 
 
 def test_a_change_begins_the_scene_anew(ball):
