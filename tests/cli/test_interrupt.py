@@ -224,20 +224,21 @@ def test_design_and_export_make_no_folder(command, tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.parametrize("asked", [pytest.param("osmesa", marks=pytest.mark.validate), "bogus"])
-def test_runs_without_pictures_need_no_mujoco_gl(asked, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "sim.run",
-        "--case",
-        "none",
-        "--duration",
-        "0.05",
-        "--no-plot",
-    ]
+@pytest.mark.parametrize(
+    ("command", "picture"),
+    [
+        ("sim.run --case none --duration 0.05 --no-plot --out out", None),
+        ("sim.run --case none --duration 0.05 --out out", "out/figure.png"),
+        ("sim.view --coupling none --duration 0.1 --video film.gif", "film.gif"),
+    ],
+)
+def test_commands_ignore_mujoco_gl(command, picture, asked, tmp_path):
+    """`import mujoco` alone fails with the backend "bogus", and with "osmesa" if that is not installed."""
     environment = ENVIRONMENT | {"MUJOCO_GL": asked}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    words = [sys.executable, "-m", *command.split()]
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, "GL" in done.stderr) == (0, False)
+    assert picture is None or (tmp_path / picture).stat().st_size
 
 
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nfor _ in range(1000): pass\nraise SystemExit(5)\n"

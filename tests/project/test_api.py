@@ -232,9 +232,8 @@ def test_the_reported_seed_draws_the_periods():
     ],
 )
 def test_bad_arguments_are_named(call, message):
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=message):
         call()
-    assert isinstance(caught.value, InputError | ValueError)
 
 
 LOOP = SHORT.loop("I")

@@ -27,15 +27,6 @@ SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
-#: designs that are named in sentences; commands of other modules need a port, a display or minutes
-IN_TEXT = sorted(
-    {
-        c
-        for text in TEXTS.values()
-        for c in regenerate.IN_SENTENCES.findall(text)
-        if "FILE" not in c and not SLOW.search(c)
-    }
-)
 
 
 def of_page(page, *values, name):
@@ -101,14 +92,6 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     assert shown.splitlines()
     assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
     assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not regenerate.same_line(a, b)] == []
-
-
-@pytest.mark.slow
-def test_designs_named_in_sentences_succeed(place):
-    """IN_TEXT may be empty, since no page needs to name a design in a sentence."""
-    for command in IN_TEXT:
-        done = run(command, place)
-        assert done.returncode == 0, f"{command}: {done.stderr}"
 
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])

@@ -105,6 +105,8 @@ def place(tmp_path_factory):
     (folder / "mine.py").write_text(MINE)
     (folder / "loud.py").write_text("print('something')\nfrom mine import gel\n")
     (folder / "ends.py").write_text("raise SystemExit(7)\n")
+    traced = "from pathlib import Path\nfrom mine import Gel, Hardening, gel\nPath('executed').touch()\n"
+    (folder / "traced.py").write_text(traced)
     return folder
 
 
@@ -152,16 +154,19 @@ def test_an_own_file_prints_to_standard_error(place):
 
 
 @pytest.mark.parametrize(
-    "line", ['type = "mine:Gel"', 'elements = [{ type = "mine:Hardening", between = ["left", "right"] }]']
+    "line", ['type = "traced:Gel"', 'elements = [{ type = "traced:Hardening", between = ["left", "right"] }]']
 )
 def test_scenario_files_cannot_name_classes(line, place):
+    """The named module would leave a file if its code were executed."""
     scenario = 'name = "own"\nT = 1e-3\ntheta = [1, 1]\ndevice = ["omega.3", "omega.3"]\n[environment]\n'
     (place / "code.toml").write_text(f'{scenario}contacts = ["left", "right"]\n{line}\n')
-    (place / "mine.pth").touch()
     done = run(f"{RUN} --scenario code.toml", place)
     assert done.returncode == 2
     assert "environment" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+    assert not (place / "executed").exists()
+    run(f"{RUN} --environment traced.py:nobody", place)
+    (place / "executed").unlink()  # the option executes the file
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from haptic_loop.sim.run import assemble, make_engine, outside_forces, run
 from haptic_loop.sim.stability import Balance, close, dominant_mode, stability_of, verdict_within
+from haptic_loop.sim.switching import switching
 from tests.asked import needs
 from tests.checks import uneven
 
@@ -38,15 +39,23 @@ DRAWN, LATE = Periods(0.6e-3, 1.5e-3), ((1e-4, 1.3e-4), (0.0, 5e-4))
 
 
 def by_hand(simulation, ticks):
-    """Return the plant states (ticks, states) of a run, with one matrix exponential from latch to latch."""
+    """Return the plant states (ticks, states) of a run, with one matrix exponential from latch to latch.
+
+    If delays vary, a tick uses the newest packet that has arrived, and zero before the first one.
+    """
     P, m, timing = plant(simulation.scene.model), simulation.process.channels, simulation.timing
-    n, w, F = len(P.A), P.B.shape[1] - m, simulation.F
-    s, z, held, states = np.zeros(n), np.zeros(F.order), np.zeros(m), []
+    delays = simulation.process.delays
+    n, w, F = len(P.A), P.B.shape[1] - m, simulation.F if delays is None else simulation.process.law.sent
+    s, z, held, states, sent = np.zeros(n), np.zeros(F.order), np.zeros(m), [], []
     pushed = run(simulation, "exact", ticks=ticks).w
     for k in range(ticks):
         states.append(s)
         x = P.C @ s
         force, z = F.C @ z + F.D @ x, F.A @ z + F.B @ x
+        if delays is not None:
+            sent.append(force)
+            arrived = [[j for j in range(k + 1) if j + delays[j, i, 0] <= k] for i in range(m)]
+            force = np.array([sent[js[-1]][i] if js else 0.0 for i, js in enumerate(arrived)])
         T, late = timing.period[k], np.zeros(m) if timing.late is None else timing.late[k]
         now = 0.0
         for until in sorted({*late.tolist(), T} - {0.0}):
@@ -119,7 +128,7 @@ def test_drawn_tick_times_are_in_range_and_seeded():
     one, same, other = (scenario.timing(seed, 4000) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.period, same.period)
     assert (one.period != other.period).any()
-    assert {0.6e-3, 1.5e-3} <= set(one.period.tolist())
+    assert (one.period.min(), one.period.max()) == (0.6e-3, 1.5e-3)
     assert one.late.min(axis=0).tolist() == [1e-4, 0.0]
     assert one.late.max(axis=0).tolist() == [1.3e-4, 5e-4]
     assert scenario.loop("I").T_max == 1.5e-3
@@ -219,8 +228,12 @@ def test_slow_creep_is_undecided():
 
 def test_periods_and_delays_may_vary_together():
     scenario = PAIR.replace(period=DRAWN, varying_delay=VaryingDelay((1, 2), (2, 3)), theta=(1, 2))
-    simulation = assemble(scenario, SOFT)
-    assert len(run(simulation, "exact").t) == scenario.samples
+    moved, _ = switching(assemble(scenario, SOFT, seed=3), 3, scenario.samples)
+    exact = run(moved, "exact").s
+    assert len(exact) == scenario.samples
+    assert {tuple(row) for row in moved.process.delays[:60, :, 0].tolist()} == {(1, 2), (1, 3), (2, 2), (2, 3)}
+    expected = by_hand(moved, 60)
+    assert abs(exact[:60, : expected.shape[1]] - expected).max() < 1e-12 * abs(exact).max()
 
 
 @pytest.mark.slow

@@ -98,14 +98,13 @@ class Touch:
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
     """Hands are thrown at each scene with delays of 0 and 2 samples, and the shell never acts."""
-    rng, acted, ticks = np.random.default_rng(3), 0, 0
+    rng = np.random.default_rng(3)
     for run in (0, 2):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
         touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
         for _ in range(350):
             assert touch.tick() <= START_J + touch.port.released + 1e-12
-        acted, ticks = acted + int(touch.shell.limited[0]), ticks + 350
-    assert acted <= (ticks // 1000 if lossless else 0)
+        assert not touch.shell.limited[0]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -137,9 +136,6 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
     assert trace.meta["scene"]["active"] == []
     assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
     np.testing.assert_array_equal(trace.f, again.f)
-    dx, delta = np.diff(trace.x, axis=0), np.array(loop.delta)
-    given = np.cumsum((-trace.f[:-1] * dx - delta / T * dx**2).sum(axis=1)).max()
-    assert world["given_J"] == pytest.approx(max(given, 0.0), abs=1e-12)
 
 
 def test_the_plate_lifts_the_cube():
@@ -210,6 +206,17 @@ TRAY = f"""<mujoco><worldbody><body name="left" pos="-0.05 0 0">{TIP}</body><bod
 UP = "along = [[0, 0, 1], [0, 0, 1]]"
 
 
+def test_a_run_sums_the_energy_given(tmp_path):
+    """A tray of 0.3 kg on two hands gives them energy as it sinks; the trace has its positions and forces."""
+    loop = scenario(tmp_path, TRAY, more=UP, duration=0.5)
+    trace = simulate(loop, certified(loop), engine="exact")
+    world, dx = trace.meta["world"], np.diff(trace.x, axis=0)
+    given = np.cumsum((-trace.f[:-1] * dx - np.array(loop.delta) / T * dx**2).sum(axis=1)).max()
+    assert given > START_J
+    assert world["given_J"] == pytest.approx(given, abs=1e-12)
+    assert given <= START_J + world["released_J"]
+
+
 def test_the_shell_credits_energy_that_gravity_releases(tmp_path):
     """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy, the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)
@@ -272,7 +279,7 @@ def test_contacts_that_give_energy_are_held_back(tmp_path, impedance, gives_J):
     {tips.format("left", -0.05)}{tips.format("right", 0.05)}</worldbody></mujoco>"""
     loop = scenario(tmp_path, text)
     (least, idle), (held, acted) = (thrown_at_walls(loop, start) for start in (1e3, START_J))
-    assert least <= -gives_J
+    assert least <= -gives_J if gives_J else least == 0.0
     assert held >= -START_J - 1e-12
     assert not idle
     assert (acted > 0) == (gives_J > 0)

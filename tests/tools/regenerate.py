@@ -40,8 +40,6 @@ SHOWN = re.compile(_BLOCK.format("output", "console"))
 MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
-#: a design that a sentence names
-IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
 #: commands that take most of a minute
 SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges|zwidth --rigid --scenario omega-pair-known")
 
@@ -130,7 +128,6 @@ def check() -> int:
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
             slow = [step.text for step in steps(text) if SLOW.search(step.text) and step.kind == "command"]
-            slow += [command for command in IN_SENTENCES.findall(text) if SLOW.search(command)]
             blocks = [(*block, False) for block in SHOWN.findall(text) if SLOW.search(block[2])]
             blocks += [(*block, True) for block in MEASURED.findall(text)]
             for command in [*slow, *(command for _, _, command, *_ in blocks)]:
