@@ -247,7 +247,7 @@ def test_json_on_standard_output_is_only_json(tmp_path):
 
 
 def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
-    """Standard error names each stage and the error reached by the optimal design; standard output has neither."""
+    """Standard error names each stage and the error of the last filter; standard output has neither."""
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # without the tests' cache
     monkeypatch.setattr("haptic_loop.design.budgets.GROWTH", 0.0)  # stop after the first basis, which reports its error
@@ -258,7 +258,7 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     code, _ = run(tmp_path, *one_device, "--coupling", "optimal", "--duration", "0.1", "--no-plot")
     shown, err = capsys.readouterr()
     assert code == 0
-    stages = ["designing the coupling", "dB after", "assessing the coupling", "simulating"]
+    stages = ["designing the coupling", " dB)", "assessing the coupling", "simulating"]
     places = [err.index(stage) for stage in stages]
     assert places == sorted(places)
     assert not any(stage in shown for stage in stages)
