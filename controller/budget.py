@@ -5,8 +5,9 @@
 
 *The guarantee of the budget.* A device of guaranteed damping Delta with its passive hand has
 sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the energy stored at the start. Here a[k] is the force that acts in
-[kT, (k+1)T), the device feels -a[k], and dx[k] = x[k+1] - x[k]. With Delta' = (1 - eps) Delta, whose diagonal is
-delta' (on vectors, ' is the transpose), the budget computes
+[kT, (k+1)T), the device feels -a[k], and dx[k] = x[k+1] - x[k]. The budget leaves a share eps (`EPS`) of the damping
+unused. Let Delta be diagonal (a matrix is first turned to its principal axes), and Delta' = (1 - eps) Delta =
+diag(delta'). On vectors, ' is the transpose. The budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
@@ -211,7 +212,7 @@ class EnergyBudget(_Net):
         self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) whether a packet sent now can act then
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
-        self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
+        self._sent = np.zeros_like(self._reserve)  # Row k % depth is the force sent at tick k, in principal axes.
         self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> its dx and its largest loss
         self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick whose force is known, and that force
         self.surprises = 0  # as in BudgetFigures

@@ -4,8 +4,8 @@
           1  x = encoder positions, sampled                (the plant's state just before kT)
           2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
           3  f = Theta f_e
-          4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant by T
-          5  commit the discrete states z+                 (the plant's state just before (k+1)T)
+          4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant to its state just before (k+1)T
+          5  z = z+, the controller's states for the next tick
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 together are one linear state-space block, so that a tick is one matrix product
@@ -177,8 +177,9 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether the linear law alone is tried next: in a single simulation without encoder steps, walls, packets and
-        #: net, if no force is known to be near its limit
+        #: Whether the next block first runs without limits (`linear_until` then checks its forces). This requires a
+        #: single simulation without encoder steps, walls, packets and net. It is False after a block that exceeded a
+        #: limit, until `rewind` finds all forces of a block below their limits.
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
         for ball in process.balls:  # No vector within this box is longer than the limit.

@@ -1,7 +1,8 @@
 """The unit of positions: m, or rad for rotary devices, with N m, N m s/rad and kg m2 in place of N, N s/m and kg.
 
-The equations are the same for both. The program's texts use metres. `in_unit` replaces the units in a text by
-rotary ones before the text is printed, drawn, or written to a file's header or keys; numbers stay the same.
+The equations are the same for both. The program's texts use metres. If the unit is rad, `in_unit` replaces the units in
+a text before it is printed, drawn or written to a file, and `keys_in_unit` those in the keys and texts of a report.
+Numbers stay the same.
 """
 
 from __future__ import annotations

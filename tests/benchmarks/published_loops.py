@@ -28,7 +28,8 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import worst_mode
 
 ROOT = Path(__file__).parents[2] / "benchmarks"
-#: columns that take long to compute; benchmarks/README.md names their commands
+#: Columns that are slow to compute. For loops n* and o*, all but `designed_rms_db` are copied from the present file;
+#: tests/benchmarks/optimal_loops.py prints their figures.
 EXPENSIVE = ("designed_rms_db", "best_rms_db", "best_stiffness_share", "bound_rms_db")
 
 
@@ -71,13 +72,16 @@ def best(path: Path) -> dict[str, float | None]:
     for kind, condition in [*kinds, *(("spring-damper", name) for name in KINDS["spring-damper"].conditions)]:
         try:
             made = design_by_kind(loop, kind, condition, **switching)
-        except ValueError:  # this design does not cover walls, devices without bounds, ..
+        except ValueError:
+            # The design finds no coupling, or refuses this loop, for example because of its walls, or because its
+            # devices have no bounds of motor and transmission.
             continue
         if assess(loop, made, condition=SWITCHING if switching else made.asked).holds:
             seen = transparency_of(loop, made)
             reached.append((seen.rms_mismatch_db, seen.dc_ratio))
     rms, share = min(reached)
-    least = None if loop.known_devices else bound(loop).rms_db  # the bound does not use guaranteed transmissions
+    # The bound covers couplings that this-environment certifies; known-device may certify better ones.
+    least = None if loop.known_devices else bound(loop).rms_db
     return {"best_rms_db": rms, "best_stiffness_share": share, "bound_rms_db": least}
 
 

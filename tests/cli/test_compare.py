@@ -45,7 +45,7 @@ def test_each_coupling_has_its_guarantee_and_error(compared):
 
 @pytest.mark.slow
 def test_a_row_is_the_run_of_that_coupling(compared, tmp_path):
-    """The row and the run have the same error, though the run uses the other engine."""
+    """The comparison uses the exact engine and the run uses MuJoCo; both report the same force error."""
     rows, _ = compared
     assert run_once(["--no-plot", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
     error = json.loads((tmp_path / "run.json").read_text())["ideal_force"]["error_percent"]

@@ -1,6 +1,7 @@
 """The energy budget, and the shell around a user's environment, bound the energy that loops give to hands.
 
-W0 [J] is the energy that a budget or shell may give at the start. Tolerances without a comment cover rounding.
+W0 [J] is the initial value of the account W: the most that a budget or shell gives in a run. Tolerances without a
+comment cover rounding.
 """
 
 import json
@@ -41,7 +42,10 @@ def given(simulation, trace):
 
 
 def test_budgets_are_idle_with_damping_to_spare():
-    """A budget is idle if any-environment needs at most 95 % of each damping, and neither clipping nor a cap exists."""
+    """A budget is idle if any-environment needs at most 95 % of each damping, no force is clipped and there is no cap.
+
+    The loop has psi = 0, constant delays, ideal encoders and no walls.
+    """
     clipped, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
     unlimited = replace(clipped, process=clipped.process.unlimited)
 
@@ -70,7 +74,10 @@ def limited_and_idle(scenario, coupling, condition):
 
 
 def test_budgets_act_on_couplings_for_known_devices():
-    """known-device-any also uses the motors' mass; the budget, which does not, limits forces that it certifies."""
+    """known-device-any also uses the motors' mass, and the budget does not.
+
+    So the budget limits forces of a coupling that known-device-any certifies.
+    """
     scenario = load("omega-pair-known")
     ends = scenario.environment.contacts
     network = Network(ends, tuple(Spring((end, "ground"), 1e6) for end in ends))
@@ -201,7 +208,8 @@ def test_reports_say_what_the_budget_did(tmp_path):
     ]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["error"]["position_relative_rms"] < 1e-6  # the exact engine runs with the budget, too
+    # The report compares this run with the exact engine's run, which must have the same budget.
+    assert report["error"]["position_relative_rms"] < 1e-6
     part = report["energy_budget"]
     assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)
     assert part["limited_ticks"] > 100

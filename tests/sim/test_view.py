@@ -287,9 +287,9 @@ def test_every_tick_is_made_or_counted_as_lost(steps):
     for step in steps:
         now += step
         assert 0 <= pace.due(now) <= 100
-        # after each call less than a tick is left over
+        # Each call leaves less than one tick (1 ms) to the next.
         assert -1e-6 <= now - pace.lost - pace.done * pace.T <= pace.T * (1 + 1e-6)
-    # More than 100 ticks are due only if the step, with the rest of less than a tick, exceeds 0.1 s.
+    # So more than 100 ticks are due only after a step of 0.1 s or more; 0.098 allows for rounding.
     assert pace.overruns <= sum(step > 0.098 for step in steps)
 
 
@@ -415,7 +415,7 @@ def test_the_overlay_says_what_limits_and_shells_do():
 
 
 def test_a_refusal_is_shown_completely_and_once(none):
-    """A refusal of any length stands in a separate part of the window, where no bodies are."""
+    """A note of more than one line stands completely, and only once, in the bottom left corner of the window."""
     running = session(none)
     press(running, "Insert")
     frame = running.frame(0.1)
@@ -516,7 +516,7 @@ def test_the_window_refuses_what_it_cannot_simulate(tmp_path, old, new, message)
 
 
 def test_a_film_shows_how_the_mass_moves(none):
-    """The drawn mass moves by its displacement; columns of contacts and masses, 70 mm apart, give the scale."""
+    """The drawn mass moves by its displacement. At rest it is 70 mm left of the contacts, which gives the scale."""
     running = session(none)
     pictures = pictures_for(running)
 
@@ -595,7 +595,7 @@ def arrows(stage, frame):
 
 
 def test_arrows_show_what_devices_feel(none):
-    """A device feels -f, and the bar's middle is that of the range of -f since the last frame."""
+    """A device feels -f. The bar covers the range of -f since the last frame, so its centre is the range's middle."""
     scene, limit = none.simulation.scene, none.simulation.process.force_limit
     stage, low, high = _ShownScene(scene, limit), np.array([1.0, -3.0]), np.array([3.0, -1.0])
     told = {"mean": np.array([2.0, -2.0]), "low": low, "high": high, "push": np.array([0.0, 1.5])}
@@ -656,7 +656,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
 def test_flat_pictures_show_a_handles_displacement(none):
     """The first device's handle, found by its colour, moves by its displacement in pixels.
 
-    520 pixels show 0.42 m: 0.09 m on each side of the handle and two arrows.
+    520 pixels show 0.42 m: on each side of the handle 0.09 m to the next body and 0.12 m for the longest arrow.
     """
     painter = _FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)

@@ -152,7 +152,10 @@ def test_the_plate_lifts_the_cube():
 
 
 def test_contacts_have_the_axes_of_their_devices(tmp_path):
-    """A smooth oblique plate pushes the free axes along its normal; a device off the plate feels no force."""
+    """On a frictionless oblique plate the force has the direction of the plate's normal, projected onto the free axes.
+
+    A device off the plate feels no force.
+    """
     plate = '<geom type="box" pos="0 0 -.05" size=".2 .2 .05" condim="1" solimp=".9 .9"/>'
     (tmp_path / "scene.xml").write_text(
         f"""<mujoco><compiler angle="degree"/><option gravity="0 0 0"/><worldbody>
@@ -456,7 +459,10 @@ def linear_tray(tmp_path):
 
 @pytest.mark.parametrize("change", [TRAY.replace("0.3", "0.4"), TRAY])
 def test_scenes_that_changed_void_their_linear_network(tmp_path, linear_tray, change):
-    """Only after a change of the scene, the claim calls the network stale, and a loaded scenario is refused."""
+    """If and only if the scene has changed, the claim asks to call linearise again.
+
+    Then linearise refuses the scenario that was loaded before the change.
+    """
     before, design = linear_tray
     after = scenario(tmp_path, change)
     said = Claim.of(assessed(after, "I", choose_given(design), energy_budget=START_J), design.certified_for)
@@ -505,7 +511,10 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_default_couplings_of_slow_worlds_do_not_ring(every):
-    """If a scene steps every few ticks, a quarter of the forces' second differences is below 0.1 N rms."""
+    """If a scene steps every few ticks, forces alternate from tick to tick by less than 0.1 N rms.
+
+    The amplitude of alternation is the second difference of a force, divided by 4.
+    """
     loop = load("world-cube").replace(duration=0.8)
     world = replace(loop.environment.world, every=every)
     slow = loop.replace(environment=replace(loop.environment, world=world))
