@@ -363,9 +363,6 @@ class Drive:
             if test is None:
                 self._test = None
                 self.gain = self.limits.next_gain(self.gain, ticks * self.T)
-                # Accounts of energy count no pulses, and records of hw.identify must not depend on the motion.
-                if self.gain == 1.0 and self._last_test and not (self._budget or self.world):
-                    test = self.encoders.pulse
         elif direction < 0:
             self.gain = self.limits.next_gain(self.gain, -ticks * self.T)
             if closing and self._last_test and self.gain == 0:

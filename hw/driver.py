@@ -40,6 +40,8 @@ class Operator:
                 self._free_at = now + _LET_GO_US * (session.settings.check_axes or bool(session.settings.elsewhere))
             elif self.auto_arm and now >= self._free_at:
                 return self._arm_once(session, now)
+            elif self.auto_arm:
+                session.request = f"let go of every handle: forces act in {_LET_GO_US / 1e6:g} s"
         if session.stage == Stage.ARMED and self._armed_at is None:
             self._armed_at = now
         if self.deadman:

@@ -41,12 +41,9 @@ _BETTER = 8.0  # least ratio of squares that a one-sided fault explains to the r
 _WEAKENED = 0.7  # least motion at the end of a session, as a share of the motion at arming
 _LETTING_GO = 5.0  # [s] time at the end of a session in which a person can let go of a handle
 ELSEWHERE = 5e-3  # [m] least motion by a person after which a handle counts as moved to another place
-_SETTLED = 0.5  # [s] time of rest before a person is asked to move an axis
+_SETTLED, _CALM = 0.5, 5e-4  # [s] time of rest before and after a person moves an axis; [m] largest motion in a rest
 _REST = 0.1  # [s] window in which the noise of an encoder at rest is measured
 _PRESSING, _PRESSED = 0.3, 0.5  # force, as a multiple of 1 N; longest time [s] of rest under this force
-#: [s] rest under this force after which a pulse of this length acts against it; 1.3 N move a firm hand (0.5 kg,
-#: 20 N s/m, 1500 N/m) by 73 um or more if dry friction of 0.5 N holds it
-_KNOCK, _KNOCKING = 0.3, 0.02
 _TREMOR = 3e-5  # [m] least motion of a calm hand within _PRESSED; on coarser counts the encoder looks dead
 
 
@@ -80,40 +77,65 @@ class EncoderNoise:
 class AxisCheck:
     """Let a person move one axis after the other in its + direction while no force acts.
 
-    This finds axes that are reversed or exchanged with motors and encoders together, which no force can show.
+    This finds axes that are reversed or exchanged with motors and encoders together, which no force can show. Motions
+    are judged between places where all handles rest, so that a handle that sags slowly passes no axis. A wrong motion
+    is asked for again from the same place, and only the second one is an error, because people move wrong handles.
     """
 
     def __init__(self, units: Units, T: float, lever: float) -> None:
         self._step, self._far, self._rest = units.encoder_step, ELSEWHERE / lever, round(_SETTLED / T)
-        self._axis, self._still, self._origin = 0, 0, tuple[int, ...]()
+        self._calm = [max(_CALM / lever, 1.5 * q) for q in self._step]
+        self._axis, self._still, self._moving = 0, 0, 0  # the axis that is asked for, ticks of rest, last axis to move
+        self._anchor: tuple[int, ...] = ()  # [counts] place at which the present rest began
+        self._origin: tuple[int, ...] = ()  # [counts] place of rest from which the next motion is counted
+        self._wrong: tuple[int, bool] | None = None  # axis and sign of the last wrong motion
+        self._finding = ""  # words for the last wrong motion
 
     @property
     def request(self) -> str | None:
         """What the person must do now; None once all axes were moved."""
         if self._axis == len(self._step):
             return None
-        if self._still < self._rest:
-            return f"let every handle rest, then move axis {self._axis + 1}"
-        return f"move axis {self._axis + 1} by {1e3 * self._far:.3g} mm or more in its + direction"
+        if not self._origin:
+            return f"let every handle rest: axis {self._moving + 1} moves"
+        ask = f"move axis {self._axis + 1} by {1e3 * self._far:.3g} mm or more in its + direction, and hold it there"
+        return f"{self._finding}. Go back, then {ask}" if self._wrong else ask
 
     def note(self, counts: tuple[int, ...]) -> str | None:
-        """Process the counts (m,) of a tick. Return a message if an axis moves the wrong way or instead of another."""
-        moved = [(n - then) * q for n, then, q in zip(counts, self._origin or counts, self._step, strict=True)]
-        farthest = max(range(len(moved)), key=lambda i: abs(moved[i]))
-        ready, axis = self._still >= self._rest, self._axis + 1
-        if not self._origin or (not ready and abs(moved[farthest]) > self._far / 5):
-            self._origin, self._still = counts, 0
-        elif not ready:
-            self._still += 1
-        elif axis <= len(moved) and abs(moved[farthest]) >= self._far:
-            far = f"{1e3 * moved[farthest]:+.3g} mm"
-            if farthest + 1 != axis:
-                both = "the axes are exchanged, with motors and encoders"
-                return f"axis {farthest + 1} moved by {far} instead of axis {axis}: {both}"
-            if moved[farthest] < 0:
-                return f"axis {axis} moved by {far}, not in + direction: reverse both its motor and its encoder"
-            self._axis, self._origin, self._still = axis, (), 0
-        return None
+        """Process the counts (m,) of a tick. Return a message once a wrong motion is repeated."""
+        places = zip(counts, self._anchor or counts, self._step, self._calm, strict=True)
+        strayed = [abs(n - then) * q - calm for n, then, q, calm in places]
+        if not self._anchor or max(strayed) > 0:
+            self._moving, self._anchor, self._still = strayed.index(max(strayed)), counts, 0
+            return None
+        self._still += 1
+        if self._still != self._rest or self._axis == len(self._step):
+            return None
+        origin, self._origin = self._origin, counts
+        moved = [(n - then) * q for n, then, q in zip(counts, origin or counts, self._step, strict=True)]
+        return self._judged(origin, moved) if max(map(abs, moved)) >= self._far else None
+
+    def _judged(self, origin: tuple[int, ...], moved: list[float]) -> str | None:
+        """Judge a motion (m,) [m] from `origin` to the next rest. Return a message if it repeats a wrong one."""
+        far, asked = [abs(x) for x in moved], self._axis
+        farthest, others = far.index(max(far)), max([x for i, x in enumerate(far) if i != asked], default=0.0)
+        if moved[asked] >= self._far and others <= moved[asked] / 2:
+            self._axis, self._wrong = asked + 1, None
+            return None
+        if farthest < asked:  # An axis that has passed moves back.
+            return None
+        self._finding = f"axis {farthest + 1} moved by {1e3 * moved[farthest]:+.3g} mm"
+        if farthest != asked:
+            self._finding += f" instead of axis {asked + 1}"
+            why = "the axes are exchanged, with motors and encoders, or the person moved another axis"
+        elif moved[asked] < 0:
+            self._finding += ", not in + direction"
+            why = "reverse both its motor and its encoder, unless the person moved it the other way"
+        else:
+            self._finding += f", and another axis by {1e3 * others:.3g} mm"
+            why = "move one axis alone"
+        again, self._wrong, self._origin = self._wrong, (farthest, moved[farthest] > 0), origin
+        return f"{self._finding}, twice: {why}" if again == self._wrong else None
 
 
 class Expected:
@@ -427,8 +449,7 @@ class EncoderMonitor:
     reverses stays within two counts of q for 4 sqrt(q M / F), so a coarse encoder gets twice this time. Under a force
     of more than 0.3 N (0.15 of a weak motor's cap), no hand holds still for half a second, because it has a tremor. The
     tremor shows where noise and counts hide less than 30 um. Handles with dry friction F_c may look dead, because
-    friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c. So
-    after 0.3 s a `pulse` moves the handle. It is an external force: the certified loop stays stable, but does not rest.
+    friction holds them while the force changes by 2 F_c (so 1 N allows F_c = 0.5 N), and hides a tremor below F_c.
     """
 
     def __init__(self, limits: SafetyLimits, T: float, units: Units, still: Sequence[int]) -> None:
@@ -442,9 +463,6 @@ class EncoderMonitor:
         self._quiet = [0.0] * m  # [s] time under a force without a motion that shows a tremor
         self._reference = [0.0] * m  # [N] force at the last motion
         self._impulse = [0.0] * m  # [N s] changes of force over time since the last motion
-        self._steady = [0.0] * m  # [N] force, without pulses
-        self._after = [0.0] * m  # [s] time until a pulse no longer acts
-        self._strongest = [min(_TEST_FORCE * limits.lever, cap) for cap in limits.cap]
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
         """Raise SafetyStop where an encoder is dead. `applied` (m,) [steps] acts from these `counts` (m,) on."""
@@ -452,12 +470,9 @@ class EncoderMonitor:
             self._band = [[n, n] for n in counts]
         for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
             force, band, still = steps * self._units.force_step[i], self._band[i], self._still[i]
-            self._after[i] = 2 * _KNOCKING if self._knocks(i) else self._after[i] - ticks * self._T
-            if self._after[i] <= 0.0:
-                self._steady[i] = force
             if n > band[0] + still or n < band[1] - still:
                 band[:] = n, n
-                self._reference[i], self._impulse[i], self._quiet[i] = self._steady[i], 0.0, 0.0
+                self._reference[i], self._impulse[i], self._quiet[i] = force, 0.0, 0.0
                 continue
             if n > band[1]:
                 band[1] = n
@@ -471,19 +486,8 @@ class EncoderMonitor:
                 if self._impulse[i] > max(_IMPULSE * newton, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                     doing = f"it stands still while the force changes by {change:.3g} N"
                     raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
-            pressed = self._shown[i] and abs(self._steady[i]) > _PRESSING * newton
+            pressed = self._shown[i] and abs(force) > _PRESSING * newton
             self._quiet[i] = self._quiet[i] + ticks * self._T if pressed else 0.0
-
-    def _knocks(self, i: int) -> bool:
-        return _KNOCK <= self._quiet[i] < _KNOCK + _KNOCKING
-
-    @property
-    def pulse(self) -> tuple[float, ...] | None:
-        """Forces fed back (m,) [N] against the forces on handles at rest, until the handles move, or None."""
-        axes = range(len(self._still))
-        if not any(map(self._knocks, axes)):
-            return None
-        return tuple(math.copysign(self._strongest[i], self._steady[i]) * self._knocks(i) for i in axes)
 
     @property
     def dead(self) -> str | None:

@@ -1,5 +1,7 @@
 """Sessions in virtual time, for the tests of hw/."""
 
+import re
+
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import SafetyLimits
 from haptic_loop.hw.monitor import LinkSettings
@@ -21,3 +23,25 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **optio
     if recorder is not None:
         session.record = recorder
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
+
+
+class MovesAxes:
+    """A person who moves each axis by `mm` when a session asks for it, and who repeats a wrong motion.
+
+    After a wrong motion the person goes back, and moves the axis again 0.8 s later. `axes` lists the axes that were
+    asked for, counted from 1.
+    """
+
+    def __init__(self, emulator, mm=6.0):
+        self.axes, self._emulator, self._mm, self._plan, self._requests = [], emulator, mm, [], set()
+
+    def __call__(self, session):
+        asked = re.search(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
+        if asked and session.request not in self._requests:
+            self._requests.add(session.request)
+            self.axes.append(int(asked[1]))
+            again = session.request.startswith("axis")  # The request begins with the wrong motion.
+            moves = [(0.0, -self._mm), (0.8, self._mm)] if again else [(0.0, self._mm)]
+            self._plan += [(session.now + 1e6 * after, mm) for after, mm in moves]
+        while self._plan and self._plan[0][0] <= session.now:
+            self._emulator.plant.s[self.axes[-1] - 1 : 4 : 2] += 1e-3 * self._plan.pop(0)[1]  # motor and handle

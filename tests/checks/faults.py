@@ -23,6 +23,7 @@ from haptic_loop.hw.protocol import Info
 from haptic_loop.hw.rehearsal import Plan, Rehearsal
 from haptic_loop.hw.session import Said, Session
 from haptic_loop.sim.scenario import Scenario, load
+from tests.sessions import MovesAxes
 
 _WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
 _LASTS = 0.9336  # [s] from arming to the end of a case
@@ -318,13 +319,16 @@ CASES = (
         for part in (1.0, 0.5, -1.0)
     ),
     Fault("axes moved by hand", A, free=True, shown=True),
-    Fault("axes 1 and 2 exchanged", G.REFUSED, "axis 2 moved .* instead of axis 1", ("exchange",), shown=True),
+    Fault(
+        "axes 1 and 2 exchanged", G.REFUSED, "axis 2 moved .* instead of axis 1", ("exchange",), free=True, shown=True
+    ),
     *(
         Fault(
             f"axis {i} all reversed",
             G.REFUSED,
             f"axis {i} moved .* not",
             (f"axis{i}:motor=-1", f"axis{i}:reverse"),
+            free=True,
             shown=True,
         )
         for i in (1, 2)
@@ -472,10 +476,6 @@ def _rehearse_case(
     emulator = Emulator(nobody(scenario) if case.free else scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick
 
-    def show(session: Session) -> None:
-        if asked := re.match(r"move axis (\d)", session.request or ""):
-            emulator.plant.s[int(asked[1]) - 1 : 4 : 2] += 2e-4  # motor and handle
-
     def frozen(session: Session, now: int) -> Said:
         rehearsal.freeze(case.host_stall)
         return ()
@@ -487,7 +487,7 @@ def _rehearse_case(
         faults,
         actions=[(case.acts, case.action)] if case.action else [(_WHEN, frozen)],
         clock=case.period,
-        watch=show if case.shown else lambda session: None,
+        watch=MovesAxes(emulator) if case.shown else lambda session: None,
     )
     rehearsal.run_until_armed(case.lasts)
     timed = case.within is not None and rehearsal.armed_us is not None

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from haptic_loop.hw.driver import Operator
@@ -11,6 +12,7 @@ from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
+from tests.sessions import MovesAxes
 
 
 def rehearsal_of(scenario, rungs, operator, *faults):
@@ -109,21 +111,15 @@ def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
 
 
 def shown(scenario, rungs, monkeypatch, *faults, mm=6.0, seconds=8.0):
-    """Run a session whose person moves each axis by `mm` when asked, and then lets go of it."""
+    """Run a session whose person moves each axis by `mm` when asked, and repeats a wrong motion from the same place."""
     monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 300_000)
-    free, faults, requests = nobody(scenario), tuple(map(FaultInjection.parse, faults)), []
+    free, faults = nobody(scenario), tuple(map(FaultInjection.parse, faults))
     session = Session(free, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100, held=False, check_axes=True))
     emulator = Emulator(free, faults)
-
-    def move(session):
-        asked = re.match(r"move axis (\d) by 5 mm or more in its \+ direction", session.request or "")
-        if asked and session.request not in requests:
-            emulator.plant.s[int(asked[1]) - 1 : 4 : 2] += 1e-3 * mm  # motor and handle
-            requests.append(session.request)
-
-    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, operator=Operator(True, 5.0), watch=move)
+    person = MovesAxes(emulator, mm)
+    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, operator=Operator(True, 5.0), watch=person)
     rehearsal.run_until_armed(0.6) if seconds is None else rehearsal.run(seconds)
-    return session, rehearsal, [int(request[10]) for request in requests]
+    return session, rehearsal, person.axes
 
 
 def test_axes_moved_as_asked_arm(scenario, rungs, monkeypatch):
@@ -136,9 +132,9 @@ def test_axes_moved_as_asked_arm(scenario, rungs, monkeypatch):
 @pytest.mark.parametrize(
     ("faults", "mm", "words"),
     [
-        (["exchange"], 6, r"axis 2 moved by \+6 mm instead of axis 1: the axes are exchanged"),
-        (["exchange"], -6, "axis 2 moved by -6 mm instead of axis 1"),
-        (["motor=-1", "reverse"], 6, r"axis 1 moved by -6 mm, not in \+ direction: reverse both its motor"),
+        (["exchange"], 6, r"axis 2 moved by \+6 mm instead of axis 1, twice: the axes are exchanged"),
+        (["exchange"], -6, "axis 2 moved by -6 mm instead of axis 1, twice"),
+        (["motor=-1", "reverse"], 6, r"axis 1 moved by -6 mm, not in \+ direction, twice: reverse both its motor"),
         (["axis2:motor=-1", "axis2:reverse"], 6, r"axis 2 moved by -6 mm, not in \+ direction"),
         ([], -6, "axis 1 moved by -6 mm, not in"),
     ],
@@ -161,21 +157,54 @@ def test_small_motions_show_no_axis(scenario, rungs, monkeypatch):
     assert (session.stage, axes) == (Stage.DISARMED, [1])
     session.arm(session.now)
     assert session.stage == Stage.DISARMED
-    assert session.log[-1].cause == "move axis 1 by 5 mm or more in its + direction"
+    assert session.log[-1].cause == "move axis 1 by 5 mm or more in its + direction, and hold it there"
 
 
-@pytest.mark.parametrize("direction", [1, -1])
+def checked(places, lever=1.0, q=1e-5):
+    """Move axes to `places` [mm at a lever of 1 m] in 0.3 s each, with rests of 0.6 s; return (answers, check)."""
+    T, m = 1e-3, len(places[0])
+    check, answers, here = AxisCheck(Units((q,) * m, (1e-3,) * m, (10**9,) * m), T, lever), [], np.zeros(m)
+    for place in [here, *(1e-3 / lever * np.array(place, dtype=float) for place in places)]:
+        path = np.concatenate([np.linspace(here, place, 300), np.repeat([place], 600, axis=0)])
+        answers += [check.note(tuple(np.round(x / q).astype(int).tolist())) for x in path]
+        here = place
+    return [answer for answer in answers if answer], check
+
+
 @pytest.mark.parametrize("lever", [1.0, 0.02])
-def test_one_axis_shows_its_direction(direction, lever):
+def test_one_axis_shows_its_direction(lever):
     """A knob held at 20 mm must turn by 5 mm / 20 mm = 0.25 rad."""
-    T, q, far = 1e-3, 1e-5, 5e-3 / lever
-    check = AxisCheck(Units((q,), (1e-3,), (10**9,)), T, lever)
-    counts = [round(direction * min(1.0, max(0, k - 600) / 300) * 1.01 * far / q) for k in range(1000)]
-    answers = [check.note((n,)) for n in counts]
-    first = next((k for k, n in enumerate(counts) if abs(n) * q >= far), None)
-    if direction > 0:
-        assert not any(answers)
-        assert check.request is None
-    else:
-        assert re.match("axis 1 moved by -.*, not in", answers[first])
-        assert not any(answers[:first])
+    assert checked([(5.05,)], lever)[1].request is None
+    assert checked([(4.9,)], lever)[1].request is not None
+    (answer,), _ = checked([(-5.05,), (0.0,), (-5.05,)], lever)
+    assert re.match(r"axis 1 moved by -.*, not in \+ direction, twice: reverse both its motor", answer)
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        [(8, 0), (0, 0), (0, 6)],  # axis 1 returns before axis 2 is moved
+        [(0, 7), (0, 0), (6, 0), (6, 6)],  # the wrong axis once
+        [(6, 6), (0, 0), (6, 1), (6, 7)],  # both axes once
+        [(8, 2), (8, 10)],  # an oblique motion
+    ],
+)
+def test_honest_motions_pass_the_check(places):
+    answers, check = checked(places)
+    assert not answers
+    assert check.request is None
+
+
+def test_the_way_back_from_a_wrong_motion_does_not_count():
+    """A reversed axis moves back in its measured + direction."""
+    answers, check = checked([(-8,), (0,)])
+    assert not answers
+    assert check.request.startswith("axis 1 moved by -8 mm, not in + direction. Go back, then move axis 1")
+
+
+def test_a_sagging_handle_passes_no_axis():
+    """At 0.8 mm/s every window of 0.5 s counts as rest; at 1.5 mm/s there is no rest."""
+    for speed in (0.8, 1.5, -0.8):
+        check = AxisCheck(Units((1e-5,), (1e-3,), (10**9,)), 1e-3, 1.0)
+        assert not any(check.note((round(speed * k / 10),)) for k in range(15_000))
+        assert check.request is not None
