@@ -101,6 +101,7 @@ def test_no_finished_tick_means_no_report(scenario, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_interrupted_runs_in_worlds_say_so(tmp_path, monkeypatch, capsys):
     interrupt(monkeypatch, 1)
     assert finish(["sim.run", "--scenario", "world-cube", "--duration", "3"], tmp_path) == 130

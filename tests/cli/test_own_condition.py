@@ -51,6 +51,7 @@ def test_own_condition_designs_are_proved_and_tight(folder):
     assert CLAIMED in report["claim"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "words"),
     [

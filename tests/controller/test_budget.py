@@ -388,6 +388,7 @@ def active_environment():
     return Networks(FIGURE_4.contacts, (M, D - 4.0 * np.diag([0, 0, 1.0]), K)).E(T)
 
 
+@pytest.mark.slow
 def test_the_shell_makes_an_active_mass_passive():
     """The energy from the environment's port never exceeds W0, and no larger scale of the force is possible."""
     rng, W0, nsim = np.random.default_rng(13), 0.01, 40

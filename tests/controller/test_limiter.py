@@ -161,6 +161,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
     np.testing.assert_allclose(f_e, expected, rtol=0, atol=1e-11)  # 600 ticks round forces of up to 3 N
 
 
+@pytest.mark.slow
 def test_many_simulations_equal_separate_runs():
     x = wander(300, 2, 5)
     process = closed(loop_of(WALLED, (1, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0)))

@@ -342,6 +342,7 @@ def test_commands_agree_on_the_requirement_of_a_wall(tmp_path, monkeypatch, ever
     assert judged.requirements["this-environment"].required == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_switching_before_walls_needs_more_damping():
     """A coupling that is certified for a constant delay is not certified for delays of 0 to 2 samples."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
@@ -364,6 +365,7 @@ SPRING = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
 ALONE = Loop(1.2e-3, (1,), (0,), (0,), (1.37,), SPRING)
 
 
+@pytest.mark.slow
 def test_a_search_of_other_ranges_is_repeated():
     """Alone a spring k needs 3/2 k T: 0.66 of the damping for 505 N/m (1 % more), 0.92 for 700 N/m (40 % more)."""
     narrow, wide = (change(ALONE, ranges=ranges_around(SPRING, percent)) for percent in (1.0, 40.0))

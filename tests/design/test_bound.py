@@ -96,6 +96,7 @@ def test_bounds_equal_those_of_separate_code(name, rms_db):
     assert found.sampled_rms > found.rms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -87,6 +87,7 @@ def test_fixed_order_designs_beat_spring_dampers(inner):
     assert found.objective < spring_damper.design(loop).objective
 
 
+@pytest.mark.slow
 def test_results_are_certified_from_the_coupling_alone(inner):
     loop, found = inner
     V = found.coupling.V

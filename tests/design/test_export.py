@@ -382,6 +382,7 @@ def test_an_export_is_repeatable_byte_for_byte(place):
     assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full").read_text()
 
 
+@pytest.mark.slow
 def test_a_file_names_the_loop_that_is_certified(tmp_path, capsys):
     """Export and `check` name known devices, periods and latencies, because other loops are not certified here."""
     known = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),) * 2

@@ -755,6 +755,7 @@ def test_an_optimal_coupling_uses_known_devices(monkeypatch, ranges):
     assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
 
 
+@pytest.mark.slow
 def test_no_coupling_is_optimal_where_it_is_certified():
     found = design_coupling(KNOWN, "optimal")
     assert isinstance(found.coupling, NoCoupling)
@@ -892,6 +893,7 @@ def test_no_lossless_hand_and_environment_grow_together(theta):
     assert worst[short] > 1 + 1e-6  # rounding alone gives 1 + 1e-13
 
 
+@pytest.mark.slow
 def test_no_lossless_hand_grows_under_varying_periods():
     """At 1.01 of the requirement for T_min to T_max no product of steps of random periods grows, for 200 hands."""
     K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
@@ -1191,6 +1193,7 @@ def test_limited_forces_need_less_on_known_devices(name):
     assert limited_needs(name) < plain
 
 
+@pytest.mark.slow
 @LINEAR_OR_WALL
 def test_no_hand_gains_energy_from_limited_forces(name):
     """No lossless hand behind the transmission gains energy at 1.01 of the requirement; at 0.1 some do."""
@@ -1309,6 +1312,7 @@ def test_a_search_weighs_axes_by_their_damping():
     np.testing.assert_allclose(speed, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["switching", *(pytest.param(n, marks=pytest.mark.validate) for n in ("limiter-switching", "walls-switching"))],

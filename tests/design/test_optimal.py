@@ -147,6 +147,7 @@ def test_static_stiffness_is_an_exact_share(name):
         assert (g * E1 == F1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n0", "n4", "o12"))]
 )

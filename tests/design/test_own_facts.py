@@ -83,6 +83,7 @@ def test_an_own_fact_adds_its_damping(base, shipped, fact):
     assert own.required == pytest.approx([d + fact.less * PAIR.T for d in plain.required], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_files_name_the_bounds_of_own_known_devices():
     """Theorem B bounds the period from below, too, so that a certificate names T_min and the devices' bounds."""
     loop = change(KNOWN, T_max=1.2e-3, T_min=0.8e-3)
@@ -91,6 +92,7 @@ def test_files_name_the_bounds_of_own_known_devices():
     assert "from 0.8 to 1.2 ms" in own[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fact", FACTS)
 @pytest.mark.parametrize("shipped", [KNOWN_DEVICE, KNOWN_DEVICE_ANY])
 def test_known_devices_keep_an_own_fact(shipped, fact):
@@ -247,8 +249,10 @@ def test_certify_refuses_switching_for_an_own_condition():
 
 @pytest.mark.parametrize(
     ("loop", "base", "shipped"),
-    [(PAIR, LimitedForces, LIMITER), (KNOWN, LimitedKnownDevice, LimitedKnownDevice())],
-    ids=["plain", "known-device"],
+    [
+        pytest.param(PAIR, LimitedForces, LIMITER, id="plain"),
+        pytest.param(KNOWN, LimitedKnownDevice, LimitedKnownDevice(), id="known-device", marks=pytest.mark.slow),
+    ],
 )
 def test_an_own_limiter_counts_once_it_is_proved(loop, base, shipped):
     own = condition(base, Less(0.0))

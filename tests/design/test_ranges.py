@@ -245,6 +245,7 @@ def test_vertex_force_maps_match_raw_matrices(robust):
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_one_filter_holds_at_every_vertex(robust, nominal_only):
     rooms = [least_room(m.network, robust.coupling) for m in LOOP.members()]
     alone = [least_room(m.network, nominal_only.coupling) for m in LOOP.members()]

@@ -334,6 +334,7 @@ def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     assert not lossy["covered"]
 
 
+@pytest.mark.slow
 def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
     broken = sealed(change(stored.certificate, margin=9.0))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
@@ -356,6 +357,7 @@ def test_validate_and_audit_say_what_files_cover(file, constant_file, tmp_path, 
     assert any("judged anew" in note for note in outcome["notes"])
 
 
+@pytest.mark.slow
 def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch):
     """The limit on states is below the switching model's order. The report says so; the file claims no switching."""
     monkeypatch.setattr(budgets, "PROOF_STATES", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)

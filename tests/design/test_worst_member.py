@@ -175,6 +175,7 @@ def test_edge_violations_match_a_dense_sweep(known):
     assert found.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
 
 
+@pytest.mark.slow
 def test_violations_between_vertices_take_the_guarantee_away(known):
     assert known.certificate is not None
     assert len(known.at_samples) == 64

@@ -361,6 +361,7 @@ def ended_live(scenario, rungs, hand, *faults, lets_go=9.0):
     return session
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hand", [(0.25, 0.0, 0.0), (0.5, 20.0, 1500.0)])
 def test_sessions_finish_once_handles_are_let_go(scenario, rungs, hand):
     """A firm hand is asked to let go, not taken for a wrong scale. A hand of 0.25 kg only halves the motion."""
@@ -587,6 +588,7 @@ def test_two_counts_of_motion_restart_the_impulse():
         monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N on and off, two counts every 18 ms
 
 
+@pytest.mark.slow
 def test_no_session_stops_for_a_still_hold():
     """This test draws 300 hands that hold still; tests/benchmarks/still_holds.py draws 10,000."""
     still_holds = run_path(str(Path(__file__).parent.parent / "benchmarks/still_holds.py"))["still_holds"]

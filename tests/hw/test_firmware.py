@@ -436,6 +436,7 @@ def sketch(compiled_sketch, tmp_path):
     return Sketch(Path(shutil.copy(compiled_sketch, tmp_path)))
 
 
+@pytest.mark.slow
 @needs_gxx
 def test_the_example_sketch_arms_follows_and_stops(sketch):
     assert sketch.run(12_000) == []  # no message before HELLO or CONFIG

@@ -104,6 +104,7 @@ def session(tmp_path_factory):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_device_is_opened_by_serial_number(session):
     assert (session["serial"], session["name"]) == (4712, "omega.3")
 

@@ -227,6 +227,7 @@ def test_sessions_with_too_late_forces_are_refused(scenario, read, write, holds)
         assert "us, which must be longer: use a longer T" in session.cause
 
 
+@pytest.mark.slow
 def test_forces_later_than_certified_end_in_a_ramp(scenario):
     """Forces after 0.4 ms in place of 0.1 ms are within the tick, but later than certified."""
     sdk = StandIn(scenario)
@@ -242,6 +243,7 @@ def test_forces_later_than_certified_end_in_a_ramp(scenario):
     assert sdk.force.tolist() == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_a_host_that_cannot_keep_the_period_stops(scenario):
     sdk = StandIn(scenario)
 

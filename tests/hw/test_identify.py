@@ -284,6 +284,7 @@ def test_the_swing_reaches_its_speed_within_its_travel():
     assert np.abs(signal).max() == pytest.approx(swing.force[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _marked(HANDS))
 def test_hands_on_the_handle_are_detected(judged, name):
     """A hand's damping, 0.1 to 3 N s/m, is not the device's. The hand's spring reveals the hand."""
@@ -316,6 +317,7 @@ def test_damping_hands_are_detected_by_two_sittings(odd):
     assert first.delta == min(odd["ideal"].delta, odd["late 0.3"].delta) <= 1
 
 
+@pytest.mark.slow
 def test_undetectable_hands_add_no_damping(odd):
     """8 % more damping may be a device's scatter. The least bound counts, so one record without the hand is enough."""
     assert odd["faint"].delta > 1.05

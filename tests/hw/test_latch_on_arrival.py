@@ -72,6 +72,7 @@ def test_the_last_force_holds_until_the_answer(share):
     assert apart.max() < 0.51 * counts
 
 
+@pytest.mark.slow
 def test_coupled_motors_are_found_at_arming():
     def plan(ages):
         met, link = timed(LAB, ages, 0.99, 100.0, at_once=True)

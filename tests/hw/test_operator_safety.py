@@ -63,6 +63,7 @@ def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
     assert 1e-6 * (at[Stage.STOPPED] - at[Stage.DISARMING]) == pytest.approx(0.1, abs=0.005)
 
 
+@pytest.mark.slow
 def test_holding_the_deadman_continues_the_session(scenario, rungs):
     session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
@@ -95,6 +96,7 @@ def test_a_release_before_full_gain_ends_the_session(scenario, rungs):
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
+@pytest.mark.slow
 def test_any_key_shows_that_somebody_is_there(scenario, rungs):
     operator = Operator(True, 10.0, lambda: False)
     rehearsal = rehearsal_of(scenario, rungs, operator)
@@ -231,6 +233,7 @@ def test_impossible_limits_are_refused(scenario, options, words):
 # the incident log
 
 
+@pytest.mark.slow
 def test_the_incident_log_survives_sigkill(tmp_path):
     """A child process with a session is killed: every stage up to then is on the disk."""
     code = (
@@ -254,6 +257,7 @@ def test_the_incident_log_survives_sigkill(tmp_path):
     assert lines[2]["counters"]["states"] == 0
 
 
+@pytest.mark.slow
 def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     log = IncidentLog(tmp_path / "log")
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
@@ -338,12 +342,14 @@ def test_rehearsals_have_a_sessions_stages_and_files(rehearsed):
     assert replay.main([str(out / "trace.npz")]) == 0
 
 
+@pytest.mark.slow
 def test_a_rehearsal_is_the_same_every_time(rehearsed):
     (first, trace, _), (second, again, _) = rehearsed
     assert trace == again
     assert {k: v for k, v in first.items() if k != "files"} == {k: v for k, v in second.items() if k != "files"}
 
 
+@pytest.mark.slow
 def test_a_rehearsal_shows_the_injected_fault(tmp_path, capsys):
     options = ["--rehearse", "--no-plot", "--duration", "1", "--fault", "axis2:jump=-5@0.5", "--out", str(tmp_path)]
     assert bridge.main(options) == 1

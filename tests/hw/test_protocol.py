@@ -97,6 +97,7 @@ axes = st.integers(1, 8)
 messages = st.one_of(small, *[axes.flatmap(kind) for kind in (states, forces, configs, infos)])
 
 
+@pytest.mark.slow
 @given(messages)
 def test_decoded_frames_equal_sent_messages(message):
     frame, decoder = encode(message), Decoder()
@@ -186,6 +187,7 @@ def test_fields_out_of_range_are_named(message, text):
         encode(message)
 
 
+@pytest.mark.slow
 @given(st.lists(messages, max_size=6), st.randoms(use_true_random=False))
 def test_the_decoder_takes_pieces_of_any_size(sent, rng):
     stream, decoder, got = b"".join(map(encode, sent)), Decoder(), []
@@ -323,6 +325,7 @@ def mutations(rng: random.Random, frame: bytes):
             yield bytes(data) + b"\0"
 
 
+@pytest.mark.slow
 def test_mutated_commands_arm_nothing_and_move_nothing():
     """No damaged ARM or RUN frame for the next tick has an effect; an intact ARM frame then arms the device."""
     device, rng = disarmed(), random.Random(2)

@@ -58,6 +58,7 @@ def test_a_sessions_trace_loads_as_a_simulations(trace):
     assert {path.name for path in files} == {"trace.npz", "trace.csv", "figure.png", "report.json"}
 
 
+@pytest.mark.slow
 def test_a_replay_is_identical_bit_by_bit(trace):
     result, link = load(trace[0][0])
     assert 10 < (~link["received"]).sum() < 200
@@ -66,6 +67,7 @@ def test_a_replay_is_identical_bit_by_bit(trace):
     assert np.abs(link["sent"]).max() > 1000
 
 
+@pytest.mark.slow
 def test_twice_armed_sessions_replay_both_couplings(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, "down:jitter=0.0007@0.45", recorder=recorder)

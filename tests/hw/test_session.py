@@ -374,6 +374,7 @@ def test_a_coupling_from_a_file_has_reserves_too(scenario, optimal_rungs, tmp_pa
         certified_couplings(scenario, "I", str(path), None, 2)  # no reserve replaces the file's coupling
 
 
+@pytest.mark.slow
 def test_a_reserve_armed_later_replays_bit_by_bit(scenario, optimal_rungs, tmp_path):
     """After late answers and a ramp, a person arms the reserve. The trace of both couplings replays bit by bit."""
     recorder = Recorder(2)
@@ -424,6 +425,7 @@ def test_wrong_faults_are_refused_in_one_line(text, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
     """With caps of 0.3 and 0.2 N, the limiter keeps forces within the caps and acts in over a third of the ticks."""
     recorder = Recorder(2)

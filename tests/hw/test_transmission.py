@@ -61,6 +61,7 @@ def bounds(m1, m2, k, b, delta, lag=0.0, clamp=FAR):
 RIGS = [(0.06, 0.19, 14500.0, 0.5, 1.37), (0.09, 0.12, 9000.0, 2.5, 0.6), (0.05, 0.2, 20000.0, 0.2, 1.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("m1", "m2", "k", "b", "delta"), RIGS)
 def test_bounds_contain_the_truth(m1, m2, k, b, delta):
     found = bounds(m1, m2, k, b, delta)
@@ -84,16 +85,19 @@ def test_derivatives_of_responses_are_exact(held):
         np.testing.assert_allclose(exact[:, i], difference, rtol=0, atol=1e-5 * np.abs(difference).max())
 
 
+@pytest.mark.slow
 def test_a_lossless_transmission_has_no_bounds():
     with pytest.raises(ValueError, match=r"transmission damping .* lower bound .*, which is not above 0|leave"):
         bounds(0.06, 0.19, 14500.0, 1e-4, 1.37)
 
 
+@pytest.mark.slow
 def test_a_late_current_loop_is_refused():
     with pytest.raises(ValueError, match="us late, at most 60 us"):
         bounds(*RIGS[0], lag=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clamp", [2e4, 1e5, 1e6])
 def test_a_soft_clamp_hides_no_stiffness(clamp):
     """A clamp that gives way makes the transmission look softer: the record is refused, or the bound still holds."""
@@ -120,6 +124,7 @@ def test_play_and_presliding_friction_are_refused():
             transmission_bounds(records[0], records[1:], T, STEP, friction(*records[0], T, STEP))
 
 
+@pytest.mark.slow
 def test_written_bounds_are_rounded_outwards():
     """A written table is read as a device with bounds that are no tighter than those found."""
     found, known = bounds(*RIGS[0]), load("omega-pair-known")

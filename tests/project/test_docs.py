@@ -103,6 +103,7 @@ def test_measured_output_is_of_a_command_that_exists(page, command, pattern, sho
     assert shown == regenerate.kept(shown, pattern)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [of_page(page, page, name=page.name) for page in PAGES if SNIPPETS[page]])
 def test_every_snippet_runs(page, place, monkeypatch):
     """The Python blocks of a page run in order, in one namespace."""

@@ -60,6 +60,7 @@ CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_EN
 AT_HOME = ("design/conditions", "design/environments", "design/result")
 
 
+@pytest.mark.slow
 def test_no_code_compares_names_of_conditions():
     """A user's own condition works in every command, since no code decides by a condition's name."""
     asking = []

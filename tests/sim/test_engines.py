@@ -72,6 +72,7 @@ def test_the_default_engine_is_exact_to_1e_8(simulation):
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
 
+@pytest.mark.slow
 def test_the_exact_engine_equals_a_fine_integration(simulation):
     """One step of the exact engine from a random state equals 20000 steps of classical Runge-Kutta."""
     held, continuous = simulation.plant, plant(simulation.scene.model)

@@ -97,6 +97,7 @@ def test_too_few_ticks_give_a_reason():
     assert growth(motion(0.2), T, STEP).reason == "only 167 ticks; a growth rate needs 200"
 
 
+@pytest.mark.slow
 def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
     options = [
         "--case",
@@ -202,6 +203,7 @@ def ran(scenario, engine):
     return simulation, run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
 
 
+@pytest.mark.slow
 def test_no_trace_contradicts_its_eigenvalues():
     """Trace 11 has two devices that nothing joins: one is unstable, but only the other moves.
 

@@ -49,6 +49,7 @@ def test_verdicts_are_right_near_the_boundary(side, wrong):
         assert (other > 0) != (side > 0)
 
 
+@pytest.mark.slow
 def test_rk4_keeps_the_limit_cycle_that_euler_loses():
     """Uncoupled, the force of channel 2 deviates by 9.635 N rms at 83.85 Hz; with Euler x 1 by less than a tenth."""
     loop = assemble(load(), NoCoupling())

@@ -122,6 +122,7 @@ def test_any_environment_requires_the_same_in_all_cells():
     assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 
 
+@pytest.mark.slow
 def test_hands_grow_as_in_exact_loops(optimal):
     """HeldDevices gives each set of hands the growth rate of the exact loop with the force map of the cell."""
     sweep = around(PAIR, optimal["omega-pair"])

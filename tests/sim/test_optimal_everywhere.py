@@ -58,6 +58,7 @@ def files(tmp_path_factory):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_coupling_files_prove_and_drive_the_process(files, form):
     """Forces are displacements convolved with the impulse response that samples of F on the circle |z| = 1.05 give."""
@@ -80,6 +81,7 @@ def test_coupling_files_prove_and_drive_the_process(files, form):
     np.testing.assert_allclose(exact.f[:ticks], by_hand, rtol=0, atol=1e-9 * np.abs(exact.f).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_run_and_validate_take_couplings_of_each_form(files, form, tmp_path):
     _, name, path = files[form]

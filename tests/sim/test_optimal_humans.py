@@ -79,6 +79,7 @@ def test_the_same_hands_destabilise_the_loop_without_coupling(scenario):
     assert upset[True] > (0.9 if compliant else 0.02) * HUMANS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "lossless"), checkered(DEVICES, [False, True]))
 def test_mujoco_gives_the_exact_verdicts(scenario, lossless):
     """The eigenvalues of MuJoCo's one-period map give the exact verdict for every hand."""

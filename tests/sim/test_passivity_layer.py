@@ -73,6 +73,7 @@ def limited_and_idle(scenario, coupling, condition):
     return figures.limited_ticks, idle(simulation, requirements, figures)
 
 
+@pytest.mark.slow
 def test_budgets_act_on_couplings_for_known_devices():
     """known-device-any also uses the motors' mass, and the budget does not.
 
@@ -157,6 +158,7 @@ def test_hostile_loops_cannot_exceed_the_budget(start, vary):
         assert np.abs(trace.f).max() < 0.5 * np.abs(alone.f).max()
 
 
+@pytest.mark.slow
 def test_budgets_bound_loops_with_walls():
     """A large budget changes nothing in a run with a wall; with W0 = 0 no energy is given."""
     scenario = load("one-wall").replace(duration=1.5)
@@ -169,6 +171,7 @@ def test_budgets_bound_loops_with_walls():
     assert given(simulation, poor) <= 1e-9
 
 
+@pytest.mark.slow
 def test_the_shell_bounds_a_users_environment():
     """A force along the motion gives at most W0 = 2 mJ through the shell, and far more with a huge W0."""
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
@@ -196,6 +199,7 @@ def test_the_shell_bounds_a_users_environment():
         netted(assemble(SHORT, NoCoupling()), Plugged(lambda u: u))
 
 
+@pytest.mark.slow
 def test_reports_say_what_the_budget_did(tmp_path):
     options = [
         "--energy-budget",

@@ -153,6 +153,7 @@ def run(tmp_path, *options):
     return json.loads((tmp_path / "r.json").read_text())
 
 
+@pytest.mark.slow
 def test_both_engines_meet_the_same_delays(tmp_path):
     report = run(tmp_path, "--varying-delay", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
     # Both engines are exact here: when measured, their positions differed by 2e-14 of their rms, which is rounding.

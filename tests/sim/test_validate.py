@@ -319,6 +319,7 @@ def test_opposite_growth_is_a_disagreement():
     assert disagree(exact, other).tolist() == [True, True, False, False]
 
 
+@pytest.mark.slow
 def test_the_worst_human_replays(tmp_path):
     out, file = tmp_path / "out", tmp_path / "r.json"
     options = ["--case", "none", "--humans", "30", "--engine", "exact", "--duration", "0.5"]
@@ -381,6 +382,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
     assert report["humans"] == 125
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_other_processes_batches():
     """Ctrl-C does not wait for a batch of 50,000 simulated seconds."""
     scenario = load("omega-pair")

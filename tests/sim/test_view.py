@@ -790,6 +790,7 @@ def ball():
     return first_loop(Menu("I"), load("world-ball"), "moving-average")
 
 
+@pytest.mark.slow
 def test_live_worlds_feel_as_in_a_run(tmp_path):
     """The live loop delays forces itself, and sim.run delays them as packets; forces and energies are equal."""
     tray = first_loop(Menu("I"), world_scenario(tmp_path, TRAY, more=UP, duration=0.5), "moving-average")

@@ -138,6 +138,7 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
     np.testing.assert_array_equal(trace.f, again.f)
 
 
+@pytest.mark.slow
 def test_the_plate_lifts_the_cube():
     """The plate rises by 3 cm; its friction lifts the cube, which rests at 3 cm, by more than a centimetre."""
     loop = load("world-cube")
@@ -220,6 +221,7 @@ def test_a_run_sums_the_energy_given(tmp_path):
     assert given <= START_J + world["released_J"]
 
 
+@pytest.mark.slow
 def test_the_shell_credits_energy_that_gravity_releases(tmp_path):
     """Hands carry a tray of 0.3 kg. Without W0 and credit for released energy, the shell limits most forces."""
     loop = scenario(tmp_path, TRAY, more=UP)

@@ -117,6 +117,7 @@ def test_maps_of_the_widest_plane_match_sweeps(scenario):
     np.testing.assert_allclose(sweep.ratios("this-environment", K, B), true, rtol=2e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("theta", "least"), [(0, 1.6154), pytest.param(1, 1.8630, marks=pytest.mark.validate), (2, 2.3639)]
 )
@@ -149,6 +150,7 @@ def test_late_springs_require_the_closed_form_damping():
         np.testing.assert_allclose(needed, share * K * T, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_stiffest_certified_spring_dampers_are_known():
     """The largest K is 2740 N/m without delay (2 delta/T), and 1135 with one sample of delay against a wall.
 
@@ -431,6 +433,7 @@ def test_friction_stops_growing_oscillations():
     assert held.differ.all()
 
 
+@pytest.mark.slow
 def test_coarse_encoders_make_stable_loops_oscillate():
     calm = points(rigid(1), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
     coarse = points(with_devices(rigid(1), encoder_step=2e-4), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
@@ -486,6 +489,7 @@ def test_chai3ds_limit_of_an_omega3_is_not_certified(audit):
     assert 2740 < mark["stiffest_K_at_this_B"]["population"] < 3200
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_map_agree(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
