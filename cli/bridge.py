@@ -31,11 +31,14 @@ from haptic_loop.sim.couplings import NAMES, encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, Claim
 
-_LONGEST = 3600.0  # [s] longest session, because the trace is kept in memory
+_LONGEST = 3600.0  # [s] largest --duration, the time at full gain of an arming, because the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
-    """Run a session. Return 0 if it ended as planned, 130 if interrupted (after a ramp), 1 for any other end."""
+    """Run a session. Return 0 if it ended as planned, 130 after a signal other than SIGUSR1, 1 for any other end.
+
+    While the device is armed, the first such signal starts a ramp to zero force.
+    """
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
@@ -48,7 +51,7 @@ def main(argv: list[str]) -> int:
     _check(args, scenario, at_once, bool(behind))
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    # In a rehearsal the scenario's hands hold the handles.
+    # No person can move the axes in a rehearsal, so they are not checked; the scenario's hands hold the handles.
     checked = not (args.rehearse or args.no_axis_check)
     settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse, check_axes=checked)
     session = session_for(scenario, settings, **limits)
@@ -66,8 +69,11 @@ def main(argv: list[str]) -> int:
         render.console(args).print(verdict(programs[0].assessment), soft_wrap=True)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         if below:
-            note = "· delta is a full matrix; a device states one lower bound per axis"
-            render.console(args).print(f"{note}: {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
+            note = (
+                "· delta is a full matrix, but INFO has one number per axis: "
+                "the certificate uses the smaller diagonal matrix"
+            )
+            render.console(args).print(f"{note} {', '.join(f'{d:.4g}' for d in below)} N s/m", highlight=False)
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
@@ -153,7 +159,8 @@ def _print_certificate(
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old (median), {at[99]} us at the 99th percentile, {ages.missing} of "
-        f"{len(ages.values) + ages.missing} never arrived: {_link(link, programs[0].scenario)}"
+        f"{len(ages.values) + ages.missing} never arrived; "
+        f"the loop is certified for {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
@@ -168,7 +175,7 @@ def _print_certificate(
         console.print(f"[dim]·[/] {remark}", highlight=False)
     if len(programs) == 1:
         console.print(
-            "no reserve: no softer coupling is certified for a longer delay, so that late answers end the session"
+            "no reserve: no softer coupling is certified for a longer delay. Too many late answers end the session."
         )
 
 
@@ -190,9 +197,9 @@ def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
 
 def _link(link: int, scenario: Scenario) -> str:
     if link or not scenario.latency:
-        return f"a link of {link} tick{'s' if link > 1 else ''}"
+        return f"a link delay of {link} tick{'s' if link > 1 else ''}"
     least, most = scenario.latency[0]
-    return f"forces act {1e6 * least:.0f} to {1e6 * most:.0f} us after their tick"
+    return f"forces that act {1e6 * least:.0f} to {1e6 * most:.0f} us after their tick"
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
@@ -216,7 +223,7 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
     """Print the session's log, and the figures of the link, of energy accounts and of the scene.
 
-    Without an assessment no verdict has been printed, so that the end of the session comes first.
+    If the session ended before the assessment, print its last stage and cause first, because no verdict was printed.
     """
     if report.assessment is None:
         last = report.session.log[-1]
@@ -247,7 +254,7 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
     if report.scene and report.scene.active:
         console.print(f"active parts: {', '.join(report.scene.active)}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
-    console.print(f"counted from the first message on, measuring included: {counted or 'nothing'}")
+    console.print(f"counters of the whole session, including the delay measurement: {counted or 'nothing'}")
     if details:
         console.print(f"[dim]·[/] {CAVEATS}")
 

@@ -1,9 +1,9 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
-Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. In a loop without
-walls and friction, the scenario's own hands feel every coupling, and couplings.png shows the forces side by side,
-except for the paper's gains. With --coupling, the named couplings are drawn over frequency: singular values, required
-damping, perceived stiffness and damping.
+Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. If the loop has
+neither walls nor friction, each coupling is also run with the scenario's hands. couplings.png shows these forces side
+by side; it omits the paper's gains. With --coupling, the named couplings are drawn over frequency: singular values,
+required damping, perceived stiffness and damping.
 """
 
 from __future__ import annotations
@@ -51,9 +51,12 @@ def _parser() -> options.Parser:
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
-    parser.add_condition("condition for names without :CONDITION (default: the coupling's); your own judges every one")
+    parser.add_condition(
+        "condition for names without :CONDITION (default: the coupling's); "
+        "a condition of your own is evaluated for every coupling"
+    )
     parser.add_output(picture=True)
-    parser.only("with --coupling: the runs of every coupling use no seed", lambda args: args.coupling, "seed")
+    parser.only("with --coupling: runs without it have the seed 0", lambda args: args.coupling, "seed")
     return parser
 
 
@@ -87,8 +90,9 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return a sentence that names the guaranteed coupling of least force error, or says that there is none.
+    """Return a sentence that names the guaranteed coupling of least force error.
 
+    The sentence may also say that there is none, or that neither force error nor static stiffness is known.
     If errors are equal, the coupling with dc_ratio nearest to 1 is named.
     """
     guaranteed = [each for each in couplings if each.guarantee]
@@ -104,7 +108,10 @@ def _nearest(couplings: Sequence[Alternative]) -> str:
         return "No force error was measured, and the object has no static stiffness: the nearest coupling is not known."
     error = render.optional(best.force_error_percent, "{:.3g} % force error", "no force error was measured")
     static = "no static stiffness" if best.dc_ratio is None else f"{_share(best.dc_ratio, '-')} of the stiffness"
-    return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {static}, {error}."
+    return (
+        f"Of the couplings with a guarantee, {best.name} ({best.guarantee}) is nearest to the object: "
+        f"{static}, {error}."
+    )
 
 
 def _beside(couplings: Sequence[Alternative], own: Condition | None) -> render.Table:
@@ -221,8 +228,8 @@ def _guarantees(report: Comparison) -> render.Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = (
-        f"{damping} (available: {_list(available)} N s/m; at 10 %: for the worst stiffness or mass within 10 %) · "
-        f"{report.scenario}, case {report.case}"
+        f"{damping} (available: {_list(available)} N s/m; at 10 %: the largest requirement when a stiffness or mass "
+        f"changes by +10 % or -10 %) · {report.scenario}, case {report.case}"
     )
     scale = available[0] if alike else 1.0
     cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
@@ -253,7 +260,8 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep does not resolve frequencies below 0.5 mHz.
+    # Rounded to 1 mHz: a sweep may place a maximum at 0 up to 1e-5 rad/sample above 0.
+    return render.optional(hz and round(hz, 3), "{:.4g}")
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:
@@ -263,7 +271,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """Return the damping, `scale` times required over available, for the worst stiffness or mass within ten percent."""
+    """Return `scale` times the largest required over available damping when a parameter changes by +10 % or -10 %."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"

@@ -55,7 +55,11 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """Return "value (type)", or "a type" for a long value or an object of this package, or "None"."""
+    """Describe `value` for a message: its repr and type, such as `2.5 (float)`.
+
+    Return only `a Loop` (its type) if the repr is longer than 60 characters or has several lines, or if the class is of
+    this package. Return `None` for None.
+    """
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

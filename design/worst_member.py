@@ -144,7 +144,8 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Find a local maximum by compass search from `point`: move along an axis, or halve the step if no move helps."""
-    # With many parameters only some vertices were tried, so the first steps go to other vertices.
+    # With many parameters only some vertices were tried, so the first steps move one parameter to an end of its range
+    # (from a vertex: to a neighbouring vertex).
     step = 1.0 if point.size > _MANY else _FIRST
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]

@@ -15,7 +15,10 @@ RUNNING = (wire.Phase.ARMED, wire.Phase.HOLDING, wire.Phase.RAMP)  # phases in w
 
 
 class Device:
-    """One microcontroller. Call tick() once per period, receive() when bytes come, estop() and fault() at any time."""
+    """The state machine of one device.
+
+    Call tick() once per period, receive() when bytes come, estop() and fault() at any time.
+    """
 
     def __init__(self, info: wire.Info) -> None:
         """Begin in the state SILENT. Raises ValueError if a field of `info` does not fit into its frame."""
@@ -37,7 +40,8 @@ class Device:
         self.slots: list[wire.Force | None] = [None] * _SLOTS
         self.applied = self.ramp_from = self.zero
         self.held = self.ramp_left = self.run = 0
-        # the source tick of the last FORCE, and how long [us] before its latch it came
+        # source tick of the last FORCE that was used or too late, and how long [us] before its latch (theta = 0: before
+        # the end of its tick) it came
         self.echo, self.margin = 0, wire.NO_MARGIN
 
     @property
@@ -86,7 +90,10 @@ class Device:
             self.applied = self.config.limited(self.run, self.applied, frame.force)
 
     def halt(self, cause: wire.Cause) -> None:
-        """Ramp to zero force if armed, only stop if disarmed, and keep any other phase with its first cause."""
+        """If the device is armed or holding, begin the ramp to zero force. If it is disarmed, go to STOPPED.
+
+        In any other phase change nothing, so that the first cause stays.
+        """
         if self.phase in (wire.Phase.ARMED, wire.Phase.HOLDING):
             assert self.config is not None
             self.phase, self.cause = wire.Phase.RAMP, cause

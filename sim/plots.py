@@ -24,7 +24,8 @@ from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.sim.shown import Contacts, Onset, Run
 
-if TYPE_CHECKING:  # A second process (cli.painter) draws the picture of a run, which needs none of these modules.
+# The second process that draws a run (cli.painter) does not need controller.lti, and starts faster without it.
+if TYPE_CHECKING:
     from haptic_loop.controller.lti import Array
 
 Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison; importing them would be circular
@@ -154,7 +155,7 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
 
 
 _PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
-_LEGEND = 0.8  # columns of a legend per entry, before the figure is shrunk
+_LEGEND = 0.8  # number of legend columns divided by the number of entries, for a figure that is not shrunk
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
@@ -211,8 +212,9 @@ def draw_run(
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The frequency of the oscillation. The zoom shows at least six periods, or the whole run if that is
-            shorter. If nothing grows and no part stands out (`_stands_out`), there is no zoom.
+        frequency_hz: The frequency of the oscillation. The zoom is a part of the ticks within the credible limits and,
+            if the loop grows, before the first clipped tick. It shows at least six periods (of at most 1 s), or all
+            these ticks if they are fewer. If nothing grows and no part stands out (`_stands_out`), there is no zoom.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -283,7 +285,10 @@ _ALIKE = 0.005  # curves that differ by less, relative to the largest value, loo
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return the last part of each curve's label, for values (N, m): which earlier curve looks the same, or ""."""
+    """Return a label suffix for each column of `values` (N, m).
+
+    It is " (the same curve as NAME)" if an earlier curve looks the same, else "". It is "" if all values are 0.
+    """
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -459,8 +464,8 @@ class Panel:
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
     """Plot the forces of several couplings on equal axes, one panel each; pale curves are the object's own forces.
 
-    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is credible), so that
-    oscillating forces may leave the panels.
+    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is credible). Oscillating forces
+    do not enlarge the axes; they may be cut off.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
@@ -485,7 +490,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
         axis.set_ylabel("force [N]")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    pale = "pale: the force of the object itself for this motion, with the same delay"
+    pale = "pale: the force of the object itself for this motion, with the reference delay"
     axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label=pale)
     _legend(figure, _ordered(_entries(axes[0, 0]), around), 6)
     return save(figure, path)

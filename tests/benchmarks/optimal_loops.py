@@ -1,12 +1,16 @@
-"""Design optimal couplings for the loops n* and o* of benchmarks/loops: their mismatch, their cost, and the bound.
+"""Design optimal couplings for the loops n* and o* of benchmarks/loops.
+
+For each loop, print the mismatch of the optimal coupling, the CPU time of its design, and a lower bound on the mismatch
+of any linear coupling.
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
-`before` is the rms mismatch of an older version's optimal couplings for nine loops. `to beat` is the goal for the rms
-mismatch and the rendered stiffness g. The bound is computed for loops of at most --bound devices. Seconds are CPU
-seconds. `need` is the required over the available damping, and `at 10 %` the worst one when a parameter of the object
-changes by 10 %. `gain` is the high-frequency gain (design/transparency.py), and `limited` the mismatch of the coupling
-that also covers limited forces.
+`before` is the rms mismatch [dB] of an older version's optimal coupling, or the reason why there was none (nine loops).
+`to beat` is the goal for the rms mismatch and the rendered stiffness g. The bound is computed for loops of at most
+--bound devices. Seconds are CPU seconds. `need` is the required over the available damping. `at 10 %` is the largest
+such ratio when one spring, all springs or one mass of the environment change by +10 % or -10 %. `gain` is the
+high-frequency gain (design/transparency.py), and `limited` the mismatch of the coupling that also covers limited
+forces.
 """
 
 from __future__ import annotations
@@ -27,7 +31,9 @@ from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.scenario import load
 
 T = TypeVar("T")
-PATIENT = Options(seconds=600)  # so that a busy machine tries as many bases as an idle one
+# After 600 s of clock time no larger basis is tried, so that one loop cannot block the run. Without a limit (None) the
+# result would not depend on the load.
+PATIENT = Options(seconds=600)
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
 #: by loop: rms mismatch [dB] of an older version (or why there was none), mismatch [dB] and stiffness to beat
@@ -46,8 +52,12 @@ BEFORE = {
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--bound", type=int, default=MOST, help="most devices for the bound")
-    arguments.add_argument("--limiter", type=int, default=2, help="most devices for a design with limiter")
+    arguments.add_argument(
+        "--bound", type=int, default=MOST, help="largest number of devices for which the bound is computed"
+    )
+    arguments.add_argument(
+        "--limiter", type=int, default=2, help="largest number of devices for which a design with limiter is made"
+    )
     arguments.add_argument("--only", default="", help="beginnings of names, separated by commas")
     chosen = arguments.parse_args()
     print(f"{'loop':28} {'before':>8} {'to beat':>13} {'now':>7} {'g':>6} {'bound':>7} {'s':>5} {'states':>6}", end=" ")

@@ -69,7 +69,7 @@ def test_conditions_need_named_couplings(tmp_path):
 
 def test_the_stiffest_coupling_is_nearest_without_force_errors():
     rows = [Alternative("soft", None, "g", dc_ratio=0.3), Alternative("stiff", None, "g", dc_ratio=0.9)]
-    assert "stiff, 90 % of the stiffness" in _nearest(rows)
+    assert "stiff (g) is nearest to the object: 90 % of the stiffness" in _nearest(rows)
     assert _nearest([Alternative("soft", None, "g")]).startswith("No force error was measured")
 
 

@@ -97,7 +97,7 @@ def test_limited_springs_meet_their_closed_forms(theta):
 
 @pytest.mark.parametrize(("c", "factor"), [(0.0, 2.0), (0.25, 1.6875), (0.5, 1.5625), (1.0, 1.5), (2.0, 1.6)])
 def test_the_multiplier_sets_a_delayed_springs_need(c, factor):
-    """One sample late, a spring K needs (2 + c)^2/(4 c + 2) K T with the multiplier c."""
+    """With a delay of one sample and the multiplier c, a spring K requires the damping (2 + c)^2/(4 c + 2) K T."""
     G = Lti.constant([[1000.0]], T)
     assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
 
@@ -140,7 +140,10 @@ def test_no_multiplier_on_a_grid_is_better():
 
 
 def test_many_devices_use_the_zero_multiplier(monkeypatch):
-    """With more than `MULTIPLIER_ROWS` rows one sweep at c = 0 replaces the search, and may need more damping."""
+    """With more than `MULTIPLIER_ROWS` rows one sweep at c = 0 replaces the search.
+
+    The required damping at c = 0 may be larger than at the best c.
+    """
     best = required_damping(PAIR, BUILT, LIMITER)
     monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 3)
     monkeypatch.setattr(environments._Search, "best", None)
@@ -172,9 +175,10 @@ def test_bad_multipliers_betas_and_loops_are_refused():
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
 def test_the_least_multiple_makes_the_block_singular(rank):
-    """At the least s free + s gain is singular, just above it positive, and below it not.
+    """At the least s the matrix `free + s gain` is singular.
 
-    s is infinite unless `free` is positive where `gain` vanishes.
+    For a slightly larger s it is positive definite, and for a smaller s it is not. s is infinite unless `free` is
+    positive where `gain` vanishes.
     """
     rng = np.random.default_rng(rank)
     for _ in range(20):
@@ -285,7 +289,8 @@ def test_limiter_designs_use_all_the_damping():
     made = design(PAIR, "this-environment", limiter=True)
     assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
-    assert rms_db(made.coupling) < -10.5  # without limiter -11.19 dB, but no proof
+    # A design without `limiter` reaches -11.19 dB, but has no proof for limited forces.
+    assert rms_db(made.coupling) < -10.5
     with pytest.raises(ValueError, match="constant delays"):
         design(PAIR.switching(DelayRange((1, 1), (2, 2))), "this-environment", limiter=True)
 

@@ -124,7 +124,7 @@ class Traffic:
         return Config(self.theta, rng.randint(0, 4), rng.randint(1, 6), rng.choice((0, 0, 3, 100)), cap, slew)
 
     def force(self) -> Force:
-        """Return a valid FORCE in time, with a random force and a command that is mostly right for the phase."""
+        """Return a valid FORCE in time: mostly RUN with a random force, in DISARMED IDLE or ARM with zero force."""
         d, rng = self.device, self.rng
         source = d.k
         command, force = rng.choice((Command.IDLE, Command.ARM)), (0,) * d.info.axes
@@ -366,7 +366,10 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 @needs_gcc
 def test_the_headers_need_no_library_or_heap(tmp_path):
-    """Both headers include only C99 and have no float; the compiled harness calls memcpy, memset and strncpy only."""
+    """Apart from haptic_frame.h, the headers include only headers of standard C99, and they use no floating point.
+
+    The compiled harness calls memcpy, memset and strncpy only.
+    """
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
         '#include "haptic_frame.h"',
@@ -477,7 +480,7 @@ def test_the_sketch_counts_edges_and_obeys_its_button(sketch):
     sketch.lib.stub_set_pin(SKETCH_PINS["stop"], 0)
     (state,) = sketch.run(1200)
     assert (state.phase, state.deadman) == (Phase.ESTOP, True)
-    sketch.lib.stub_set_pin(SKETCH_PINS["deadman"], 1)  # the button is released, or its wire is broken
+    sketch.lib.stub_set_pin(SKETCH_PINS["deadman"], 1)  # the deadman is released, or its wire is broken
     (state,) = sketch.run(1200)
     assert not state.deadman
 
@@ -512,7 +515,11 @@ def test_small_write_buffers_send_whole_frames(sketch, room):
 
 @needs_gxx
 def test_only_ticks_feed_the_boards_watchdog(sketch):
-    """Ticks feed the watchdog; a loop whose clock stands still, or that hangs, does not, as the sketch's text shows."""
+    """In a running sketch the watchdog does not expire.
+
+    The source calls watchdogFeed() exactly once: in loop(), after the check that a tick is due and after the forces are
+    written.
+    """
     sketch.run(100_000)
     assert not sketch.lib.stub_bites()
     text = (HEADER / "example.ino").read_text()
@@ -521,12 +528,13 @@ def test_only_ticks_feed_the_boards_watchdog(sketch):
     assert loop.index("not due yet") < loop.index("watchdogFeed();") > loop.index("writeForces(force);")
 
 
-# The tests below check, in Python and in C, rules of docs/protocol.md that involve several ticks.
+# The tests below play short sequences of messages and ticks to both implementations and check rules of
+# docs/protocol.md.
 
 
 @pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
 def device(request):
-    """Return the Python or the C device with two axes, ticked by hand."""
+    """Return the Python or the C device with two axes, whose ticks the test calls one by one."""
     make = Device if request.param == "python" else lambda about: Firmware(request.getfixturevalue("library"), about)
     return Hand(make(info(2)))
 

@@ -155,7 +155,7 @@ def test_sessions_with_arrival_latching_replay_bit_for_bit(tmp_path, capsys):
     assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["link"]["age_us"]["p50"] == pytest.approx(TAU)
     said = " ".join(capsys.readouterr().out.split())
-    assert "forces act 30 to 230 us after their tick" in said
+    assert "forces that act 30 to 230 us after their tick" in said
     assert "one longer tick may give a hand at most 0.617 mJ for every ms" in said
     assert replay([str(tmp_path / "trace.npz")]) == 0
 

@@ -531,7 +531,7 @@ def test_walls_on_the_bridge_replay_bit_by_bit(tmp_path, capsys):
     assert bridge.main(["--rehearse", *words]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert re.search(r"link while forces acted: \d+ answers a second, 0\.00 % of ticks missed", shown)
-    assert re.search(r"counted from the first message on, measuring included: states \d+, misses 14", shown)
+    assert re.search(r"counters of the whole session, including the delay measurement: states \d+, misses 14", shown)
     assert replay_command.main([str(tmp_path / "trace.npz")]) == 0
     with pytest.raises(ValueError, match="cannot face walls"):
         bridge.main(["--rehearse", "--coupling", "optimal", *words])
