@@ -55,8 +55,7 @@ def _parser() -> options.Parser:
         "condition for names without :CONDITION (default: the coupling's); "
         "a condition of your own is evaluated for every coupling"
     )
-    parser.add_output(picture=True)
-    parser.only("with --coupling: runs without it have the seed 0", lambda args: args.coupling, "seed")
+    parser.add_output(picture=True, seed=False)
     return parser
 
 
@@ -166,7 +165,7 @@ def _held(scenario: Scenario, case: str) -> list[str]:
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     out = options.out_folder(args, "compare")
     chosen, failed = _chosen(scenario, args, args.coupling)
-    report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
+    report = Comparison.of(scenario, args.case, chosen, failed)
     files = render.pictures(args, report, out, _PICTURES)
     lines = [*report.notes, *_held(scenario, args.case)]
     tables = [_guarantees(report), _feel(report)]

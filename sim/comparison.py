@@ -204,7 +204,6 @@ class Comparison:
 
     case: str
     scenario: str
-    seed: int
     T_s: float
     theta: tuple[int, ...]
     psi: tuple[int, ...]
@@ -222,9 +221,7 @@ class Comparison:
         return [*self.couplings[0].conditions]
 
     @classmethod
-    def of(
-        cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str], seed: int
-    ) -> Comparison:
+    def of(cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str]) -> Comparison:
         """Compare the couplings `chosen`, by name; `failed` has a sentence for each failed design."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
@@ -247,5 +244,5 @@ class Comparison:
         ]
         for c in couplings:
             notes += [f"{c.name}, {name}: {each.reason}" for name, each in c.conditions.items() if each.reason]
-        about = case, scenario.name, seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
+        about = case, scenario.name, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
         return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)

@@ -199,7 +199,6 @@ class Own:
         ("validate", "--scenario world-cube --no-limiter", "--no-limiter"),
         ("validate", "--engine exact --traces all", "--traces"),
         ("validate", "--duration 0 --traces all", "--traces"),
-        ("compare", "--seed 5", "--seed"),
         ("zwidth", "--lam 0,0", "--lam"),
         ("zwidth", "--reference I", "--reference"),
         ("zwidth", "--case II", "--case II"),
