@@ -61,17 +61,19 @@ def main(argv: list[str]) -> int:
     defaults = ((EXPONENTIAL, 1), ("RK4", default))
     judged = [row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults]
     right = all(judged)
-    which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
-    verdict = None if report.interrupted else _verdict(which, right, report.rows)
+    verdict = None if report.interrupted else _verdict(judged, report.rows)
     render.publish(args, report, [table], lines, out, files, verdict)
     return options.exit_code(right, report.interrupted)
 
 
-def _verdict(which: str, right: bool, rows: Sequence[Row]) -> str:
-    """Say whether the default settings judge stability correctly, with the errors of the exponential integrator."""
-    if "judge" in which:
-        which = f"{which} stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
-    words = which
+def _verdict(judged: Sequence[bool], rows: Sequence[Row]) -> str:
+    """Say whether the default settings judge stability correctly, with the errors of the exponential integrator.
+
+    `judged` has one entry for each of the two defaults that was measured.
+    """
+    which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
+    words = f"{which} stability as the exact engine does" if judged else which
+    words = words if all(judged) else "A DEFAULT JUDGES STABILITY WRONGLY"
     for row in rows:
         if (row.integrator, row.substeps) == (EXPONENTIAL, 1):
             position = render.optional(row.position_relative_rms, "{:.1e}", "unknown")

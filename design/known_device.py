@@ -878,7 +878,7 @@ class LimitedKnownDevice(KnownDevice):
         self.plain = self.limiter = limiter
 
     def behind(self, limiter: LimitedForces) -> LimitedKnownDevice:
-        """Return the same condition, or the same user's subclass, with another limiter."""
+        """Return this condition with another limiter. An instance of a user's subclass keeps its class."""
         other = copy(self)
         other.plain = other.limiter = limiter
         return other

@@ -145,7 +145,7 @@ class Expected:
     """
 
     def __init__(self, scenario: Scenario, held: bool) -> None:
-        """Build the plants; the handles are free unless they are `held`."""
+        """Build the plants. If `held`, the hands of the scenario hold the handles; otherwise nobody does."""
         import scipy
 
         self.held, devices = held, scenario.device
@@ -187,7 +187,7 @@ class _Fit(NamedTuple):
 
     shares: Array  # (k,) coefficients of the shapes
     doubts: Array  # (k,) errors of the coefficients: sqrt(12) standard errors, which 0.05 % of normal errors exceed
-    explains: bool  # whether the last shape explains most of what the others leave
+    explains: bool  # whether the last shape explains most of the motion that the other shapes do not explain
     rest: float  # [m^2] sum of squares that remains
     fitted: Array  # (n,) [m]
 
@@ -224,7 +224,8 @@ class _Block:
         fit, tested = self.size**2 * power / own, moved[:, axis]
         both = np.linalg.qr(np.stack([wanted, late], axis=1))[0]
         self.moves = self.span > ranges
-        self.swings = bool(np.linalg.norm(both.T @ tested) > _ALIVE * math.sqrt(power))  # at any phase of the force
+        # `late` is the integral of `wanted`, so that a swing at the frequency of the force counts at any phase.
+        self.swings = bool(np.linalg.norm(both.T @ tested) > _ALIVE * math.sqrt(power))
         # A block lasts about as long as the window in which the noise was measured, so one count more is a motion.
         self.follows = (self.span > np.maximum(1, ranges // 2 + 1)) & (fit > _FIT)
         #: whether the tested axis moves like a free handle, and not like one in a hand as heavy as the device
@@ -390,7 +391,7 @@ class EncoderTest:
             return f"{name} moves much farther in one direction than in the other: {what}"
         hidden = abs(size) < max(least, 1 / _TEST_RATIO) or late_for_sure
         if hidden and self._unknown_hands and not block.free:
-            return None  # a hand can explain such a motion
+            return None  # A hand that holds the handle can make its motion small or late.
         if size < 0:
             wrong = "a positive force moves it to negative counts"
             return f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder"

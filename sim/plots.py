@@ -453,7 +453,7 @@ def _turns(f: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The data of one panel: one of several runs with the same hands."""
+    """The data of one panel. All panels of a picture show runs with the same hands."""
 
     title: str
     trace: Run

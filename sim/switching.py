@@ -262,7 +262,7 @@ class DelaysCovered:
     """Whether a certificate covers the delays of a scenario, and the damping that switching requires."""
 
     covered: bool
-    covers: str  # which delays are covered, or that none are, in words
+    covers: str  # words that say which delays are covered, or that none are
     switching: SwitchingFigures | None = off_table(default=None)
     on_file: DelayRange | None = None  # range for which the file proves any switching; None unless it covers these
 

@@ -33,7 +33,7 @@ class _Endured:
     result: str
     tenth_mib: float | None  # after a tenth of the work
     end_mib: float | None
-    allowed_mib: float  # by how much the peak may rise after a tenth
+    allowed_mib: float  # largest rise of the peak that is allowed after a tenth of the work
     holds: bool
 
 

@@ -52,7 +52,7 @@ def _delayed(rng: np.random.Generator) -> Loop:
             m = len(network.contacts)
             theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
             return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
-        except ValueError:  # some node has no element
+        except ValueError:  # A random network may have a contact without springs and masses, which a network refuses.
             continue
 
 

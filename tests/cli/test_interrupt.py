@@ -256,7 +256,8 @@ def test_ctrl_c_while_a_command_is_imported(command, tmp_path):
 
 @pytest.mark.parametrize("code", [INTERRUPT, IN_EXEC, IN_C], ids=["signal", "exec", "compiled"])
 def test_ctrl_c_while_mujoco_is_imported(code, tmp_path):
-    command = "sim.run --case none --duration 0.05 --no-plot"  # without a design, MuJoCo is imported soon
+    # Case none has no coupling to design, so that MuJoCo is imported soon.
+    command = "sim.run --case none --duration 0.05 --no-plot"
     assert interrupted_at(command, "mujoco", code, tmp_path) == (130, "interrupted\n")
 
 

@@ -144,7 +144,10 @@ def test_a_users_condition_must_name_switching_delays():
 
 @pytest.mark.slow
 def test_a_guarantee_names_its_limiters_known_devices():
-    """This-environment needs 0.991 of the damping and its limiter 1.005: only the known devices' limiter is proved."""
+    """This-environment requires 0.991 times the available damping, and 1.005 times as much if forces are limited.
+
+    So its limiter is not certified, and the limiter of the condition known-device is used and proved.
+    """
     bounds = DeviceBounds(0.1, 2000.0, 0.5, 2.0)
     loop = change(LOOP, delta=(0.98 * 1.37,), known_devices=(bounds,))
     limited = assess(loop, HERE_ONLY)

@@ -94,7 +94,7 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
 def test_safe_gains_are_proved_again_from_files(tmp_path, coupling, condition, ratio):
     stored = certified(DEFAULT, coupling, condition)
     assert stored.certificate.proof == "rational"
-    if ratio:  # None: not compared; the others have three digits
+    if ratio:  # A ratio of None is not compared. The ratios are given to three digits.
         assert stored.certificate.required[0] / 1.37 == pytest.approx(ratio, abs=1e-3)
     save(stored, tmp_path / "coupling.json")
     assert load(tmp_path / "coupling.json") == stored
@@ -314,7 +314,10 @@ def test_realisations_changed_by_rounding_are_refused(condition):
 
 
 def test_the_bound_on_rounding_holds_over_ticks():
-    """Parseval's theorem bounds the errors of 200 forces by `rounding` times |x|, and |x| is below 3 sqrt(200)."""
+    """By Parseval's theorem, each error of 200 forces is at most `rounding` times the norm of x.
+
+    The entries of x have a standard deviation of 1, so the norm of its 200 entries is below 3 sqrt(200).
+    """
     loop, rng = change(wall(1000.0, 2.0, 5.0), theta=(1,), lam=(1,)), np.random.default_rng(8)
     for size in (1.0, 1e3):
         running, exact = loop.F(cancelling(size)), loop.F(cancelling(size), exact=True)

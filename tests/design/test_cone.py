@@ -52,7 +52,7 @@ def test_stacks_hold_every_matrix_of_a_problem():
     problem, x = with_known_optimum(rng, 7, [(3, 4, True), (4, 1, False), (2, 2, True), (2, 1, False)])
     problem = ConeProgram(problem.cost, [*problem.blocks, problem.blocks[0]])
     stacks = cone._stacked(problem)
-    assert len(stacks.blocks) == 4  # the sizes 4, 1, 2 and 14
+    assert len(stacks.blocks) == 4  # one stack for each size of matrices: 4, 1, 2 and 14
     values = [
         np.sort(np.concatenate([np.linalg.eigvalsh(b.at(x)).ravel() for b in p.blocks])) for p in (problem, stacks)
     ]

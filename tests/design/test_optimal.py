@@ -318,7 +318,7 @@ def test_random_loops_get_a_proved_design(seed):
     found = design(loop, SMALLEST)
     assert found.proved
     assert this_environment(force(loop, found.coupling), loop.delta).certified
-    assert found.figures.rms_mismatch < 1.001  # zero force has 1
+    assert found.figures.rms_mismatch < 1.001  # A coupling without force has a mismatch of 1.
 
 
 def test_designs_keep_small_forces_accurate():

@@ -212,7 +212,7 @@ def test_the_cortex_m7_repeats_the_test_vector(teensy):
 def test_the_cortex_m7_limits_vectors(tmp_path):
     """For two devices of three axes, the vector limiter repeats the ticks of Python to the last bit."""
     loop = load_scenario("omega-space").loop("I")
-    stiffness, damping = [16000.0] * 3 + [6000.0] * 3, [0.2] * 3 + [2.3] * 3  # rounded design, which took ten seconds
+    stiffness, damping = [16000.0] * 3 + [6000.0] * 3, [0.2] * 3 + [2.3] * 3  # gains of a design, rounded
     coupling = SpringDamper(stiffness, damping)
     save(Stored.of(loop, coupling, assess(loop, coupling).force_limits.certificate), tmp_path / "coupling.json")
     process = ["--process", "--force-limit", "3", "--out", str(tmp_path / "coupling-process.c")]

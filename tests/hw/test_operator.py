@@ -183,10 +183,10 @@ def test_one_axis_shows_its_direction(lever):
 @pytest.mark.parametrize(
     "places",
     [
-        [(8, 0), (0, 0), (0, 6)],  # axis 1 returns before axis 2 is moved
-        [(0, 7), (0, 0), (6, 0), (6, 6)],  # the wrong axis once
-        [(6, 6), (0, 0), (6, 1), (6, 7)],  # both axes once
-        [(8, 2), (8, 10)],  # an oblique motion
+        [(8, 0), (0, 0), (0, 6)],  # Axis 1 returns before axis 2 is moved.
+        [(0, 7), (0, 0), (6, 0), (6, 6)],  # The person moves axis 2 first, goes back, and then moves axes 1 and 2.
+        [(6, 6), (0, 0), (6, 1), (6, 7)],  # The person moves both axes at first.
+        [(8, 2), (8, 10)],  # The person moves axis 1 obliquely.
     ],
 )
 def test_honest_motions_pass_the_check(places):

@@ -74,7 +74,11 @@ def test_bounds_contain_the_truth(m1, m2, k, b, delta):
 
 @pytest.mark.parametrize("held", [False, True])
 def test_derivatives_of_responses_are_exact(held):
-    """Derivatives equal central differences to 1e-5 of the largest, which covers second-order error and rounding."""
+    """Derivatives equal central differences.
+
+    The tolerance is 1e-5 times the largest difference. It covers the error of differences, which is of second order in
+    the step, and rounding.
+    """
     free = signals(0.2)[0]
     spectra = Spectra(record(free, *RIGS[0]), free, T, held)
     p = np.array([*np.log(RIGS[0][:4]), 1.37, 3e-5, 2e-5, 0.3, 0.1])

@@ -166,7 +166,7 @@ def test_scenario_files_cannot_name_classes(line, place):
     assert len(done.stderr.splitlines()) == 1
     assert not (place / "executed").exists()
     run(f"{RUN} --environment traced.py:nobody", place)
-    (place / "executed").unlink()  # the option executes the file
+    (place / "executed").unlink()  # The option --environment executes the file, so the check above could have failed.
 
 
 @pytest.mark.parametrize(

@@ -42,9 +42,9 @@ def given(simulation, trace):
 
 
 def test_budgets_are_idle_with_damping_to_spare():
-    """A budget is idle if any-environment needs at most 95 % of each damping, no force is clipped and there is no cap.
+    """The budget of this loop is idle if any-environment requires at most 95 % of the damping of each channel.
 
-    The loop has psi = 0, constant delays, ideal encoders and no walls.
+    No force may be clipped and no cap set. The loop has psi = 0, constant delays, ideal encoders and no walls.
     """
     clipped, budget = assemble(SHORT, NoCoupling()), EnergyBudget(SHORT.delta, SHORT.T, Packets((1, 2))).figures()
     unlimited = replace(clipped, process=clipped.process.unlimited)
@@ -212,7 +212,7 @@ def test_reports_say_what_the_budget_did(tmp_path):
     ]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    # The report compares this run with the exact engine's run, which must have the same budget.
+    # The position error compares this run with a run of the exact engine. It is small only if both have the budget.
     assert report["error"]["position_relative_rms"] < 1e-6
     part = report["energy_budget"]
     assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)

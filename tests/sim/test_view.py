@@ -510,7 +510,7 @@ def test_scene_files_show_the_object_beside_devices(name):
 def test_the_window_refuses_what_it_cannot_simulate(tmp_path, old, new, message):
     text = (SCENARIOS / "omega-pair.toml").read_text()
     (tmp_path / "loop.toml").write_text(text.replace(old, new))
-    film = str(tmp_path / "film.txt")  # a suffix that no film has, so that nothing runs
+    film = str(tmp_path / "film.txt")  # The suffix is refused after the scenario, so no film is made.
     with pytest.raises(InputError, match=message or "film.txt"):
         command.main(["--scenario", str(tmp_path / "loop.toml"), "--video", film])
 
@@ -801,7 +801,7 @@ def test_live_worlds_feel_as_in_a_run(tmp_path):
     np.testing.assert_allclose(frame.q[:2], trace.x[-1], rtol=0, atol=1e-4)  # [m] the frame is a tick later
     assert frame.world.ticks == 500
     assert frame.world.given_J == pytest.approx(trace.meta["world"]["given_J"], abs=1e-12)
-    assert frame.world.given_J > START_J  # the tray sinks
+    assert frame.world.given_J > START_J  # The tray sinks, so that the scene gives energy.
 
 
 def test_a_change_begins_the_scene_anew(ball):

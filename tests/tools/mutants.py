@@ -25,7 +25,7 @@ _OPERATORS = {
 }  # fmt: skip
 _NAMES = {"min": "max", "any": "all", "argmin": "argmax", "minimum": "maximum", "floor": "ceil", "zeros": "ones"}
 _NAMES |= {other: one for one, other in _NAMES.items()}
-_DROPPED = {"abs", "conj", "sqrt", "frozen", "reduced"}  # calls that may be left out around their argument
+_DROPPED = {"abs", "conj", "sqrt", "frozen", "reduced"}  # A mistake replaces a call of these functions by its argument.
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Mutant:
     module: str
     function: str  # qualified name
     place: int
-    kind: int  # number of the mistake, of those that the node allows
+    kind: int  # index of the mistake in the list of mistakes for this node
     line: int
     was: str
     now: str
@@ -66,7 +66,7 @@ def _changed(node: ast.AST, returns: str | None) -> Iterator[ast.AST | None]:
             yield ast.Constant(not value)
         case ast.Constant(value=int(value)):
             yield ast.Constant(value + 1)
-        case ast.Constant(value=float(value)) if 0 < value < float("inf"):  # most small ones are tolerances
+        case ast.Constant(value=float(value)) if 0 < value < float("inf"):  # Most numbers below 0.01 are tolerances.
             yield ast.Constant(1000 * value if value < 1e-2 else 2 * value)
         case ast.Name(id=name) | ast.Attribute(attr=name) if name in _NAMES:
             setattr(new, "id" if isinstance(node, ast.Name) else "attr", _NAMES[name])
