@@ -155,10 +155,9 @@ def remove_earlier(folder: Path, *files: str) -> None:
     """Remove the report and these files of an earlier run, which must not stand beside new results.
 
     A command removes them before it writes its first file, because Ctrl-C may come between two files. Raises InputError
-    if a file cannot be removed.
+    if a file cannot be removed, and keeps all files if the command has read one of them.
     """
-    for file in ("report.json", *files):
-        remove(folder / file)
+    remove(*(folder / file for file in ("report.json", *files)))
 
 
 def pictures(

@@ -311,18 +311,19 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     return path
 
 
-def remove(path: Path) -> None:
-    """Remove a file that an earlier run wrote, if it is there. For a link, the file that it points to is removed.
+def remove(*paths: Path) -> None:
+    """Remove files that an earlier run wrote, if they are there. For a link, the file that it points to is removed.
 
-    Raises InputError if it cannot be removed, or if the command has read it, or has written it and an option names it.
+    Raises InputError if a file cannot be removed. If the command has read one of the files, or has written it and an
+    option names it, InputError is raised before any file is removed.
     """
-    try:
-        place = _target(path)
-        if place.is_file():
-            _spare(path)
-            place.unlink()
-    except OSError as error:
-        raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
+    for unlink in (False, True):
+        for path in paths:
+            try:
+                if (place := _target(path)).is_file():
+                    place.unlink() if unlink else _spare(path)
+            except OSError as error:
+                raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
 
 
 def _spare(path: Path) -> None:

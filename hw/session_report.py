@@ -259,8 +259,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
     The files of an earlier session are removed first, the report before all others: an interrupt leaves no report.
     """
     files = []
-    for name in ("report.json", "trace.npz", "trace.csv", "figure.png"):
-        remove(out / name)
+    remove(*(out / name for name in ("report.json", "trace.npz", "trace.csv", "figure.png")))
     if len(recorder):
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
         names = session.scenario.channel_names

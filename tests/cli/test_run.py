@@ -370,14 +370,16 @@ def test_no_plot_removes_the_old_picture(tmp_path):
     assert str(picture) not in report["files"]
 
 
-def test_a_file_that_was_read_is_not_removed(tmp_path):
+def test_no_file_is_removed_if_one_was_read(tmp_path):
     with one_command():
-        path = tmp_path / "figure.png"
+        path, other = tmp_path / "figure.png", tmp_path / "report.json"
         path.write_text("a scenario of this name")
+        other.write_text("the report of an earlier run")
         read(path)
         with pytest.raises(InputError, match=r"cannot write .*figure\.png: it was read"):
-            remove(path)
+            remove(other, path)
     assert path.exists()
+    assert other.exists()
 
 
 def test_cross_checks_say_whether_verdicts_agree():
