@@ -30,7 +30,7 @@ MOST_DAMPING = 1e4  # [N s/m] largest damping of a device
 _LEAST_EIGENVALUE = 1e-9  # [N s/m] allowed in a damping matrix: far below any device's damping, above rounding errors
 AXES = ("x", "y", "z")
 
-#: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
+#: A number for all axes or one per axis; `_Levels` may also be a symmetric matrix.
 _PerAxis = float | tuple[float, ...]
 _Levels = float | tuple[float | tuple[float, ...], ...]
 _Matrix = NDArray[np.float64]
@@ -160,10 +160,9 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
 
     @property
     def most_credible_force(self) -> float:
-        """The transmission force [N] up to which its linear model is trusted: `credible_force` or an assumption.
+        """The transmission force [N] up to which its linear model is trusted.
 
-        The force at which a cable slips on its capstan is not published. The assumption is three times the motor's
-        force limit, since a transmission is made for its motor.
+        By default it is three times the motor's force limit, an assumption: a transmission is made for its motor.
         """
         return 3.0 * float(np.max(self.force_limit)) if self.credible_force is None else self.credible_force
 
@@ -226,10 +225,9 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def within(cls, device: Device, u: NDArray[np.float64]) -> Mechanics:
         """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
 
-        A negative entry of u selects the bound itself, because the worst devices lie near the bounds. A positive entry
-        moves the logarithm of its parameter evenly away from the bound. At 1 the motor has ten times its least mass,
-        the handle (which has no bound) has a hundredth of its mass, the stiffness is a tenth of the largest stiffness,
-        and the damping is the largest damping.
+        A negative entry of u selects the bound itself, because the worst devices lie near the bounds. From 0 to 1 a
+        parameter moves away from its bound on a logarithmic scale: the motor's mass to ten times the bound, the
+        stiffness to a tenth, the damping to its upper bound, the handle's mass (no bound) to a hundredth of its value.
         """
         known = device.guaranteed
         assert known is not None  # the caller draws only if every device has bounds
@@ -313,7 +311,7 @@ def _check_damping(self: Any) -> None:
     if not (lowest := np.linalg.eigvalsh(delta)[0]) >= _LEAST_EIGENVALUE:
         expected = f"eigenvalues of at least {_LEAST_EIGENVALUE:g} N s/m"
         raise ValueError(f"delta is {_listed(self.delta)} with the eigenvalue {lowest:g}, expected {expected}")
-    # eigvalsh is exact to a few units in the last place of the largest entry
+    # This tolerance is for the rounding of eigvalsh, a few units in the last place of the largest entry.
     if (left := np.linalg.eigvalsh(damping - delta)[0]) < -1e-12 * most:
         raise ValueError(
             f"delta is {_listed(self.delta)}, allowed is delta <= damping as matrices: "
@@ -368,7 +366,6 @@ _IDENTIFIED = "section 6 of the paper: a first-order model identified on an Omeg
 
 
 def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> Listed:
-    """Return a Force Dimension device of CHAI3D's table, without wrist and gripper."""
     limits = {"force_limit": force, "stiffness": stiffness, "framework_damping": 30.0}
     return Listed(f"Force Dimension {title}", **{name: _Known(value, _DELTA) for name, value in limits.items()}, **more)
 

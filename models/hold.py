@@ -1,7 +1,4 @@
-"""The plant under a zero-order hold: matrix exponentials of one plant, or of many plants at once.
-
-If forces latch later than the tick, the state is [s; forces that the actuators hold].
-"""
+"""The plant under a zero-order hold: matrix exponentials of one plant, or of many plants at once."""
 
 from __future__ import annotations
 
@@ -36,7 +33,7 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
     """Sample a continuous plant, or many plants, with its input held for T [s].
 
     If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold]. The held forces
-    act until the latch: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
+    act until the latch: s+ = A(T) s + B(T) [w; held] + B_f(T - late) (f - held), where B_f are the columns of f.
     """
     if late is not None:
         return latched(partial(hold, plant), T, late)
@@ -63,7 +60,7 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return rows (..., m, entries) that map [s; held forces; w; f] to each position at the latch of its force."""
+    """Return the matrix (..., m, entries) from [s; held forces; w; f] to each position when its force latches."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -99,7 +96,7 @@ def expm_each(matrices: _Array) -> _Array:
     """Return the exponential of each of (nsim, n, n) matrices, by scaling and squaring.
 
     Each result depends on its own matrix only. scipy.linalg.expm calls a threaded BLAS for every matrix, which made
-    verdicts about many humans several times slower on busy cores, and its import takes as long as a short run.
+    verdicts about many humans several times slower.
     """
     norm = np.abs(matrices).sum(axis=1).max(axis=1)
     halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
@@ -169,10 +166,7 @@ def product_of(matrices: _Array) -> Product:
 
 
 def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
-    """Return rows and columns of the independent blocks of a (states, states + inputs) pattern of nonzeros.
-
-    The arrays have the shapes (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
-    """
+    """Return rows (blocks, rows) and columns (blocks, columns) of the pattern's independent blocks, padded with -1."""
     import scipy
 
     n, width = pattern.shape

@@ -3,8 +3,6 @@
 Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
 feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). The constructor of a `Port` checks passivity,
 so every human in a simulation is passive.
-
-On a device with several axes a port of one axis acts in the same way along each axis (`Port.in_space`).
 """
 
 from __future__ import annotations
@@ -75,7 +73,7 @@ class Impedance:
 
 
 def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
-    """Raise ValueError unless Z is stable and Re Z(jw) >= 0 at every frequency, within _ROUNDING of its mean size."""
+    """Raise ValueError unless Z is stable and Re Z(jw) >= -_ROUNDING times the mean of |Z| at every frequency."""
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected a stable A")
@@ -104,9 +102,8 @@ class Port:
     The points are the handles (several if a person holds several devices), followed by the human's own masses. The
     base is ground, or a person's body if the port is an arm of this person. Row i of `across` holds the derivatives of
     the length of spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers
-    for a lever. With several axes every point and the base have `axes` neighbouring columns of `across`.
-    The port is passive because no parameter is negative and the impedance is passive. Arrays with a leading axis hold
-    many humans of the same structure.
+    for a lever. With several axes every point and the base have `axes` neighbouring columns of `across`. Arrays with a
+    leading axis hold many humans of the same structure.
 
     Raises:
         ValueError: A shape does not match, a parameter is negative, a point other than a handle has no mass, `pull` is
@@ -373,8 +370,7 @@ _MOST_LINKS = 500  # Largest number for one hand: its eigenvalues take 5 s; thos
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A chain of masses and spring-dampers, from the handle to the equilibrium.
 
-    The chain is passive because no parameter can be negative. One link is the usual mass-damper-spring hand, two links
-    are a hand with a grip on an arm, and links without damping form a lossless chain.
+    One link is the usual mass-damper-spring hand, and two links are a hand with a grip on an arm.
     """
 
     links: Annotated[tuple[Link, ...], msgspec.Meta(min_length=1)]
@@ -433,10 +429,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
 
 
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A hand as a transfer function from velocity to force, `mass` s + C (s I - A)^-1 B + D.
-
-    The hand has no bodies. The MuJoCo engines integrate its state beside those of the scene (sim.engines).
-    """
+    """A hand without bodies: a transfer function from velocity to force, `mass` s + C (s I - A)^-1 B + D."""
 
     A: tuple[tuple[float, ...], ...]
     B: tuple[tuple[float, ...], ...]
@@ -471,8 +464,8 @@ class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A person who holds several devices: a passive mechanical multi-port.
 
-    The arms at these devices end on the person's body instead of on ground. The body is a mass with a spring-damper
-    to ground. The spring-damper `cross` joins each hand to the next, in the order of `holds`.
+    The arms that hold these devices end on the person's body instead of on ground. The body is a mass with a
+    spring-damper to ground. The spring-damper `cross` joins each hand to the next, in the order of `holds`.
     """
 
     holds: tuple[int, ...]  # devices, counted from 1

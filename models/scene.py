@@ -40,25 +40,23 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
-# Motor, handle and transmission come from compliant.xml or rigid.xml, which a viewer can open. The motor of device i is
-# called device_i/motor, and so on. The scenario gives the parameters. The scene's XML contains shapes that are only
-# drawn; the simulated model does not.
+# Motor, handle and transmission come from compliant.xml or rigid.xml and get the prefix device_i/. The scene's XML
+# contains shapes that are only drawn; the simulated model does not.
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices.
 # Gravity, contacts and constraints are off, except for the Coulomb friction of devices. The inputs are MuJoCo
 # actuators: first the external forces (voluntary motion and taps), then one motor per channel with gear -1, because
 # the device feels -f.
 #
-# A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper that stretches with one joint
-# alone becomes a property of this joint; every other spring-damper becomes a fixed tendon. An impedance (A, B, C, D)
-# has no body: it is stored in the model's custom numbers, where `plant` reads it, and the engines integrate its state.
+# A spring-damper that stretches with one joint alone becomes a property of this joint; every other one becomes
+# a fixed tendon. An impedance (A, B, C, D) has no body: it is stored in the model's custom numbers, where `plant` reads
+# it, and the engines integrate its state.
 
 
 _Array = NDArray[np.floating[Any]]
 
-#: A device creeps while MuJoCo's friction holds it. With these parameters a device of 0.25 kg stops within 1.5e-6 m of
-#: the point that follows from Coulomb's law, and creeps at 1e-7 m/s under half the friction force. With MuJoCo's
-#: defaults it stops within 7e-5 m and creeps at 6e-4 m/s.
+#: MuJoCo's friction lets a held device creep. A device of 0.25 kg under half its friction force creeps at 1e-7 m/s with
+#: these parameters, and at 6e-4 m/s with MuJoCo's defaults.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 _FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] distances of devices and of bodies of one device; height of bodies
@@ -94,7 +92,6 @@ class Scene:
 
     @cached_property
     def plant(self) -> Plant:
-        """The linear plant of the model (see `plant`)."""
         return plant(self.model)
 
 
@@ -186,7 +183,6 @@ def _plant(
 
 
 def _impedances(model: mujoco.MjModel) -> list[_Felt]:
-    """Read the impedances from the custom numbers of a model."""
     felt = []
     for i in range(model.nnumeric):
         first, size = int(model.numeric_adr[i]), int(model.numeric_size[i])
@@ -332,10 +328,7 @@ class _Placed(NamedTuple):
 def _placed(
     devices: Sequence[Device], ports: Sequence[Port], held: Sequence[tuple[tuple[int, ...], Port]]
 ) -> tuple[_Placed, ...]:
-    """Return the placed ports of all devices, then those of the persons who hold several devices.
-
-    Raises ValueError as `build` does.
-    """
+    """Return the placed ports of all devices, then those of `held`. Raises ValueError as `build` does."""
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
     check_holds([holds for holds, _ in held], len(devices))
@@ -378,7 +371,7 @@ def _place(port: Port, joints: tuple[str, ...], base: tuple[str, ...], name: str
 
 
 class _Amounts(NamedTuple):
-    """Masses, dampings and stiffnesses by the name of a joint or tendon; with many sets of humans, arrays over sets."""
+    """Masses, dampings and stiffnesses by the name of a joint or tendon: numbers, or arrays over the sets of humans."""
 
     mass: dict[str, Any]  # in the order motors, handles, other masses
     damping: dict[str, Any]
@@ -688,7 +681,6 @@ class Crowd:
 
 
 def _link(row: _Array, axes: int) -> Link:
-    """Return a link from its numbers in `Crowd.links`, on a device with `axes` axes."""
     if axes == 1:
         return Link(*row[:3].tolist())
     along, count = directions(axes), axes**2
@@ -773,7 +765,7 @@ def _draw_bodies(population: Population, persons: int, seed: int, index: int) ->
 
 @dataclass(frozen=True, eq=False)
 class HumanSets:
-    """Sets of any humans, with one human per device. The sets differ in parameters only, and have the same persons."""
+    """Sets of any humans, with the methods of Crowd. The sets differ in parameters only, and have the same persons."""
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, devices)
     people: tuple[Person, ...] = ()
@@ -789,15 +781,12 @@ class HumanSets:
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """For each person with several devices: the devices, and the port with a leading axis over the sets."""
         return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
 
     def humans(self, i: int) -> tuple[Hand, ...]:
-        """Return the humans of set i, one per device."""
         return self.sets[i]
 
     def persons(self, i: int) -> tuple[Person, ...]:
-        """Return the persons of set i who hold several devices."""
         return self.people
 
 

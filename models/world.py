@@ -8,8 +8,8 @@ integrator then solves in each step of length h
 
     f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
 
-The functions take G and u0 as numbers and need no coupling or device. controller.budget.Shell measures and limits the
-energy that a scene generates. The lemma in docs/theory.md, "MuJoCo worlds", bounds this energy for ordinary scenes.
+controller.budget.Shell measures and limits the energy that a scene generates. The lemma in docs/theory.md, "MuJoCo
+worlds", bounds this energy for ordinary scenes.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def files_of(path: Path) -> list[Path]:
 
     visit(path, path.parent)
     for name in assets:
-        # with the compiler's option strippath only the last part of a name counts
+        # The compiler's option strippath keeps only the last part of a name.
         places = [folder / part for folder in folders for part in (name, Path(name).name)]
         files.update(dict.fromkeys(place for place in places if place.is_file()))
     return list(files)
@@ -136,9 +136,9 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Return the names of the children of the world, in file order, that have no joint and are not mocap bodies.
+    """Return the names of the world's children that have no joint and are not mocap bodies, in file order.
 
-    Those that are not welded may be contacts. Raises ValueError for a file that cannot be read or that MuJoCo refuses.
+    All of them but welded bodies may be contacts. Raises ValueError for a file that MuJoCo refuses or cannot read.
     """
     return _without_joints(_spec(path))
 
@@ -182,7 +182,6 @@ class World:
             self._compile(stiffness, gravity)
 
     def _compile(self, stiffness: Sequence[Array], gravity: bool) -> None:
-        """Build the model, and store the indices of its slides."""
         spec = _spec(self.path)
         base = _compiled(spec, self.path)
         self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
@@ -478,10 +477,9 @@ class WorldPort:
     """One simulation of a world, tick by tick, with the energy that the scene has generated."""
 
     def __init__(self, world: World, force_limit: Array, balls: Sequence[slice] = ()) -> None:
-        """Start a simulation with `force_limit` (m,) [N], inf for none.
+        """Start a simulation with `force_limit` (m,) [N], inf for none, and `balls` as in World.port.
 
-        If a contact's channels are one of the `balls`, the limit bounds the length of its force. Raises ValueError for
-        a limit that is not positive, or a ball whose channels have different limits.
+        Raises ValueError for a limit that is not positive, or a ball whose channels have different limits.
         """
         if force_limit.shape != (world.channels,) or not (force_limit > 0).all():
             raise ValueError(f"force_limit is {force_limit.tolist()}, expected {world.channels} positive forces in N")
@@ -511,7 +509,7 @@ class WorldPort:
         """
         world = self.world
         goal = world._Q.T @ u0
-        # The scene does not move between its steps, so it does no work there.
+        # Between the steps of the scene its position is constant, so that the forces do no work.
         force = self._within(self._spring(goal)) if self.ticks % world.every else self._stepped(goal)
         self.ticks += 1
         return force
