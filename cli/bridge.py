@@ -42,6 +42,9 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
+    if seconds > _LONGEST:
+        allowed = f"a session lasts 0.1 to {_LONGEST:g} s: use --duration"
+        raise InputError(f"duration = {seconds:g} s in scenario {scenario.name}; {allowed}")
     # A device without a clock applies each force on arrival.
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)
     start = world_start(args) if is_world(scenario) else START_J

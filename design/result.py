@@ -200,7 +200,7 @@ def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) 
 
     With `once`, three or more values with the same digits are printed as one.
     """
-    texts = ["inf" if v is None else f"{v:.{digits}g}" for v in values]
+    texts = ["inf" if v is None else f"{v + 0.0:.{digits}g}" for v in values]
     return texts[0] if once and len(texts) > 2 and len(set(texts)) == 1 else ", ".join(texts)
 
 

@@ -394,7 +394,12 @@ def test_a_search_of_another_condition_is_repeated(monkeypatch):
 
 @pytest.mark.parametrize(
     ("values", "text"),
-    [((1.37, 1.37, 1.37), "1.37"), ((1.37, 1.37), "1.37, 1.37"), ((1.37, 1.37, 1.36), "1.37, 1.37, 1.36")],
+    [
+        ((1.37, 1.37, 1.37), "1.37"),
+        ((1.37, 1.37), "1.37, 1.37"),
+        ((1.37, 1.37, 1.36), "1.37, 1.37, 1.36"),
+        ((-0.0,), "0"),
+    ],
 )
 def test_three_equal_dampings_print_once(values, text):
     assert listed(values, once=True) == text

@@ -448,6 +448,14 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
     os.close(slave)
 
 
+def test_too_long_sessions_of_scenarios_are_refused(tmp_path):
+    path = tmp_path / "long.toml"
+    scenario = (ROOT / "sim/scenarios/omega-pair.toml").read_text()
+    path.write_text(scenario.replace("duration = 15.0", "duration = 4000"))
+    with pytest.raises(InputError, match=r"^duration = 4000 s in scenario omega-pair; a session lasts 0\.1 to 3600 s"):
+        bridge.main(["--rehearse", "--scenario", str(path), "--out", str(tmp_path / "out")])
+
+
 @pytest.mark.parametrize("module", [bridge, identify])
 def test_varying_delays_of_scenarios_are_refused(module, scenario, tmp_path, monkeypatch):
     """The link has its own delays, so a scenario's [varying_delay] is refused instead of ignored."""
