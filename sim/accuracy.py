@@ -1,7 +1,7 @@
 """Accuracy of runs: errors of engines and of felt forces, and the choice of an integrator and its substeps.
 
 `measure` returns the cost and the errors of one setting (engine, integrator, substeps). `compare_engines` runs several
-settings on a scene, and `pick` chooses the cheapest one within a given error. `settle` supplies defaults of settings.
+settings on a scene, and `pick` chooses the cheapest one within a given error.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def position_error(
     """Return the position error of a trace against the exact engine.
 
     `grows` says whether the loop is unstable; by default its eigenvalues decide. An unstable trace that clips gets no
-    figures, because growth multiplies any difference. Then `reason` has the error up to the first clipped tick.
+    figures, because growth multiplies any difference; `reason` then has the error up to the first clipped tick.
     """
     if exact is None:
         return PositionError(reason="the loop has Coulomb friction, which the exact engine does not model")
@@ -92,8 +92,8 @@ class Row:
     position_relative_rms: float | None  # as in PositionError
     growth_rate_error: float  # [1/s] the error with or without the coupling, whichever is larger in magnitude
     verdict_correct: bool  # whether the verdicts with and without the coupling are both right
-    cycle_deviation_n: float | None  # standard deviation of a force in the limit cycle without coupling
-    cycle_frequency_hz: float | None  # frequency of the same force in the limit cycle
+    cycle_deviation_n: float | None  # standard deviation of one channel's force in the limit cycle without coupling
+    cycle_frequency_hz: float | None  # frequency of the same force
     cycle_deviation_error: float | None  # relative error of `cycle_deviation_n`
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
@@ -147,7 +147,7 @@ def measure_all(
 
 
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
-    """Run one setting, and return its row with the errors; its cost is the shortest wall time of _REPEATS runs."""
+    """Run one setting, and return its cost and errors."""
     settings = (engine, integrator, substeps)
     trace, wall = _timed(truth.coupled, *settings)
     for _ in range(_REPEATS - 1):
@@ -160,8 +160,7 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 def _with_front(rows: Sequence[Row]) -> list[Row]:
     """Set `pareto` for rows with right verdicts and finite figures that no row of the same engine dominates.
 
-    A dominating row is no worse in cost, position error and growth error, and better in one of them. MuJoCo's settings
-    do not compete with the exact engine, which exists for linear plants only.
+    Engines do not compete with one another, because the exact engine exists for linear plants only.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -189,10 +188,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
 
 
 def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
-    """Return the growth-rate error [1/s] of larger magnitude, of two loops, and whether both verdicts are right.
-
-    The two loops are the coupled and the uncoupled one.
-    """
+    """Return the larger growth-rate error [1/s] of the coupled and uncoupled loop, and if both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
         held = _measured_hold(simulation, engine, integrator, substeps)
@@ -231,12 +227,11 @@ def _point(row: Row) -> Array:
 class Credible:
     """When a run leaves the range of the devices' linear model, with peak forces and speeds, and their limits.
 
-    Each list has one entry per channel, but the peaks of a run without ticks are empty. The transmission force of a
-    rigid device is None.
+    Each list has one entry per channel, but the peaks of a run without ticks are empty.
     """
 
-    until_s: float | None
-    transmission_force_n: list[float | None]
+    until_s: float | None  # first time at which a transmission force or a motor speed exceeds its limit
+    transmission_force_n: list[float | None]  # None for a rigid device
     motor_speed_m_per_s: list[float]
     credible_force_n: list[float | None]
     credible_speed_m_per_s: list[float]
@@ -246,8 +241,7 @@ class Credible:
 def credible(simulation: Simulation, trace: Trace) -> Credible:
     """Check whether a run stays within the forces and speeds for which the devices' linear model is credible.
 
-    `until_s` is the first time at which a transmission carries more than `most_credible_force`, or a motor moves faster
-    than `credible_speed`. It is None if neither happens.
+    The limits are `Device.most_credible_force` and `Device.credible_speed`.
     """
     n, devices = simulation.scene.model.nq, simulation.scenario.axis_devices
     forces: list[float | None] = []
@@ -274,7 +268,6 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
 
 
 def _not_credible(credible: Credible, until: float) -> str:
-    """Return a sentence that says by how much a run exceeds the credible limits."""
     pairs = zip(credible.transmission_force_n, credible.credible_force_n, strict=True)
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
     speeds = zip(credible.motor_speed_m_per_s, credible.credible_speed_m_per_s, strict=True)
@@ -315,7 +308,6 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     """Compare the run's forces before clipping with those of Lambda E for the measured displacements.
 
     With switching delays, a limiter or a passivity layer, the forces that the devices received are compared instead.
-    With walls there is no comparison, because walls have no linear ideal.
     """
     process = simulation.process
     if process.walls:
@@ -344,15 +336,14 @@ def _rms(values: Array) -> float:
 # ---- the cheapest engine and step for a given error
 #
 # The error is the relative rms error of the encoders' positions over the run. Without friction the reference is a run
-# with the exact engine. With friction that engine cannot run. Then two runs of RK4 are compared, one with n and one
-# with 2 n substeps, and n is doubled until their difference is small enough. If every doubling multiplies the
-# difference by q, the error of the finest run is q/(1 - q) times the last difference; a method of first order has q =
-# 1/2. One pair of runs may agree by chance, so q is the larger ratio of the last two doublings. It is at least _EVEN,
-# because friction makes the ratio jump.
+# with the exact engine. With friction, two runs of RK4 are compared, with n and with 2 n substeps, and n is doubled
+# until their difference is small enough. If every doubling multiplies the difference by q, the error of the finest run
+# is q/(1 - q) times the last difference; a method of first order has q = 1/2. Two runs may agree by chance, so q is the
+# larger ratio of the last two doublings. It is at least _EVEN, because friction makes the ratio jump.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # largest number of substeps of a refined reference
-_MOST_EVALUATIONS = 6e7  # largest number in all runs of a refinement; these evaluations take two minutes
+_MOST_EVALUATIONS = 6e7  # largest number of evaluations of the dynamics in a refinement; they take two minutes
 _EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
 _FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three
@@ -364,7 +355,7 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # error of the positions plus the error bound of a refined reference; inf: ended early
+    position_relative_rms: float  # error of positions plus the reference's error bound; inf if the run ended early
     verdict_correct: bool  # whether the simulated loop has the verdict of the exact loop
     cpu_s: float  # CPU time of the run, for the report only
 
@@ -384,11 +375,10 @@ def compare_engines(
     """Run the settings that are stable on the scene's plant for `ticks` ticks, and return them, the cheapest first.
 
     Runs include the scenario's walls, limits, encoder steps, varying delays and passivity layer. Verdicts are for
-    constant delays without the layer. With friction, RK4 is refined until the run with half of the reference's substeps
-    has an error of at most `error`. Every run calls `progress`.
+    constant delays without the layer. Every run calls `progress`.
 
-    Raises InputError if `error` is not positive, if 256 substeps or 60 million evaluations of the dynamics do not
-    suffice, or if nothing moves.
+    Raises InputError if `error` is not positive, if nothing moves, or if, with friction, 256 substeps or 60 million
+    evaluations of the dynamics do not suffice.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -520,13 +510,12 @@ def _positions(
 
 
 def _require_motion(positions: Array) -> None:
-    """Raise InputError if nothing moves, because a relative error is then undefined."""
     if not positions.any():
         raise InputError("--error is relative to the motion, but nothing moves: add a tap or a voluntary motion")
 
 
 def _apart(own: Array, truth: Array) -> float:
-    """Return the rms difference relative to `truth`; inf if one of the runs ended early, 0 if `truth` is all 0."""
+    """Return the rms difference relative to the rms of `truth`; inf for different lengths, 0 if `truth` is all 0."""
     if own.shape != truth.shape:
         return math.inf
     scale = float(np.mean(truth**2))
@@ -538,8 +527,8 @@ def _apart(own: Array, truth: Array) -> float:
 #
 # Without friction the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
 # the continuous plant decide: a step h [s] must resolve the fastest weakly damped mode w [rad/s] (w h <= 0.2), and
-# follow the strongest damping a [1/s] (a h < 1). The number of steps is doubled until the verdict is that of the exact
-# loop.
+# follow the strongest damping a [1/s] (a h < 1). The number of steps is at least 4, and is doubled until the verdict is
+# that of the exact loop.
 
 MOST = 10_000  # largest number of substeps
 _MODE_LOST = "it damps fast modes away"
@@ -571,8 +560,7 @@ def settle(
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     """Return 1 for the exponential integrator without friction, else a number of steps that resolves the plant.
 
-    The number is at least 4, and is doubled until the simulated loop has the verdict of the exact loop. Raises
-    InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
+    Raises InputError if no number up to 10000 suffices, or for MuJoCo's integrator `discrete`.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return least_substeps(EXPONENTIAL)
@@ -641,8 +629,7 @@ def _measured_hold(
 ) -> HeldPlant:
     """Return the map s[k+1] = A s[k] + B [w; f][k] of an engine, by stepping every basis state and input once.
 
-    Closed with the force map, this map has the growth rate that the engine simulates. The default of `T` [s] is the
-    scenario's period.
+    The default of `T` [s] is the scenario's period.
     """
     period, simulation = simulation.scenario.T if T is None else T, simulation.even
     stepped = make_engine(simulation, engine, integrator, substeps, period)

@@ -1,14 +1,13 @@
 """Seeded searches for the passive humans whose loop grows fastest: lossless chains, or hands of the population.
 
-A lossless chain of masses and springs takes no energy out, and can present any reactance at the frequency where the
+A lossless chain of masses and springs dissipates no energy, and can present any reactance at the frequency where the
 loop is weakest. Masses and stiffnesses are bounded, so that no mode of a human exceeds about 3 kHz; above it, errors of
 the matrix exponential would decide the verdict.
 
 All conditions but the known-device ones assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact
-it dissipates the integral of v^2, which is larger unless v is constant between samples. For a sinusoid of frequency f,
-|dx|^2 / T is (sin a / a)^2 times the integral, with a = pi f T. At the frequency where it binds, a condition therefore
-requires too much damping: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (loops with long delays). If the damping lacks no
-more than this, no search has found an unstable human; if it lacks more, most searches find one.
+it dissipates the integral of v^2. For a sinusoid of frequency f, |dx|^2 / T is (sin a / a)^2 times the integral, with
+a = pi f T. At the frequency f where it binds, a condition therefore requires too much damping, by (a / sin a)^2: 4.8 %
+at 101 Hz and T = 1.2 ms. If the damping lacks no more than this, no search has found an unstable human.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class _Pass(NamedTuple):
 
 
 _PASSES = (_Pass(1, 2.0), _Pass(2, 2.0), _Pass(1, 0.0), _Pass(1, 2.0, held=True))
-_CANDIDATES = 120  # sets of humans in a generation
+_CANDIDATES = 120  # number of sets of humans in a generation
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def search_population(
     """Search for the worst sets of hands that the scenario's population can draw.
 
     In the first generation all sets are new draws, later half of them. The others take each device's hand from one of
-    the worst sets so far, or from a new draw. So each hand is one that the population drew.
+    the worst sets so far, or from a new draw.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []
@@ -144,7 +143,7 @@ def search_population(
 
 
 def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
-    """Return each set with its growth [1/s]; if no mode grows, with the growth of the modes above 2 Hz."""
+    """Return (growth [1/s], set) for each set: of all modes if one grows, otherwise of the modes from 2 Hz up."""
     layouts: dict[object, list[tuple[Hand, ...]]] = {}
     for hands in sets:
         layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)

@@ -58,7 +58,7 @@ class ScenarioRun:
 
     simulation: Simulation  # the loop without a net (passivity layer)
     ran: Simulation  # the loop that ran: `simulation`, with its net if there is one
-    period: Period | None  # the worst switching of the delays; None unless their pattern is adversarial
+    period: Period | None  # the worst switching of the delays; None unless the pattern of the delays is adversarial
     choices: tuple[EngineChoice, ...]  # the compared settings if an error was requested, the cheapest first
     settings: EngineSettings  # engine, integrator and steps, with defaults filled in
     remarks: list[str]  # remarks on integrator and substeps
@@ -134,15 +134,14 @@ def simulate(
         coupling: None for the loop without a coupling, or a coupling, a design or the file "design.json" of a design.
         engine: "mujoco", "exact" (the linear loop, without Coulomb friction), your own engine (sim.engines.Engine), or
             a function that makes one from a sim.run.Simulation.
-        integrator: An integrator of MuJoCo. None is "exponential", or "RK4" if a device has Coulomb friction.
-        substeps: Steps per period. None is the default of the plant.
+        integrator: An integrator of MuJoCo. None means "exponential", or "RK4" if a device has Coulomb friction.
+        substeps: Steps per period. None means the default (sim.accuracy.default_substeps).
         seed: Seed of varying delays, periods and latencies.
         environment: A function that replaces the scenario's environment. Once a tick it receives the positions (m,)
             [m] that its port would have without a force, and returns the forces fed back, (m,) [N]. A shell makes the
-            function passive up to the energy `energy_budget`. If the coupling is certified for any environment, and psi
-            is 0, no passive hand makes the loop unstable.
+            function passive up to the energy `energy_budget`.
         energy_budget: W0 [J]. With `environment` or a MuJoCo scene it is the shell's (default 0, in a scene START_J).
-            Otherwise it is the energy budget of the devices; None means none.
+            Otherwise it is the energy budget of the devices; None means that they have no budget.
         limiter: False to clip forces. By default a limiter limits them, if the coupling's guarantee covers a limiter
             (`meta["assessment"]["force_limits"]`).
 
@@ -244,8 +243,8 @@ def validate(
         seed: Seed of the draws.
         engine: "exact", "mujoco" or "both", or your own class (sim.engines.Engine), which is compared with the exact
             engine and makes one engine for each set of humans.
-        duration: Length [s] of the traces. 0 means no traces: growth rates come from eigenvalues over one period,
-            except under varying delays or ticks (`Findings.switching`).
+        duration: Length [s] of the traces; 0 means no traces, only eigenvalues over one period (and, under varying
+            delays or ticks, `Findings.switching`).
         shards: Number of processes. A script with more than 1 needs `if __name__ == "__main__"`.
         progress: Called with (parts done, number of parts).
         limiter: False to clip forces.
@@ -254,8 +253,7 @@ def validate(
 
     Returns:
         Findings with n = humans. `exact` and `mujoco` (n,) are growth rates [1/s], positive where a human makes the
-        loop unstable. `radius` (n,) and `frequency` (n,) [Hz] describe the exact loop's dominant mode, `disagreements`
-        (n,) whether the engines disagree. crowds.Findings lists the other fields.
+        loop unstable; `disagreements` (n,) says whether the engines disagree. crowds.Findings lists the other fields.
 
     Raises:
         InputError: A device has Coulomb friction, or the environment is a MuJoCo scene; verdicts are of linear loops.

@@ -1,9 +1,9 @@
 """Comparison of couplings: with the same devices and hands (`alternatives`), and over frequency (`Comparison`).
 
-The alternatives are: no coupling, the paper's gains (in the paper's loop only), and the spring-dampers for any passive
-environment and for this environment. The optimal coupling is included if it is quick to find. Each coupling is assessed
-with its proof and, in loops without walls or friction, drives the same hands in the exact engine. Over frequency,
-couplings of the user's choice are compared by required damping, robustness and felt impedance.
+The alternatives are: no coupling, the paper's gains (in the paper's loop only), the spring-dampers for any passive
+environment and for this environment, and the optimal coupling if it is quick to find. In loops without walls or
+friction, each also drives the same hands in the exact engine. Over frequency, couplings of the user's choice are
+compared by required damping, robustness and felt impedance.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ class Alternative:
 
     @property
     def name(self) -> str:
-        """The name in tables and pictures: for a spring-damper its condition."""
+        """The name in tables and pictures: of a spring-damper its condition, otherwise the kind of the coupling."""
         if self.coupling == "spring-damper":
             return self.condition or ""
         return self.coupling
 
     def needs(self, condition: str) -> float | None:
-        """Return required over available damping of the worst channel; None if it is infinite or not judged."""
+        """Return required over available damping of the worst channel; None if infinite, or if not computed."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None
@@ -81,10 +81,10 @@ def alternatives(
     progress: Callable[[int, int], None] = lambda done, of: None,
     also: Condition | None = None,
 ) -> list[Alternative]:
-    """Judge each coupling of `_ROWS` that is possible in the loop; run it if there are no walls and no friction.
+    """Assess each coupling of `_ROWS` that is possible in the loop; run it if there are no walls and no friction.
 
-    Scenarios with ranges get designs for any environment only. Scenarios with walls get no optimal coupling, because
-    it contains a linear model. `also` is a user's own condition, by which every coupling is judged in addition.
+    Scenarios with walls get no optimal coupling, because it contains a linear model. `also` is a user's own condition,
+    for which the required damping of every coupling is computed in addition.
 
     Raises:
         InputError: the delays switch.
@@ -177,7 +177,7 @@ class ComparedCoupling:
     def of(
         cls, loop: Loop, name: str, chosen: Chosen, assessment: Assessment, judged: compare.Demands, hz: Array
     ) -> ComparedCoupling:
-        """Compute the curves of one coupling in `loop` at the frequencies `hz` (k,) [Hz]."""
+        """Compute the curves of one coupling at the frequencies `hz` (k,) [Hz]."""
         curves, conditions = compare.curves(loop, judged, hz), {}
         for key, requirement in judged.requirements.items():
             demand, reason = curves.demands[key], requirement.reason
@@ -217,7 +217,7 @@ class Comparison:
 
     @property
     def conditions(self) -> list[str]:
-        """Names of the conditions by which every coupling is judged."""
+        """Names of the conditions for which every coupling's required damping is computed."""
         return [*self.couplings[0].conditions]
 
     @classmethod

@@ -48,7 +48,7 @@ def choose(
         case: The reference delays, "I" or "II"; "none" for the loop without a coupling.
         name: One of NAMES, FILE.json, or FILE.py:NAME of a user's own function.
         condition: The condition of a design, by name or a user's own; None for the kind's usual condition.
-        limiter: For kinds whose designs cover limited forces if possible: True to require it, False to ignore limits.
+        limiter: For kinds whose proof covers limited forces if possible: True to require that, False to ignore limits.
         progress: Called during long searches with (task, steps done, number of steps).
 
     Raises:
@@ -76,7 +76,6 @@ def _choose(
     limiter: bool | None,
     progress: Callable[[str, int, int], None],
 ) -> Chosen:
-    """Return the coupling `name` for the condition named `condition`, or for the user's own condition `own`."""
     if case == "none":
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
@@ -149,15 +148,13 @@ def from_file(
         stored: The content of the file.
         loop: The loop in which the coupling is used.
         kind: The name of the coupling in reports.
-        own: The user's own condition, which verifies a certificate with this condition's name.
+        own: The user's own condition. The file stores only its name, and its certificate needs the condition.
         coupling: The file's coupling if the caller has built it, for example for another T.
 
     Returns:
-        The choice. Its `certificate` holds for the loop of the file, which may differ from `loop`: `assess` compares
-        both loops.
+        The choice. Its `certificate` holds for the loop of the file, which may differ from `loop`.
     """
     claim, coupling = stored.certificate, coupling or stored.built()
-    # The file stores only the name of a user's own condition, so the caller must pass the condition again.
     made_for = claim.condition if claim and claim.condition in CONDITIONS else THIS_ENVIRONMENT.name
     condition = own if claim and own and claim.condition == own.name else None
     try:
@@ -196,8 +193,7 @@ def from_file(
     )
 
 
-# ----------------------------------------------------------------------------------------------------
-# The coupling in the scenario's loop, assessed before anything runs.
+# ---- assessment before a run
 
 
 def assessed(
@@ -226,7 +222,7 @@ def assessed(
         progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment, qualified by the scenario's encoder steps and lost packets (`qualified`).
+        The assessment; encoder steps or lost packets may have removed its guarantee (`qualified`).
     """
     assessment = assess(
         scenario.loop(case),
@@ -247,11 +243,10 @@ def assessed(
 
 
 def qualified(scenario: Scenario, case: str, assessment: Assessment) -> Assessment:
-    """Return the assessment of a scenario's loop, qualified by the encoder steps and lost packets of the scenario.
+    """Add the scenario's encoder steps to an assessment, and remove a guarantee that does not cover the scenario.
 
-    `Assessment.encoder` compares the devices' friction with that needed for the encoder steps. A shell gives no
-    guarantee with encoder steps. With lost packets only an energy budget gives a guarantee, because forces may become
-    older than any certificate covers.
+    A shell gives no guarantee with encoder steps. With lost packets only an energy budget gives a guarantee, because
+    forces may become older than any certificate covers.
     """
     plugged = shelled(assessment.environment)
     assessment = replace(assessment, encoder=None if plugged else encoder_steps(scenario, case, assessment))
@@ -268,7 +263,7 @@ def encoder_steps(
 ) -> EncoderSteps | None:
     """Compare the devices' friction with that needed for encoder steps in the environment that runs.
 
-    `steps` (m,) [m] replace those of the scenario. Returns None without steps, or for a singular loop.
+    `steps` (m,) [m] replace the scenario's encoder steps. Returns None without steps, or for a singular loop.
     """
     stated = assessment.guarantee
     beyond = stated.condition if stated and (stated.own or stated.condition in KNOWN_CONDITIONS) else None

@@ -4,8 +4,7 @@ Set i of humans depends on the seed, the population and i alone. Batches do not 
 the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the map of its RK4
 integrator over one period (its period map), which shares only the model with the exact engine. MuJoCo's traces use the
 exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates
-all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`). Workers end when their parent
-ends.
+all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`).
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ _NEAREST = 8  # number of humans nearest to the stability limit that are sampled
 _AT_RANDOM = 64  # size of the random sample of all humans
 
 
-# ---- random passive humans, each from its own seed
+# ---- random passive humans
 
 
 def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
@@ -78,17 +77,17 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
 
 @dataclass(frozen=True)
 class Validation:
-    """A loop, the number of sets of random humans that hold it, and the settings of the validation."""
+    """A loop, and the settings of its validation."""
 
     scenario: Scenario
     coupling: Coupling
     seed: int
-    humans: int
-    links: int
+    humans: int  # number of sets of random humans
+    links: int  # number of links of each hand
     engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
     duration: float  # [s] length of the traces; 0 for no traces
     threads: int = 0  # number of MuJoCo's threads; 0: one, or one per core for large batches
-    environments: tuple[Member, ...] = ()  # environments that humans meet in turn; if empty, the scenario's alone
+    environments: tuple[Member, ...] = ()  # environments for the sets in turn; if empty, the scenario's alone
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 
@@ -102,13 +101,13 @@ class Validation:
         return assemble(self.scenario, self.coupling, self.lag)
 
     def batches(self) -> list[range]:
-        """Return all indices in batches of at most _BATCH; each batch meets one environment."""
+        """Return all indices in batches of at most _BATCH; a batch has one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
         return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
 
     def environment(self, index: int) -> Member | None:
-        """Return the environment that the humans of this index meet; None for the scenario's own."""
+        """Return the environment that the set of this index touches; None for the scenario's own."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
@@ -125,12 +124,11 @@ class Validation:
         return crowds(scenario.population, len(counts), self.seed, indices, self.links, holds, axes, scenario.device)
 
     def crowd(self, index: int) -> Crowd | HumanSets:
-        """Draw the set of humans with this index."""
         ((_, crowd),) = self.crowds([index])
         return crowd
 
     def can_store(self, index: int) -> bool:
-        """Return whether a file can hold the humans with this index; files hold only hands of the class Human."""
+        """Return whether a file can store the humans with this index; it stores only hands of the class Human."""
         return all(isinstance(human, Human) for human in self.crowd(index).humans(0))
 
 
@@ -138,7 +136,7 @@ class Validation:
 class Findings:
     """The results for every set of humans, sorted by index. Without engine or trace, figures are nan and counts 0.
 
-    The energy W(N) is the work of the forces plus the least dissipation of the devices, up to tick N.
+    W(N) [J] is the work of the forces plus the least dissipation of the devices, up to tick N.
 
     Attributes:
         index: (n,) number of each set; index and seed determine the set.
@@ -197,7 +195,7 @@ class Findings:
 
     @property
     def trace_decides(self) -> NDArray[np.bool_]:
-        """(n,) whether the growth rate of the trace is larger than its error, so that its sign is a verdict."""
+        """(n,) whether the growth rate of the trace is larger than its error."""
         return np.abs(self.trace) > self.trace_error
 
 
@@ -206,7 +204,6 @@ _COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated",
 
 
 def _merge(parts: Sequence[Findings]) -> Findings:
-    """Merge the findings of groups or batches; without findings the columns are empty."""
     if not parts:
         kinds: dict[str, type] = {"index": int, "witnessed": bool, "clipped": int, "contacts": int}
         empty: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, float)) for name in _COLUMNS}
@@ -223,10 +220,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
-    """Judge and simulate the humans of `indices`, who all touch the same environment.
-
-    `ticked` is called after each block that the other engine simulates, with the number of ticks in it.
-    """
+    """Judge and simulate the humans of one batch; `ticked` is called with the other engine's ticks in each block."""
     simulation = validation.simulation
     if member := validation.environment(indices[0]):
         scenario = validation.scenario.replace(environment=member.network, ranges=None)
@@ -241,7 +235,7 @@ def _group(
     crowd: Crowd | HumanSets,
     ticked: Callable[[int], None],
 ) -> Findings:
-    """Judge and simulate the humans `index`, whose ports have the same structure."""
+    """Judge and simulate humans whose ports have the same structure."""
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
     late = scenario.usual_latency
@@ -306,7 +300,7 @@ def _other_engine(
         make = validation.engine
 
         def one_by_one(sets: NDArray[np.intp], integrator: str, timing: Timing | None) -> Engine:
-            """Make the user's engine, which takes its timing from the simulation."""
+            """Make the user's engines, which take the timing from the simulations."""
             return OneByOne([make_engine(each[i], make) for i in sets])
 
         return one_by_one, np.array([simulated_growth(one, None, None, make) for one in each])
@@ -319,7 +313,7 @@ def _other_engine(
 
 
 def _dominant(plants: HeldPlant, frozen: Iterable[Lti]) -> Mode:
-    """Return the dominant mode of each plant with the force map for which it grows fastest."""
+    """Return the dominant mode of each plant with the force map with which it grows fastest."""
     return Mode.worst([dominant_mode(close(plants, F)) for F in frozen])
 
 
@@ -341,8 +335,7 @@ def _witnessed(
     """Return the positions in a group of the humans that the other engine also simulates.
 
     These are all sets with a lossless hand, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of
-    the random sample; with `all_traces`, all sets. They depend on the validation and the group alone, not on the number
-    of processes.
+    the random sample; with `all_traces`, all sets.
     """
     if validation.all_traces:
         return np.arange(len(index))
@@ -388,10 +381,7 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine every batch in `shards` processes, and merge the findings.
-
-    An interruption, the death of a worker or a lack of memory ends the validation; finished batches are returned.
-    """
+    """Examine every batch in `shards` processes. An error of memory or a worker, or Ctrl-C, keeps finished batches."""
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:
@@ -422,7 +412,6 @@ def _here(question: Validation, parts: dict[int, Findings], progress: Progress) 
 
 
 def _in_processes(question: Validation, shards: int, parts: dict[int, Findings], progress: Progress) -> None:
-    """Fill `parts` with the findings of each batch. Raises BrokenProcessPool if a worker dies."""
     batches, alone = question.batches(), replace(question, threads=1)
     # A forked child would inherit locks of MuJoCo's threads and of the progress bar.
     context = multiprocessing.get_context("spawn")

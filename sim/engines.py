@@ -1,6 +1,6 @@
 """Engines advance the plant from one sample to the next, for one simulation or for many at once.
 
-The plant has the state s = [positions; velocities v; states of the hands' impedances], external forces w and forces f
+The plant has the state s = [positions q; velocities v; states of the hands' impedances], external forces w and forces f
 that are fed back. A step lasts h seconds.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
@@ -52,16 +52,14 @@ if TYPE_CHECKING:
 
 
 _MOST_MAPS = 256  # largest number of held plants, and of (period, latch times), that an engine caches
-#: A batch with fewer calls of mj_forward in a tick uses one thread. For example, 36 calls take 0.13 ms of CPU time in
-#: one thread, and 0.23 ms in two.
-_CALLS_FOR_THREADS = 128
+_CALLS_FOR_THREADS = 128  # a batch with fewer calls of mj_forward in a tick uses one thread, which is then cheaper
 
 
 class Engine(Protocol):
-    """Advances the plant by one period at a time, reading and writing a buffer."""
+    """Advances the plant by one period at a time."""
 
     def start(self, buffer: StepBuffer) -> None:
-        """Take the plant state of row 0 as the state at the first tick."""
+        """Take the plant state in row 0 of the buffer as the state at the first tick."""
         ...
 
     @property
@@ -76,7 +74,7 @@ class Engine(Protocol):
 
 @runtime_checkable
 class RunsBlocks(Protocol):
-    """Optional methods of an engine that runs many ticks of a linear law in one call."""
+    """Optional members of an engine that runs many ticks of a linear law in one call."""
 
     run_block: RunBlock | None  # set by `start`; runs the law and `advance` for a number of ticks from row 0 on
 
@@ -89,7 +87,7 @@ class _Exact:
     run_block: RunBlock | None = None
 
     def back(self, k: int) -> None:
-        """Do nothing, because the exact engines store no state."""
+        """Do nothing: the exact engines store no state."""
 
     def troubled(self) -> bool:
         return False
@@ -188,11 +186,11 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad] and decay (rate times step) in a step that RK4 resolves
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # largest phase [rad], and largest decay (rate times step), in a step of RK4
 
 
 def least_substeps(integrator: str) -> int:
-    """Return the least default number of steps per period: 1 for the exponential integrator, 4 for MuJoCo's own."""
+    """Return the least default number of steps per period."""
     return 1 if integrator == EXPONENTIAL else 4
 
 
@@ -219,8 +217,7 @@ class _Access:
     """Arrays and functions of MuJoCo that a tick reads, writes and calls.
 
     Arrays are (n,) for one simulation and (n, nsim) for many. `ticks` returns closures, because attribute lookups would
-    take longer than the step. They refer to this object and not to the engine, because a reference to the engine would
-    form a cycle, which would keep a batch's memory allocated.
+    take longer than the step. They must not refer to the engine: the cycle would keep a batch's memory allocated.
     """
 
     T: float  # [s]
@@ -236,11 +233,10 @@ class _Access:
     kick: Callable[[float], Product] | None  # seconds -> step of the impedances alone, from s to s
 
     def put(self, buffer: StepBuffer, k: int) -> None:
-        """Put the plant into the state of row k."""
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
 
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
-        """Return a function of k that advances the plant by one tick, with the inputs of row k of the buffer."""
+        """Return a function of k that advances the plant from row k of the buffer to row k + 1."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
         states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
@@ -252,7 +248,7 @@ class _Access:
         return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
     def _shaped(self, states: Array) -> Array:
-        """Return a view of [q; v] of states (ticks, size, ..), shaped like `state`."""
+        """Return a view of [q; v] in states (ticks, size, ..); each tick is shaped like `state`."""
         return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
 
     def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
@@ -299,7 +295,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """Return a function that advances a tick from latch to latch, and stores the held forces after the state."""
+        """Return a function that advances from latch to latch; the forces held at the end follow the state in a row."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -318,7 +314,7 @@ class _Access:
         return advance
 
     def _move_by(self, seconds: float, row: Array) -> None:
-        """Advance MuJoCo, whose present state is `row`, by some seconds, and update `row`."""
+        """Advance MuJoCo and `row`, its present state, by some seconds."""
         (view,) = self._shaped(row[None])
         if self.move:
             for _ in range(self.substeps):
@@ -388,7 +384,6 @@ class MujocoEngine:
 
     @property
     def advance(self) -> Callable[[int], None]:
-        """The function that advances the plant by one tick. The first access after `start` creates it."""
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 
@@ -429,7 +424,6 @@ class MujocoEngine:
         return run_block
 
     def back(self, k: int) -> None:
-        """Put the plant into the state of row k, and clear MuJoCo's warnings."""
         self._access.put(self._buffer, k)
         self._warnings[:] = 0
 
@@ -506,7 +500,6 @@ def _step_of(plant: Plant, n: int, h: float) -> Array:
 
 
 def _stacked(plant: Plant) -> Plant:
-    """Return one plant, or many, as a stack."""
     if plant.A.ndim > 2:
         return plant
     return Plant(plant.A[None], plant.B[None], plant.C, None if plant.felt is None else plant.felt[None])
@@ -526,7 +519,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Return a function that multiplies column j by matrix j; a single matrix multiplies all columns."""
+    """Return the product of column j and matrix j for all j; a single matrix multiplies all columns."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 
@@ -554,7 +547,7 @@ def profiler_off() -> Iterator[bool]:
     """Run without the clock that MuJoCo's Python binding reads several times per step.
 
     The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether the
-    pointer was found; if not, the clock stays on. The pointer is restored at the end.
+    pointer was found; if not, the clock stays on.
     """
     pointer = _profiler_clock()
     if pointer is None:
@@ -589,11 +582,10 @@ class _PlantSpeed:
     rate: float  # [1/s] decay rate of the mode that decays fastest
 
     def within(self, h: float) -> bool:
-        """Return whether RK4 steps of h seconds resolve these motions."""
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """Return the least number of RK4 steps in T seconds, at least 4, that resolves these motions."""
+        """Return the least number of RK4 steps in T seconds that resolves these motions."""
         return max(
             least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
         )

@@ -1,8 +1,8 @@
 """Search for limit cycles of devices in human hands: eigenvalues for every human, MuJoCo for the worst human.
 
 A cell of a Z-width map has a force map F and a process that computes it. `HeldDevices` closes F around the devices in
-the hands of every human and gives the growth of the dominant mode; here a human is a set of hands, one for each device.
-`simulate_cells` runs cells in MuJoCo batches, with encoder steps, friction and walls.
+the hands of every human; here a human is a set of hands, one for each device. `simulate_cells` runs cells in MuJoCo,
+with encoder steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -28,12 +28,8 @@ from haptic_loop.sim.trace import RUNAWAY, Oscillation, oscillation, slowest_see
 
 Cells = NDArray[np.intp]
 
-# ----------------------------------------------------------------------------------------------------
-# The exact loop's eigenvalues, with every human.
-
-
 _MIN_FREQUENCY_HZ = 2.0  # least frequency of a fast mode; slower modes decay slowly and would hide one about to grow
-_LEADING = 0.1  # share of the humans who are tried first; the others only in cells that are stable with all of these
+_LEADING = 0.1  # share of the humans that `leading` selects
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +55,8 @@ class HeldDevices:
     ) -> HeldDevices:
         """Draw random humans for the devices.
 
-        Args:
-            devices: The devices (m,).
-            population: The distribution of the humans.
-            T: The period [s].
-            seed: The seed of the draws.
-            humans: The number of humans, each of whom is a set of hands.
-            links: The number of links of each hand; None for that of the population.
-            latency: The least and the largest latency (m,) of forces [s], of which the largest is used.
+        `links` is the number of links of each hand; None means that of the population. `latency` has the least and the
+        largest latency [s] of each channel's forces, of which the largest is used.
         """
         late = None if latency is None else tuple(most for _, most in latency)
         groups = []
@@ -81,7 +71,7 @@ class HeldDevices:
         return sum(index.size for index, *_ in self.groups)
 
     def links(self, human: int) -> Array:
-        """Return the links (m, links, 3) of one human, as in `Crowd`."""
+        """Return the links (m, links, 3) of a human, as in `Crowd`."""
         (_, crowd, *_), i = self._place(human)
         return crowd.links[i]
 
@@ -90,8 +80,7 @@ class HeldDevices:
     ) -> tuple[Array, Array]:
         """Return the growth (n,) [1/s] of the dominant mode and of the dominant fast mode of F with every human.
 
-        A fast mode has at least `min_frequency_hz`. Humans for which `humans` (n,) is false are skipped; their growth
-        is -inf.
+        A fast mode has at least `min_frequency_hz`. Where the mask `humans` (n,) is false, the growth is -inf.
         """
         n = len(self)
         everything, turning = np.full((2, n), -np.inf)
@@ -105,7 +94,7 @@ class HeldDevices:
         return everything, turning
 
     def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:
-        """Return the dominant mode above a frequency with one human, as a state [s; z] of plant and process.
+        """Return the dominant mode above a frequency, as a state [s; z] of plant and process.
 
         The mode is scaled so that the motor or handle with the largest motion moves by 1 m.
         """
@@ -128,7 +117,7 @@ class HeldDevices:
         return first
 
     def _place(self, human: int) -> tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], int]:
-        """Return the group of a human and its position in the group."""
+        """Return the group of a human, and the human's position in it."""
         for group in self.groups:
             at = np.flatnonzero(group[0] == human)
             if at.size:
@@ -137,19 +126,18 @@ class HeldDevices:
 
 
 def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
-    """Return the indices of motors and handles in a plant state; a rigid device has one index."""
+    """Return indices of a plant state; a rigid device has one, for motor and handle."""
     return tuple(dict.fromkeys((*range(scene.channels), *scene.handles)))
 
 
 # ----------------------------------------------------------------------------------------------------
-# Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The devices are held by the human
-# whose exact linear loop is nearest to oscillating or running away. Plant and process start in the loop's dominant mode
-# that a trace can show, scaled so that the motor or handle that moves most is displaced by _START. With walls or a
-# limiter only the plant starts in it, and the process at rest. Each hand presses with a force that starts smoothly and
-# then stays constant. The second half of the trace gives the verdict.
+# Cells in MuJoCo. The devices are held by the human whose exact linear loop is nearest to oscillating or running away.
+# Plant and process start in the loop's dominant mode that a trace can show, scaled so that the motor or handle that
+# moves most is displaced by _START. Each hand presses with a force that starts smoothly and then stays constant. The
+# second half of the trace gives the verdict.
 
 
-_UNLIMITED = 1e6  # [N] the largest force limit that a device may have
+_UNLIMITED = 1e6  # [N] largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] time in which the hand's force grows to its constant value
 _START = 1e-3  # [m] initial displacement of the motor or handle that moves most
@@ -159,7 +147,7 @@ UNDECIDED = "too slow to say"  # verdict if the trace oscillates and the linear 
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
-    """Return the devices with motors that never clip, because a map shows the loop below its force limits."""
+    """Return the devices with motors that never clip."""
     return tuple(msgspec.structs.replace(device, force_limit=_UNLIMITED) for device in devices)
 
 
@@ -167,14 +155,14 @@ def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
 class Plan:
     """Settings for the simulation of cells."""
 
-    points: int  # largest number of rows, and of columns, that are simulated; 0 for none
+    points: int  # largest number of the map's rows, and of its columns, that are simulated; 0 for none
     press: float  # [N] steady force of every hand
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a motor or handle oscillates
 
     @property
     def runaway_growth(self) -> float:
-        """The growth [1/s] above which a mode, oscillating or not, has diverged by the end of the trace."""
+        """The growth [1/s] above which a mode has diverged by the end of the trace."""
         return 1.2 * np.log(RUNAWAY / _START) / self.duration
 
 
@@ -190,7 +178,6 @@ class Points:
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
-        """Join parts; without parts there are no cells."""
         if not parts:
             return cls(np.zeros(0, dtype=int), np.zeros(0, dtype=bool), *np.zeros((3, 0)))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
@@ -207,7 +194,7 @@ class Points:
 
     @property
     def verdicts(self) -> list[str]:
-        """The verdict "rests", "oscillates" or UNDECIDED for each cell."""
+        """Each cell's verdict: "rests", "oscillates" or UNDECIDED."""
         words = np.where(self.oscillates, np.where(self.near, UNDECIDED, "oscillates"), "rests")
         return [str(word) for word in words]
 
@@ -219,10 +206,7 @@ _Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 def simulate_cells(
     cells: Cells, loops: _Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
 ) -> tuple[Points, bool]:
-    """Simulate cells in batches, and return the points and whether the keyboard interrupted.
-
-    `press` (m,) [N] are the steady forces of the hands.
-    """
+    """Simulate cells with steady forces `press` (m,) [N]; return the points, and whether the keyboard interrupted."""
     parts: list[Points] = []
     ticks = round(plan.duration / held.T)
     try:
@@ -243,7 +227,7 @@ def simulate_cells(
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """One simulation: the computer's process, the human that holds the devices, and the initial state."""
+    """One simulation."""
 
     process: Process
     links: Array  # (m, links, 3) links of each hand, as in Crowd
@@ -251,7 +235,7 @@ class _Trial:
 
 
 def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:
-    """Return one trial for each cell, with the human nearest to oscillating or running away, and the growth with it."""
+    """Return a trial for each cell, and the exact loop's growth [1/s] with its human."""
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)
@@ -273,7 +257,6 @@ def _points(
     press: Array,
     ticked: Callable[[int], None],
 ) -> Points:
-    """Simulate the trials of these cells."""
     lasting, amplitude, frequency = np.zeros(len(trials), dtype=bool), np.zeros(len(trials)), np.zeros(len(trials))
     links = np.array([trial.links.shape[1] for trial in trials])
     for count in np.unique(links):
@@ -290,7 +273,7 @@ def _points(
 def _simulate(
     trials: Sequence[_Trial], held: HeldDevices, press: Array, plan: Plan, ticked: Callable[[int], None]
 ) -> Oscillation:
-    """Simulate all trials together; their humans must have the same number of links. `press` is (m,) [N]."""
+    """Simulate all trials together; their humans must have the same number of links."""
     T = trials[0].process.F.T
     held_by = variants(unlimited(held.devices), Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(plan.duration / T)
@@ -319,7 +302,7 @@ def _simulate(
 
 
 def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:
-    """Return the external forces (ticks, outside) [N]: `press` (m,) on the ends of the humans, with a smooth start."""
+    """Return the external forces (ticks, outside) [N]: `press` on the ends of the humans, with a smooth start."""
     t = (first + np.arange(ticks)) * T
     eased = np.where(t < _EASE, (1 - np.cos(np.pi * t / _EASE)) / 2, 1.0)
     w = np.zeros((ticks, scene.outside))

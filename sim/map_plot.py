@@ -23,7 +23,7 @@ from haptic_loop.sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # colours of areas
 
-#: lines in the order of drawing: a dashed line follows the solid line that it may coincide with, so that both are seen
+#: lines in the order of drawing; a dashed line may coincide with the solid line before it, and then both are visible
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
@@ -37,7 +37,7 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     """Plot stiffness over damping: cells for the population, lines for certificates' edges, symbols for MuJoCo."""
     figure = Figure((8, 5.6), layout="constrained")
-    axes = figure.subplots()  # There are no grid lines, since areas show the cells.
+    axes = figure.subplots()
     about_environment = report.fixed is not None
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
@@ -94,7 +94,7 @@ def _edges(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
 
 
 def _side(ratio: Array, drawn: Map, report: MapReport) -> str:
-    """Return in a word on which side of its edge the certified part of the map lies."""
+    """Return on which side of its edge the certified part of the map lies: "below", "above" or "inside"."""
     certified = suffices(ratio).reshape(drawn.grid.shape)  # The rows are stiffnesses, the softest first.
     if report.fixed is None and not (certified[1:] > certified[:-1]).any():
         return "below"
@@ -162,5 +162,4 @@ def _title(report: MapReport) -> str:
 
 
 def _list(values: Sequence[float]) -> str:
-    """Return the numbers as text, or one number if all are equal."""
     return ", ".join(f"{v:g}" for v in (values if len(set(values)) > 1 else values[:1]))

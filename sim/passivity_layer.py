@@ -3,8 +3,8 @@
     figures = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
 The code calls such a layer a net. With a net, the linear block of a tick does not contain the delays Theta. The budget
-scales the forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces them by forces of the
-user's environment. Both send their forces through a delay line, for constant and for varying delays.
+scales the forces of G = (I + Psi E V)^-1 Psi E, within the actuators' limits. The shell replaces these forces by those
+of the user's environment. Both send their forces through a delay line, even if the delays are constant.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import InputError, require_latch_at_ticks
 
-_HELD = 4  # ticks beyond the largest delay for which a device holds a force when packets are lost
+_HELD = 4  # when packets are lost, a device holds a force for so many ticks beyond the largest delay
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class EnergyNet:
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh budget for `nsim` runs. Raises InputError for impossible numbers."""
+        """Return a new budget for `nsim` runs. Raises InputError for impossible numbers."""
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
@@ -71,12 +71,12 @@ class EnergyNet:
 class Plugged:
     """A user's function in place of the environment, behind the coupling and a shell that makes it passive."""
 
-    force: Callable[[Array], Array]  # positions (m,) [m] that its port would have without force -> forces (m,) [N]
+    force: Callable[[Array], Array]  # positions (m,) [m] that the port would have without force -> forces (m,) [N]
     start: float = 0.0  # W0 [J]
     guarantee: str | None = None  # the guarantee of this run in words, or the reason why there is none
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """Return a fresh shell for `nsim` runs. Raises ValueError if no shell fits the loop, or for a wrong `start`."""
+        """Return a new shell for `nsim` runs. Raises ValueError if no shell fits the loop, or for a wrong `start`."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None:
             raise ValueError("your own environment needs a coupling with a compliance V")
@@ -86,7 +86,7 @@ class Plugged:
 
 
 def claim(assessment: Assessment) -> str:
-    """Return one line with the guarantee of a run with a net, or the reason why there is none."""
+    """Return the guarantee of a run with a net in words, or the reason why there is none."""
     if assessment.guarantee is None:
         return f"no guarantee: {assessment.reason}"
     behind = "behind a coupling certified for any environment, " if callable(assessment.environment) else ""
@@ -104,8 +104,8 @@ class Wanted(Protocol):
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """Return the loop with a net between controller and devices, for runs of up to `ticks` (default: the scenario's).
 
-    For linear analyses, such as certificates and modes, use the simulation without a net. The delays of the simulation
-    do not change. Raises InputError for a latency, and the errors of `wanted.net` for impossible settings.
+    For linear analyses, such as certificates and modes, use the simulation without a net. Raises InputError for a
+    latency, and the errors of `wanted.net` for impossible settings.
     """
     scenario, process = simulation.scenario, simulation.process
     require_latch_at_ticks(scenario)
@@ -131,7 +131,7 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
         or any(wall.gap < 0 for wall in scenario.environment.walls)  # A wall that is pressed at rest stores energy.
     ):
         return None
-    # Like the budget, any-environment counts the devices' damping alone. So only it shows that the budget never acts.
+    # Like the budget, this condition counts the devices' damping alone; other conditions count more.
     needs = requirements[ANY_ENVIRONMENT.name]
     if not needs.ratio <= 1 - EPS:
         return None
@@ -139,7 +139,7 @@ def idle(simulation: Simulation, requirements: Mapping[str, Requirement], budget
 
 
 class _InLoop:
-    """Base class of the nets below; limits forces as the actuators do, and measures how far devices moved in a tick."""
+    """Base class: limits forces as the actuators do, and measures how far the devices moved in a tick."""
 
     def __init__(self, process: Process) -> None:
         self._within = process.applied

@@ -60,10 +60,7 @@ def _panels(
 
 
 def _arrange(figure: Figure, axes: Any) -> None:
-    """Make room for the labels of the axes (rows, columns) and the legend, in half of the constrained layout's time.
-
-    That layout measures every label twice, also those of the right and upper sides.
-    """
+    """Make room for the labels of the axes (rows, columns) and the legend, in half of the constrained layout's time."""
     renderer, (width, height) = FigureCanvasAgg(figure).get_renderer(), figure.get_size_inches()
 
     def room(axis: Any, side: int) -> float:
@@ -92,12 +89,11 @@ _MARGIN, _TITLE = 0.12, 0.22  # [inch] margin around panels, labels and legends;
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
-    """Draw a legend below all panels; `entries` has the drawn object of each label."""
+    """Draw a legend below all panels. `entries` maps labels to drawn objects."""
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, **style)
 
 
 def _entries(axis: Axes) -> dict[str, Any]:
-    """Return the drawn object of each label, in the order of drawing."""
     handles, labels = axis.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -112,7 +108,7 @@ def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
 
 
 def _texts(figure: Figure) -> list[Text]:
-    """Return all texts but tick labels. findobj would create all ticks, and the layout would create them once more."""
+    """Return all texts but tick labels; findobj would create all ticks, which is slow."""
     texts = list(figure.texts)
     for axis in figure.axes:
         texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
@@ -148,19 +144,17 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     relabel(figure)
     figure.set_dpi(dpi)
     content = BytesIO()
-    # savefig would draw a figure with a layout twice. Compression 3 takes two thirds of the default's time, and gives a
-    # file that is 6 % larger.
+    # savefig would draw a figure with a layout twice. Compression 3 is faster than the default; files are 6 % larger.
     FigureCanvasAgg(figure).print_png(content, pil_kwargs={"compress_level": 3})
     return content.getvalue()
 
 
 _PAGE = 7.16  # [inch] width of both columns of an IEEE page, and nearly that of other two-column papers
-_LEGEND = 0.8  # number of legend columns divided by the number of entries, for a figure that is not shrunk
+_LEGEND = 0.8  # legend columns per entry, for a figure that is not shrunk
 _LETTERS = (6.5, 9.0)  # [pt] smallest and largest letters in a paper
 
 
 def _fit_paper(figure: Figure) -> None:
-    """Make a figure at most as wide as a page, and its lines thinner in proportion."""
     width, height = figure.get_size_inches()
     share = min(1.0, _PAGE / width)
     figure.set_size_inches(share * width, share * height)
@@ -185,7 +179,7 @@ def _literal(figure: Figure) -> None:
 
 
 def _plain_numbers(axes: Any) -> None:
-    """Label axes with plain numbers such as 0.1 and 10, which are read and drawn faster than 10^-1 and 10^1."""
+    """Label axes with plain numbers such as 0.1, which are drawn faster than powers such as 10^-1."""
     for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
@@ -207,14 +201,10 @@ def draw_run(
 ) -> Figure:
     """Draw displacements and forces of a run, with a zoom where the forces turn most sharply.
 
-    Where handles and encoders differ, handles have thick curves and encoders thin ones.
-
     Args:
         result: The run.
         title: The title of the figure.
-        frequency_hz: The frequency of the oscillation. The zoom is a part of the ticks within the credible limits and,
-            if the loop grows, before the first clipped tick. It shows at least six periods (of at most 1 s), or all
-            these ticks if they are fewer. If nothing grows and no part stands out (`_stands_out`), there is no zoom.
+        frequency_hz: The frequency of the oscillation, by which the zoom and the windows of amplitudes are chosen.
         ideal: Forces (N, m) [N] of the ideal environment, which are drawn behind the others, and the force error [%].
         onset: Greys the part of the run that is not credible. If the loop grows, the amplitude of the oscillation and
             its prediction replace the zoom of the displacements.
@@ -250,7 +240,10 @@ def draw_run(
 
 
 def _shown_parts(result: Run, frequency_hz: float, onset: Onset | None) -> tuple[slice, ...]:
-    """Return slices of ticks: the whole run, and the zoom if the loop grows or the forces stand out there."""
+    """Return slices of ticks: the whole run, and the zoom if the loop grows or the forces stand out there.
+
+    The zoom lies within the credible limits and, if the loop grows, before the first clipped tick.
+    """
     last, grows = result.t.size, onset is not None and onset.growth is not None
     if onset and onset.until is not None:
         last = int(np.searchsorted(result.t, onset.until))
@@ -272,7 +265,7 @@ def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
 
 
 def _two_points(result: Run) -> bool:
-    """Return whether handles and encoders move apart visibly in a picture."""
+    """Return whether handles and encoders differ visibly in a picture."""
     return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
 
 
@@ -285,10 +278,7 @@ _ALIKE = 0.005  # curves that differ by less, relative to the largest value, loo
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Return a label suffix for each column of `values` (N, m).
-
-    It is " (the same curve as NAME)" if an earlier curve looks the same, else "". It is "" if all values are 0.
-    """
+    """Return a label suffix for each column of `values` (N, m): which earlier curve looks the same, or ""."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -297,13 +287,13 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
     return ends
 
 
-_SHARPER = 4.0  # least mean square of the forces' second differences in a zoom, relative to that of the run
+_SHARPER = 4.0  # a zoom's least mean square of the forces' second differences, relative to that of the run
 
 
 def _stands_out(result: Run, near: slice, ticks: int) -> bool:
     """Return whether the part `near` is short, and forces turn far more sharply in it than in the first `ticks`."""
     if 10 * (near.stop - near.start) > result.t.size:
-        return False  # The part is too long for a zoom.
+        return False
     bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
 
@@ -316,7 +306,6 @@ def _one_point(result: Run) -> str:
 
 
 def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
-    """Draw the places of walls in the panel of displacements, and the time in contact in both panels."""
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
         axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
@@ -380,8 +369,8 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
     for i, column in enumerate(1e3 * sizes.T):
         axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
-    # The prediction is fitted to the last third of the amplitudes, where only the dominant mode is left.
-    # The drawn curve is 25 % higher than the fit, so that it does not hide the amplitudes.
+    # The level is fitted to the last third of the amplitudes, where only the dominant mode is left.
+    # The curve is drawn 25 % higher, so that it does not hide the amplitudes.
     late = slice(2 * t.size // 3, None)
     level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
     predicted = 1e3 * level * np.exp(onset.growth * t)
@@ -415,7 +404,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
     """Draw the ideal forces, broad and pale, and cut them at three times the largest other force."""
     forces, percent = ideal
     label = "pale: the force of the object itself for this motion"
-    if percent is not None:  # sim.accuracy.force_error says which forces are compared.
+    if percent is not None:
         label += " (equal to the commanded force)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
@@ -429,8 +418,8 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
     """Return the part of the first `ticks` in which the forces turn most sharply.
 
-    The part has six periods, or 60 ticks if these are longer. Its length is doubled, up to half of the ticks, until
-    some force has six turning points in the part.
+    The part has six periods (of at most 1 s), or 60 ticks if these are longer. Its length is doubled, up to half of the
+    ticks, until some force has six turning points in the part.
     """
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
@@ -453,7 +442,7 @@ def _turns(f: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The data of one panel. All panels of a picture show runs with the same hands."""
+    """The data of one panel."""
 
     title: str
     trace: Run
@@ -464,8 +453,7 @@ class Panel:
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
     """Plot the forces of several couplings on equal axes, one panel each; pale curves are the object's own forces.
 
-    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is credible). Oscillating forces
-    do not enlarge the axes; they may be cut off.
+    The axes cover 1.5 times the ideal forces of the credible runs (of all runs if none is), and cut off larger forces.
     """
     columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
@@ -520,10 +508,7 @@ def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
 
 
 def draw_population(mass: Array, damping: Array, growth: Array, title: str) -> Figure:
-    """Draw growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,).
-
-    Where a loop has several humans, mass and damping are geometric means over them.
-    """
+    """Draw growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,)."""
     figure, axes = _panels(title, 1, 2, (10, 4.2), sharey=True)
     kinds = (("stable", growth <= 0, "o", STYLES[0]), ("unstable", growth > 0, "^", STYLES[1]))
     labels = "mass of the human [kg]", "least damping of the human [N s/m]"
@@ -554,7 +539,7 @@ _FLOOR = 1e-4  # smallest value on a logarithmic axis, relative to the largest
 
 
 def plot_singular_values(report: Comparison, path: Path) -> Path:
-    """Plot all singular values of E, F and the mismatch M, one panel per coupling; smaller ones are thinner."""
+    """Plot all singular values of E, F and the mismatch M, one panel per coupling; smaller values have thin lines."""
     couplings = report.couplings
     figure, axes = _over_frequency("singular values", 1, len(couplings), (4.2, 4.2))
     hz = report.frequency_hz
@@ -621,7 +606,7 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
                 axis.plot(hz, getattr(values, key)[:, i], label=name, **style)
             axis.axhline(0.0, color="black", linewidth=0.7)
             axis.set_xscale("log")
-            # The scale is linear around zero up to the power of ten below the median size, and logarithmic beyond.
+            # The scale is linear up to the power of ten below the median size.
             sizes = np.abs([getattr(values, key)[:, i] for _, values, _ in curves])
             typical = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
             axis.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(typical)))
@@ -635,5 +620,5 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
 
 
 def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
-    """Make panels of `size` [inch] each, together wide enough for the title."""
+    """Make panels of `size` [inch] each; the figure is wide enough for the title."""
     return _panels(title, rows, columns, (max(columns * size[0], 5.5), rows * size[1] + 0.6), sharex=True)

@@ -30,9 +30,6 @@ from haptic_loop.sim.stability import (
 from haptic_loop.sim.switching import DelaysCovered, Period
 from haptic_loop.sim.trace import Trace
 
-# ----------------------------------------------------------------------------------------------------
-# Friction.
-
 
 def friction_left_out(devices: Sequence[Device]) -> list[str]:
     """Return a remark for each device whose friction has a published upper bound only."""
@@ -41,10 +38,6 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
         for i, device in enumerate(devices, start=1)
         if device.friction_max is not None and not np.any(device.friction)
     ]
-
-
-# ----------------------------------------------------------------------------------------------------
-# The paper's numbers compared with those computed here.
 
 
 #: The transparency indices (25) [dB] that the paper prints. No reading of its Figure 4 that was tried reproduces them.
@@ -108,10 +101,6 @@ def _figure(case: str, stability: Stability) -> PaperRow:
     return PaperRow("Figure 5: no coupling", "self-sustained oscillation", here, why)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Varying delays: ages of forces, growth, and whether certificates cover them.
-
-
 @dataclass(frozen=True)
 class DelaySpan:
     """The range of delays [samples] and the pattern within it."""
@@ -139,7 +128,7 @@ class _Age:
 
 @dataclass(frozen=True)
 class _PeriodGrowth:
-    """Growth over one period of the worst switching that was found."""
+    """Growth over one period of the worst switching of delays that was found."""
 
     ticks: int
     growth_rate_per_s: float

@@ -65,12 +65,12 @@ _AHEAD = 8  # number of blocks for which external forces are sampled together
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Engine, integrator and steps of a run; an integrator or `substeps` of None means the default for the plant."""
+    """Engine, integrator and steps of a run; None means the default for the plant."""
 
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # name in sim.engines.INTEGRATORS
     substeps: int | None = None  # integrator steps per period
-    error: float | None = None  # allowed relative rms error of positions: the cheapest such setting replaces the above
+    error: float | None = None  # allowed relative rms error of positions; the cheapest setting within it then runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ class Simulation:
 
 
 def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
-    """Build both sides of the loop: the computer's process and the plant.
+    """Build the computer's process and the plant.
 
     `lag` is the `rho` (m,) [N/m] of controller.law.Limiter; with None, forces are clipped. `seed` is the seed of
     varying periods and latencies. Raises SingularLoop if the algebraic loop of environment and coupling has no
@@ -233,14 +233,13 @@ def run(
 
 def _finite_ticks(buffer: StepBuffer, count: int) -> int:
     """Return the number of ticks before the first one whose state or force is not finite, at most `count`."""
-    if np.isfinite(buffer.rows[:count].sum()):  # Checking the sum first is faster than checking every row.
+    if np.isfinite(buffer.rows[:count].sum()):
         return count
     finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
     return count if finite.all() else int(np.argmin(finite))
 
 
 def _columns(rows: Array, which: tuple[int, ...]) -> Array:
-    """Return the columns `which`, as a view if they are adjacent."""
     together = slice(which[0], which[-1] + 1)
     return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
@@ -370,9 +369,9 @@ def make_engine(
 ) -> Engine:
     """Return the engine `engine` for one simulation; a tick of MuJoCo lasts T [s] (default: the scenario's period).
 
-    The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's own engine is used
-    as it is; a user's class or function is called with the simulation. Raises ValueError for an unknown name, an object
-    that is no engine, the exact engine with Coulomb friction, or a user's own engine with `period` or `latency`.
+    The defaults of integrator and substeps are `default_integrator` and `least_substeps`. A user's class or function is
+    called with the simulation. Raises ValueError for an unknown name, an object that is no engine, the exact engine
+    with Coulomb friction, or a user's own engine with `period` or `latency`.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)
@@ -392,7 +391,6 @@ def make_engine(
 
 
 def engine_name(engine: AnyEngine) -> str:
-    """Return the name of an engine in reports."""
     if isinstance(engine, str):
         return engine
     kind: Any = engine if hasattr(engine, "__qualname__") else type(engine)
