@@ -36,10 +36,7 @@ class TooLong(ValueError):
 # ----------------------------------------------------------------------------------------------------
 # Counted work. Searches and exact arithmetic count their operations from the sizes of their matrices and numbers, and
 # end when a budget is spent. Without a user's time limit they read no clock, so that a busy or slow machine gets the
-# same result as a fast one.
-#
-# One unit is one second of a core at 2.4 GHz, within a factor of two. _PRODUCT and _DIFFERENCE were measured on such a
-# core.
+# same result as a fast one. One unit is one second of a core at 2.4 GHz, within a factor of two.
 
 
 _PARTS = 10**12
@@ -121,11 +118,7 @@ _Result = TypeVar("_Result")
 
 
 def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
-    """Let a function compute with one BLAS thread.
-
-    More threads change the last digits. They also wait for each other: on a busy machine the design of an optimal
-    coupling for four devices took three to six times the CPU time of one thread.
-    """
+    """Let a function compute with one BLAS thread: more threads change the last digits, and wait for each other."""
 
     @wraps(function)
     def limited(*args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
@@ -137,10 +130,9 @@ def one_blas_thread(function: Callable[_Args, _Result]) -> Callable[_Args, _Resu
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return a controller of the BLAS libraries of NumPy and of SciPy.
+    """Return a controller of the BLAS libraries of NumPy and SciPy, which must be loaded to be controlled.
 
-    SciPy is loaded here, because only loaded libraries are controlled. With OPENBLAS_NUM_THREADS=1 SciPy's library
-    uses one thread anyway.
+    With OPENBLAS_NUM_THREADS=1 SciPy's library uses one thread anyway, so that it need not be loaded.
     """
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         compiled("scipy.linalg._flapack")
@@ -150,7 +142,7 @@ def _blas() -> ThreadpoolController:
 def compiled(name: str) -> Any:
     """Return a compiled module of SciPy, such as "scipy.linalg._flapack", without the Python code of its package.
 
-    In a command the import of scipy.linalg takes 0.1 s and that of SLSQP 0.2 s more; a compiled module takes 0.01 s.
+    Importing scipy.linalg takes 0.1 s, importing SLSQP 0.2 s more, and a compiled module 0.01 s.
     A second thread waits until the first has loaded the module.
 
     Raises:
@@ -256,12 +248,10 @@ def positive_definite(M: Any) -> bool:
 
 
 def times(left: Array, right: Array) -> Array:
-    """Return left @ right. Fractions are multiplied only where they are not zero, because most entries are zero.
+    """Return left @ right. Raises ValueError if the shapes do not fit.
 
-    Raises ValueError if the shapes do not fit.
-
-    Each row of `left` and each column of `right` becomes integers over a common denominator. A sum of products then
-    needs one greatest common divisor instead of one per term.
+    Fractions are multiplied only where they are not zero. Each row of `left` and each column of `right` becomes
+    integers over a common denominator, so that a sum of products needs one greatest common divisor only.
     """
     if left.ndim != 2 or right.ndim != 2 or object not in (left.dtype, right.dtype):
         return left @ right
@@ -350,7 +340,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
 def _subtract(
     row: dict[int, Fraction], other: dict[int, Fraction], factor: Fraction, columns: Any = None, r: int = 0
 ) -> None:
-    """Subtract factor times `other` from the sparse row r; `columns` holds the rows with an entry in each column."""
+    """Subtract factor times `other` from the sparse row r; columns[c] is the set of rows with an entry in column c."""
     for c, v in other.items():
         entry = row.get(c, _ZERO) - factor * v
         if entry:

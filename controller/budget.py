@@ -28,8 +28,7 @@ it, and a tick without a report counts with its largest loss.
 the force of the previous tick. By summation by parts, the sum of a de until a tick with force a[n] is at most
 q/2 (|a[n]| + sum |a - a_-|) per channel, and |a[n]| = sum (|a| - |a_-|). |dx| is at least the measured |dx| minus q. So
 a tick with the measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel to W.
-The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss. While the
-force is constant, an encoder that dithers costs no energy.
+The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
 that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
@@ -75,7 +74,7 @@ class ShellFigures(NetFigures):
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetFigures(ShellFigures):
-    """Figures of an energy budget."""
+    """Figures of an energy budget, beside those of ShellFigures."""
 
     eps: float = EPS
     reserved_J: float  # the largest loss of the packets on their way
@@ -341,8 +340,7 @@ class Shell(_Net):
     def credit(self, released: ArrayLike) -> None:
         """Credit the energy that gravity and springs have released so far, (nsim,) [J]; only increases count.
 
-        Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick. s = 0
-        remains admissible, since a credit only raises W.
+        Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick.
         """
         rise = np.maximum(np.asarray(released, dtype=float) - self._released, 0.0)
         self._released = self._released + rise
@@ -355,8 +353,7 @@ class Shell(_Net):
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
         """Return f = s f_wanted [N] and the port's displacement u [m], (m, nsim) each, and end the tick.
 
-        `rounded` maps s f_wanted to a force that can be sent to a device; f is 0 if that force would cost too much
-        energy.
+        `rounded` maps s f_wanted to a force that can be sent. If the rounded force would make W negative, f is 0.
         """
         wanted, spoilt = _finite(wanted)
         linear = (wanted * (self._free - self._before)).sum(axis=0)

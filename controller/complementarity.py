@@ -33,7 +33,7 @@ class _Problem(ReadOnly):
 
     @cached_property
     def _separate(self) -> bool:
-        """Whether M is diagonal, so that each force can be solved for by itself."""
+        """Whether M is diagonal, so that each equation contains one unknown only."""
         return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
 
@@ -113,7 +113,7 @@ class BoxProblem(_Problem):
 
     @cached_property
     def regular(self) -> bool:
-        """Whether all principal minors are positive. With more than ten unknowns only the diagonal is checked."""
+        """Whether all checked principal minors are positive. Raises SingularLoop if one is negative."""
         n = len(self.M)
         scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
         unit, regular = self.M / scale / scale[:, None], True

@@ -103,7 +103,6 @@ class Coupling:
         raise ValueError(f"a coupling of class {type(self).__name__} cannot be stored in a file")
 
     def __repr__(self) -> str:
-        """Return the class and the order, as in `figures`."""
         try:
             return f"{type(self).__name__}(order {self.figures(1.0)['order']})"
         except (ValueError, TypeError):  # a user's own class may have no compliance
@@ -164,7 +163,6 @@ class SpringDamper(ReadOnly, Coupling):
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
     def channels(self, T: Number) -> list[Lti]:
-        """Return V_i(z) of each channel. A channel without damper has no state."""
         beta = self._beta(T)
         return [
             _spring_damper(k, b, beta, T)
@@ -172,7 +170,6 @@ class SpringDamper(ReadOnly, Coupling):
         ]
 
     def compliance(self, T: Number) -> Lti:
-        """Return the diagonal V(z)."""
         return Lti.diag(*self.channels(T))
 
     def __repr__(self) -> str:
@@ -320,7 +317,6 @@ class MovingAverage(ReadOnly, Coupling):
         return 1 / (self.weight * self.terms + self.constant)
 
     def channels(self, T: Number) -> list[Lti]:
-        """Return V_i(z) of each channel."""
         rows = zip(numbers(self.weight, T), self.terms, numbers(self.constant, T), strict=True)
         return [taps([w + e, *[w] * (n - 1)], T) for w, n, e in rows]
 
@@ -606,8 +602,6 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
-    """The form of a direct connection, V = 0."""
-
     @property
     def shape(self) -> None:
         """The field that determines the number of channels, and its size; None if any number is allowed."""
@@ -618,8 +612,6 @@ class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
 
 
 class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
-    """The form of a spring and damper per channel (26)."""
-
     K: tuple[float, ...]  # (m,) [N/m]
     B: tuple[float, ...]  # (m,) [N s/m]
 
@@ -635,8 +627,6 @@ class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-dampe
 
 
 class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix-spring-damper"):
-    """The form of springs and dampers between the axes of devices (26)."""
-
     K: _Rows  # (m, m) [N/m]
     B: _Rows  # (m, m) [N s/m]
 
@@ -652,8 +642,6 @@ class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix
 
 
 class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
-    """The form of a moving sum of the forces and a plain spring per channel."""
-
     weight: tuple[float, ...]  # (m,) [m/N]
     terms: tuple[int, ...]  # (m,)
     constant: tuple[float, ...]  # (m,) [m/N]
@@ -670,8 +658,6 @@ class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-aver
 
 
 class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
-    """The form of a general V(z): the rows of its state-space matrices."""
-
     A: _Rows
     B: _Rows
     C: _Rows
@@ -692,8 +678,6 @@ class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
 
 
 class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
-    """The form of an internal-model coupling: the poles of its basis, and a coefficient for each basis function."""
-
     poles: tuple[float, ...]  # (n,)
     Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
 
@@ -713,8 +697,6 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
 
 
 class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
-    """The form of a force filter: poles and pole pairs of its basis, and a coefficient for each basis function."""
-
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)
     R: tuple[_Rows, ...]  # (1 + n + 2 p, m, m or m + 1)

@@ -51,10 +51,7 @@ def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
 
 
 def packet_delays(values: ArrayLike) -> Ticks:
-    """Return a read-only array of delays (ticks, m, nsim), in samples or LOST.
-
-    Raises ValueError for another number of axes, for a fraction, or for a number below LOST.
-    """
+    """Return a read-only array of delays (ticks, m, nsim), in samples or LOST. Raises ValueError for other values."""
     delays = np.array(values, dtype=np.int64)
     if not np.array_equal(delays, values):
         raise ValueError("delays have fractions, expected whole numbers of samples")
@@ -96,7 +93,7 @@ def realising(wanted: Ticks) -> Ticks:
     delays = np.empty_like(wanted)
     for column in np.ndindex(*wanted.shape[1:]):
         used = packet[(slice(None), *column)]
-        # packet j arrives at the first tick that uses packet j or a newer one
+        # Packet j arrives at the first tick that uses packet j or a newer one.
         delays[(slice(None), *column)] = np.searchsorted(used, np.arange(ticks)) - np.arange(ticks)
     late = np.arange(ticks).reshape(packet.shape[0], *(1,) * (wanted.ndim - 1)) + delays >= ticks
     return np.where(late, wanted.max(axis=0), delays)

@@ -29,9 +29,9 @@ GROUND = "ground"
 _NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or the network of linearise(world, pose)"
 
 
-#: largest amounts: far above those of any rendered object, and far below the largest float
+#: Largest amounts: far above those of any rendered object, and far below the largest float.
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-#: smallest amount other than 0: a person cannot feel it, and its square is far above the smallest float
+#: Smallest amount other than 0: a person cannot feel it, and its square is far above the smallest float.
 _LEAST_AMOUNT = 1e-12
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
@@ -113,10 +113,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_de
 
 
 def _parts_of(element: Any) -> list[Spring | Wall]:
-    """Return the springs and walls of a user's own element. Raises ValueError for an object without such parts.
-
-    A hardening spring, for example, is a spring with walls in parallel, which push beyond their gaps.
-    """
+    """Return the springs and walls of a user's own element. Raises ValueError for an object without such parts."""
     listed = element.parts() if callable(getattr(element, "parts", None)) else None
     parts = list(listed) if isinstance(listed, list | tuple) else []
     if not parts or not all(type(part) in (Spring, Wall) for part in parts):
@@ -177,8 +174,8 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _ROUNDING = 1e-9  # allowed asymmetry and negative eigenvalues of E(1), relative to the mean gain
-#: stiffness of a correcting spring up to which `_correction` stops its search, and the largest stiffness that it
-#: accepts, both relative to the mean gain
+#: Stiffness of a correcting spring up to which `_correction` stops its search, and the largest stiffness that it
+#: accepts, both relative to the mean gain.
 _ENOUGH, _MOST_LIFT = 1e-8, 1e-6
 
 
@@ -539,9 +536,8 @@ def environment(network: Network, T: Number) -> Lti:
 
     The positions q and velocities v of the internal nodes obey
     M (v - v-)/T + D v + K q + (terms of the contacts) = 0 with q = q- + T v, where q- and v- are those of the
-    previous tick. Every tick solves this equation for v. The states are q- and v-, the previous displacements of
-    contacts with dampers or masses, and the previous velocities of contacts with masses. The network's block is added
-    to E(z). The arithmetic is that of T.
+    previous tick. The states are q- and v-, the previous displacements of contacts with dampers or masses, and the
+    previous velocities of contacts with masses. The network's block is added to E(z). The arithmetic is that of T.
     Raises ValueError if an internal node has no mass and nothing holds it, or only the rounding of directions does.
     """
     parts = network.contacts, network.springs, network.walls, *network.masses.items(), *network.points.items()
@@ -587,9 +583,8 @@ def _free_directions(network: Network, parts: Sequence[Spring | Wall], T: Number
     """Return the directions in which no stiffness resists the internal nodes, each as (node, displacements (n,)).
 
     The position in such a direction affects no force and would be an unobservable integrator. The node of a direction
-    moves by 1 in it and not at all in the others; `_realise` stores positions relative to this node. A body that no
-    spring joins to a contact or to ground moves freely. A body that one diagonal spring ties to ground moves freely
-    across this spring. The elimination is exact, and the result has the arithmetic of T.
+    moves by 1 in it and not at all in the others; `_realise` stores positions relative to this node. The elimination is
+    exact, and the result has the arithmetic of T.
     """
     inner = {name: i for i, name in enumerate(network.nodes()[len(network.contacts) :])}
     lengths = [ends for part in parts if part.stiffness > 0 for ends in network._lengths(part)]

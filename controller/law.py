@@ -74,7 +74,6 @@ class Law(ReadOnly):
 
     @property
     def without_theta(self) -> Self:
-        """Return the law without the delays of the forces."""
         return replace(self, theta=(0,) * self.channels)
 
     @property
@@ -98,7 +97,6 @@ class Law(ReadOnly):
 
     @cached_property
     def _problem(self) -> Complementarity:
-        """The complementarity problem of a tick, with the walls' forces p as unknowns."""
         m = self.channels
         return Complementarity(np.diag(1 / self.steepness) - self.sent.D[m:, m:])
 

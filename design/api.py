@@ -91,7 +91,7 @@ def certified_for(loop: Loop, certified: bool) -> Network | None:
     return network if certified and isinstance(network, Network) and network.linear_model_of else None
 
 
-#: the quick designs that `instead` tries; with 0 seconds an optimal coupling has only its smallest basis
+#: The quick designs that `instead` tries. With 0 seconds an optimal coupling has only its smallest basis.
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
@@ -108,7 +108,7 @@ def instead(
 ) -> str:
     """Return certified alternatives to a failed design in words, least rms mismatch first, or "" if there are none.
 
-    The candidates of _QUICK are designed and judged here; with varying delays no candidate is tried.
+    With varying delays no alternative is tried.
     """
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for i, (other, target, options) in enumerate(_QUICK):
@@ -212,10 +212,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """Return the design with its certificate if exact arithmetic proves its condition.
-
-    With ranges or varying delays, or if no proof is found, return the design unchanged.
-    """
+    """Return the design with its exact certificate; unchanged with ranges or varying delays, or without a proof."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -299,10 +296,7 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
 
 
 def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
-    """Return the coupling of a design, or the coupling itself.
-
-    Raises TypeError for anything else, and ValueError for a wrong number of channels.
-    """
+    """Return the coupling as `bare` does, but raise ValueError if its number of channels is not that of the loop."""
     alone = bare(coupling)
     Stored.of(loop, alone)
     return alone

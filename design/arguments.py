@@ -55,11 +55,7 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """Describe `value` for a message: its repr and type, such as `2.5 (float)`.
-
-    Return only `a Loop` (its type) if the repr is longer than 60 characters or has several lines, or if the class is of
-    this package. Return `None` for None.
-    """
+    """Describe `value` for a message: `2.5 (float)`, or `a Loop` for a long repr or a class of this package."""
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

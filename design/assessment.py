@@ -162,7 +162,6 @@ class SearchFigures:
 
     @classmethod
     def of(cls, searched: Searched) -> SearchFigures:
-        """Summarise a search."""
         worst, ended = searched.worst[0], searched.ended
         violated = not suffices(worst.ratio)
         return cls(searched.tried, worst.ratio, worst.member.name, violated, ended is not None, ended == "clock")
@@ -312,7 +311,6 @@ class ForceLimits:
         return self.rho is not None and self.proof == "rational"
 
     def part(self) -> dict[str, Any]:
-        """Return the record as fields for JSON."""
         shown = {"rho": self.rho, "force_limit": self.force_limit, "reason": self.reason, "words": self.words}
         return shown | {"certificate": self.requirement, "c": self.c, "energy_budget": self.energy_budget}
 
@@ -436,8 +434,7 @@ class EncoderSteps:
     ) -> EncoderSteps | None:
         """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds, which decide nothing. `beyond` is the name of the condition
-        that certifies the loop, if no friction is proved to suffice with it.
+        `beyond` is the name of the condition that certifies the loop, if no friction is proved to suffice with it.
         """
         if not any(steps):
             return None
@@ -527,7 +524,6 @@ class Guarantee:
         return self.environments
 
     def part(self) -> dict[str, Any]:
-        """Return the record as fields for JSON."""
         delays = {"lo": self.delays.lo, "hi": self.delays.hi}
         part: dict[str, Any] = {"condition": self.condition, "proof": self.proof, "facts": self.facts}
         part |= {"hands": self.hands, "environments": self.environments, "forces": self.forces}
@@ -616,7 +612,6 @@ class Assessment:
         return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
-        """Return the record as fields for JSON."""
         loop, gains = self.loop, self.gains
         about = {"T_s": loop.T, "T_max_s": loop.T_max, "latency_s": loop.latency}
         about |= {name: getattr(loop, name) for name in ("theta", "psi", "lam", "delta")}
@@ -764,7 +759,6 @@ def _force_limits(
     known: Certificate | None,
     c: Sequence[Sequence[float]] | None,
 ) -> ForceLimits:
-    """Return the limiter for a loop, or clipping with the reason."""
     if limiter is False:
         return ForceLimits(None, "the limiter is switched off")
     return _covered_limits(loop, coupling, requirements, proof, known, c)
@@ -885,10 +879,7 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """Return (the shell's guarantee or None, the reason why there is none).
-
-    The shell needs a coupling that is certified for any environment, psi = 0 and constant delays.
-    """
+    """Return (the shell's guarantee or None, the reason); it needs any-environment, psi = 0 and constant delays."""
     loop, needs = assessment.loop, assessment.requirements[(assessment.own or ANY_ENVIRONMENT).name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"

@@ -86,6 +86,8 @@ class MatrixInequality:
 class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
+    The methods are those of MatrixInequality, but `add_newton` adds the upper triangle of the Hessian only.
+
     The unknowns are the entries of the X_n, sorted by entry and then by n, followed by the x_a. At each frequency the
     second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
     S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)
@@ -104,16 +106,13 @@ class EntryInequality:
 
     @property
     def products(self) -> int:
-        """The approximate number of products in a Newton step."""
         (k, n), square, own = self.functions.shape, self.left.shape[-1] ** 2, self.slope.shape[2]
         return k * (n**2 * square**2 + square * own * (square + n * square + own))
 
     def at(self, x: Array) -> Complex:
-        """Return S(x), shape (k, r, r)."""
         return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
-        """Return the change of S if x changes by `step`, (k, r, r)."""
         r = self.left.shape[-1]
         X, own = np.split(step, [r * r * self.functions.shape[1]])
         filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)
@@ -133,7 +132,6 @@ class EntryInequality:
         return _unpacked(np.swapaxes(self.slope, 1, 2))
 
     def add_newton(self, x: Array, gradient: Array, hessian: Array) -> None:
-        """Add the gradient of -log det S and the upper triangle of its Hessian to the arguments."""
         (k, n), r = self.functions.shape, self.left.shape[-1]
         L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
         P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
@@ -182,7 +180,6 @@ class Program:
 
     @cached_property
     def square(self) -> Array:
-        """The matrix A'A."""
         return self.A.T @ self.A
 
     @property
@@ -196,7 +193,6 @@ class Program:
         return _STEP + _PRODUCT * products
 
     def value(self, x: Array) -> float:
-        """Return |A x - b|^2 + c'x."""
         residual = self.A @ x - self.b
         return float(residual @ residual + self.c @ x)
 
@@ -279,10 +275,7 @@ def centre(program: Program, x: Array, t: float) -> Array:
 
 
 def towards(start: Array, x: Array, program: Program) -> Array:
-    """Return x if it is feasible, else a feasible point on the line from the feasible `start` to x.
-
-    The point lies at nine tenths of the distance from `start` to the boundary.
-    """
+    """Return x if it is feasible, else the point at 0.9 of the way from the feasible `start` to the boundary."""
     if program.feasible(x):
         return x
     low, high = 0.0, 1.0

@@ -46,8 +46,8 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import NotProved, Requirement, refusal, switching_guarantee
 
-#: allowed error of figures on file: of required damping relative to the largest available one, of the margin relative
-#: to itself; repeated sweeps agree to 1e-9
+#: Allowed error of figures on file: of required damping relative to the largest available damping, of the margin
+#: relative to itself. Repeated sweeps agree to 1e-9.
 _CLAIM_TOLERANCE = 1e-6
 
 

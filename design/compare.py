@@ -22,10 +22,6 @@ from haptic_loop.design.environments import ANY_ENVIRONMENT, SWITCHING, THIS_ENV
 from haptic_loop.design.frequency import Response, frequencies, on_circle
 from haptic_loop.design.result import Requirement
 
-# ----------------------------------------------------------------------------------------------------
-# A coupling over frequency: singular values, required damping, and what a hand perceives.
-
-
 _LOWEST_HZ = 0.1  # lowest frequency of a picture
 FEEL_HZ = (1.0, 10.0)  # frequencies of the table of perceived stiffness and damping
 
@@ -105,7 +101,6 @@ def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
 
 
 def _singular_values(G: NDArray[np.complex128]) -> Array:
-    """Return the singular values (k, m) of (k, m, m), largest first."""
     return np.linalg.svd(G, compute_uv=False)
 
 

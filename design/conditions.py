@@ -22,9 +22,6 @@ To add a hands' side, derive a class from `HandsSide` and state
   `unknowns` its multipliers, by name; `room`, `allowed` and `excess` state which values are allowed.
 Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
 adds walls, limiter and switching without further code.
-
-any-environment applies Lemma 4 of the paper to any passive environment under backward Euler (`_v_hat`,
-`any_environment_demand`). `delayed_environment_demand` is the environment's block for psi >= 1.
 """
 
 from __future__ import annotations
@@ -211,10 +208,7 @@ def _least_multiple(free: Complex, gain: Complex) -> Array:
 
 
 def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
-    """Return the least s (...,) with free + s gain >= 0 for 2 x 2 matrices with det(gain) = room, or inf.
-
-    Solving the quadratic equation is 20 times as fast as LAPACK.
-    """
+    """Return `_least_multiple` of 2 x 2 matrices with det(gain) = room, 20 times as fast as with LAPACK."""
     (a, b, d), (p, q, r) = ((M[..., 0, 0].real, M[..., 0, 1], M[..., 1, 1].real) for M in (free, gain))
     twice, last = a * r + d * p - 2 * (b.real * q.real + b.imag * q.imag), a * d - b.real**2 - b.imag**2
     root = np.sqrt(np.maximum(twice**2 - 4 * room * last, 0.0))
@@ -224,10 +218,7 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there.
-
-    If I is empty, s is 0 or inf.
-    """
+    """Return the least s (n,) with H + s diag(0, I) >= 0 and r rows in 0; inf if H is not > 0 there."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size
@@ -239,9 +230,9 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     return needed
 
 
-#: properties of a loop that a condition covers only if it names them in `covers`
+#: Properties of a loop that a condition covers only if it names them in `covers`.
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
-#: properties of a loop that a certificate may list as its facts, in the order of reports and files
+#: Properties of a loop that a certificate may list as its facts, in the order of reports and files.
 FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 
 
