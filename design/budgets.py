@@ -3,9 +3,8 @@
 A search ends because it has converged, because a proof or a bound decides, or because one of these budgets is spent.
 No clock ends it unless the user sets a time limit, so that results do not depend on the load of the machine. Work is
 counted from the sizes of matrices and numbers (`haptic_loop.controller.arithmetic.spend`); one unit takes about a
-second on one core.
-Limits of bisections down to rounding, and of iterations in a tick, are defined where they are used.
-The numbers were measured on 23 loops, 22 of which are n0 to o13 in benchmarks/loops, on a core of an AMD EPYC, 2.4 GHz.
+second on one core. The numbers were measured on 23 loops, 22 of which are n0 to o13 in benchmarks/loops, on a core of
+an AMD EPYC, 2.4 GHz.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from haptic_loop.controller.arithmetic import TooLong
 EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.003 for two or three devices and 0.007 for eight.
 SWEEPS = 60.0
-#: The search over larger bases of an optimal coupling. The slowest of the 23 loops take 19 (o11), 17 (o08) and 15 (n6,
-#: n7).
+#: The search over larger bases of an optimal coupling. The slowest of the 23 loops takes 19 (o11).
 GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: about 500 sweeps for each set of present springs.
 RANGES = 60.0
@@ -30,11 +28,9 @@ RANGES = 60.0
 BASIS_STATES = 270
 #: Largest cost of the proofs of a basis, (number of environments) states^2.7: that of 30 proofs over 112 states.
 BASIS_PROOFS = 30 * 112**2.7
-#: Largest number of unknowns of a basis with filters between all channels, for this-environment alone. The largest
-#: program takes ten seconds.
+#: Largest number of unknowns of a basis with filters between all channels, for this-environment alone: ten seconds.
 BASIS_UNKNOWNS = 1600
-#: In all other cases, the largest product of the number of unknowns and the number of channels. A program of this size
-#: takes ten seconds.
+#: In all other cases, the largest product of the numbers of unknowns and channels: also ten seconds.
 BASIS_BESIDE = 3500
 #: Number of successive bases without a certified coupling after which no larger basis is tried; ranges have no limit.
 UNPROVED_BASES = 2
@@ -58,14 +54,12 @@ GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
 THEOREM_4_ROUNDS = 12
 #: Steps of the sequence of convex problems for gains. Case I takes 2.
 SEQUENCE_STEPS = 60
-#: Designs, each for another share of the damping, until the coupling satisfies a second condition. one-wall.toml takes
-#: 2.
+#: Designs for less and less damping, until the coupling satisfies a second condition. one-wall.toml takes 2.
 LESS_DAMPING_ROUNDS = 6
 #: Rounds that add frequencies to the program of an optimal coupling. Case I takes 4.
 PROGRAM_SWEEPS = 6
 #: Rounds that add frequencies to the bound on linear couplings, number of its vanishing sums of coefficients s_k
-#: (docs/theory.md), and intervals of its integral. Cases I and II take 2 rounds and 568 intervals. With psi = 0 a delay
-#: of theta_i samples makes theta_i sums vanish for each channel.
+#: (docs/theory.md), and intervals of its integral. Cases I and II take 2 rounds and 568 intervals.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Convex problems for a coupling of fixed order. Case I takes 44.
 FIXED_ORDER_PROBLEMS = 100
@@ -89,8 +83,7 @@ CENTRING_STEPS, CONE_STEPS = 60, 60
 DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
 #: Rounds of halving the intervals of an integral (3), and intervals that are halved in one round.
 INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
-#: Blocks of 256 ticks over which an impulse response is summed to a relative 1e-9; a bound covers the rest.
-#: Only a mode that takes 250,000 ticks to fall to 1/e needs this many blocks.
+#: Blocks of 256 ticks of an impulse response that are summed. Only a time constant above 250,000 ticks needs them all.
 GAIN_CHUNKS = 20_000
 
 

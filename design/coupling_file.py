@@ -69,7 +69,6 @@ class Stored(Strict, frozen=True):
         return stored
 
     def built(self) -> Coupling:
-        """Return the coupling, built from its form."""
         return self.coupling.build(self.loop.T)
 
 

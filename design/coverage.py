@@ -16,10 +16,6 @@ from haptic_loop.design.files import off_table
 from haptic_loop.design.result import Design, DesignFailed, Requirement, suffices
 from haptic_loop.design.transparency import decibels, transparency
 
-# ----------------------------------------------------------------------------------------------------
-# Switching delays, compared with a playout buffer.
-
-
 _NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: varying delays "
     "of the measured positions, periods longer than T_max, or forces older than the range, as after lost packets."
@@ -60,10 +56,6 @@ class SwitchingFigures:
         buffered = THIS_ENVIRONMENT.judge(latest, coupling)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
         return cls(requirement, span.lo, span.hi, requirement.multiplier, playout, _NOT_COVERED)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Cost of a guarantee for ranges: the robust coupling compared with the nominal coupling.
 
 
 @dataclass(frozen=True)
@@ -111,10 +103,7 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """Return the figures of `design` in the members of the loop's ranges.
-
-    If `nominal` is given and makes a design for the nominal environment alone, the figures of this design come first.
-    """
+    """Return the figures of `design` over the ranges, after those of `nominal`'s design if `nominal` makes one."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}

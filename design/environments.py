@@ -82,11 +82,10 @@ from haptic_loop.design.result import (
 )
 
 # ----------------------------------------------------------------------------------------------------
-# The search for the best multiplier. s is required over available damping. The block is affine in s and the multipliers
-# (`Multiplied.scaled`).
-# At finitely many frequencies a semidefinite program (design.cone) gives the least s over the multipliers between their
-# bounds (`Unknowns`), which is a lower bound. Frequencies at which a sweep with this multiplier needs a larger s are
-# added until the sweep attains the bound, or a budget is spent.
+# The search for the best multiplier. The block is affine in s, the required over the available damping, and in the
+# multipliers (`Multiplied.scaled`). At finitely many frequencies a semidefinite program (design.cone) gives the least s
+# over the multipliers between their bounds (`Unknowns`), which is a lower bound. Frequencies at which a sweep with this
+# multiplier needs a larger s are added until the sweep attains the bound, or a budget is spent.
 
 
 class Multiplied(Condition):
@@ -325,10 +324,6 @@ class _Search:
         return Inequality(constant, by, range(len(by)))
 
 
-# ----------------------------------------------------------------------------------------------------
-# The condition this-environment, with walls that make and break contact, delays that switch, and ranges.
-
-
 class ThisEnvironment(Multiplied):
     """Stability for every passive hand in the loop's environment, with the loop's facts (design.facts).
 
@@ -408,8 +403,7 @@ class ThisEnvironment(Multiplied):
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
         """Return the largest requirement of all members with `multiplier`.
 
-        For None, the usual multiplier and the best multiplier of the worst member are tried, and the better result
-        counts.
+        For None, it is the better result of the usual multiplier and of the best multiplier of the worst member.
         """
         loops = [loop.at(member.network) for member in loop.members()]
 
@@ -482,10 +476,6 @@ def worst(requirements: Sequence[Requirement]) -> int:
     return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
 
 
-# ----------------------------------------------------------------------------------------------------
-# The condition switching: delays that switch within [lo, hi] at every tick, on each device separately.
-
-
 class SwitchingDelays(ThisEnvironment):
     """The condition this-environment for delays that switch, reported as a separate requirement "switching"."""
 
@@ -555,10 +545,7 @@ class LimitedForces(ThisEnvironment):
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
 
     def not_designed(self, loop: Loop) -> str | None:
-        """Return the reason why this loop has no design for limited forces, or None.
-
-        Couplings can still be judged, unless the reason is that of `beyond`.
-        """
+        """Return the reason why this loop has no design for limited forces, or None."""
         if loop.varying_delay:
             return "limiter: designs for limited forces are made for constant delays, not for delays that switch"
         if loop.environment.walls or loop.latency:
@@ -636,10 +623,7 @@ def least_multiplier(loop: Loop) -> Array:
 
 
 def _of_least_trace(regular: Lti, most: Array, positive: bool) -> Array:
-    """Return the entries of the diagonal Phi <= most (m, m) with least trace for which `regular` + Phi is passive.
-
-    The entries are not negative if `positive`.
-    """
+    """Return the diagonal Phi <= most of least trace, (m,), with `regular` + Phi passive, and >= 0 if `positive`."""
     m, n = regular.inputs, regular.order
     ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
@@ -713,7 +697,6 @@ class _AnyEnvironment(Multiplied):
         return not self._extended and not loop.levels and not (loop.axes and self.unknowns(loop))
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """Return the facts of the environment's side that the block needs."""
         return (Switching(),) if loop.varying_delay else ()
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:

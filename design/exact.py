@@ -215,7 +215,6 @@ def _nearest(num: int, den: int, shift: int) -> int:
 
 
 def _less(W: _Integers, units: int) -> _Integers:
-    """Return W - units I."""
     W = W.copy()
     W[np.diag_indices(len(W))] -= units
     return W
@@ -398,10 +397,7 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
 
 
 def reached(G: Lti) -> Lti:
-    """Return the same map without the states that no input reaches, by the pattern of A and B.
-
-    If the map starts at rest, such states stay zero, for example those of a filter behind a lost contact.
-    """
+    """Return the same map without the states that no input reaches, which stay zero, by the pattern of A and B."""
     reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
     while (more := reached_states | (pattern & reached_states).any(axis=1)).sum() > reached_states.sum():

@@ -873,10 +873,6 @@ def _row(values: Array, suffix: str) -> str:
     return "\n".join(textwrap.wrap(f"{{{text}}}", 112, initial_indent="    ", subsequent_indent="     "))
 
 
-# ----------------------------------------------------------------------------------------------------
-# The comment above the block.
-
-
 def with_origin(
     block: ExportedBlock, file: str, stored: Stored, verdict: Verdict, claim: str | None = None
 ) -> ExportedBlock:

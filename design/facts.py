@@ -374,16 +374,12 @@ class Unknowns:
     name: str  # name of the multiplier in files
     units: tuple[float, ...]  # (n,); 0 for a number that is always 0
     expected: str  # the allowed values in words, for messages
-    least: float  # in units; if `least` is positive, the numbers must be positive
+    least: float  # in units; numbers are positive if it is positive, >= 0 if it is 0, of any sign if it is negative
     most: float
     start: tuple[float, ...] | None = None  # (n,) first values of a search; the units if None
 
     def check(self, values: Sequence[Any]) -> None:
-        """Raise ValueError unless the values may be a multiplier.
-
-        A number whose unit is 0 must be 0. The others may have any sign if `least` is negative. They must be at least 0
-        if `least` is 0, and positive if `least` is positive.
-        """
+        """Raise ValueError unless the values may be a multiplier: 0 where the unit is 0, otherwise as `least` says."""
 
         def allowed(v: Any) -> bool:
             return abs(v) < np.inf and (self.least < 0 or (v >= 0 if self.least == 0 else v > 0))
@@ -484,10 +480,7 @@ class Latency(HandsSide):
         return form
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
-        """Return s I - D Q D for the Q in `values`, at _LATENCIES latencies tau of each range.
-
-        D is diag(tau, T_max - tau)^(1/2).
-        """
+        """Return s I - D Q D, D = diag(tau, T_max - tau)^(1/2), for the Q in `values` and _LATENCIES tau per range."""
         bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)

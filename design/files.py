@@ -121,10 +121,6 @@ def _met(places: set[Any], known: dict[Any, str]) -> str | None:
     return next((known[place] for place in places if place in known), None)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Reading.
-
-
 def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, hint: str = "") -> bytes:
     """Return the bytes of a regular file of at most `most` bytes. Raises InputError.
 
@@ -218,10 +214,6 @@ def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
         if dtype.hasobject or min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != there:
             raise ValueError(f"{entry.filename} declares {shape} of {dtype}, but contains {there} bytes")
         return np.frombuffer(member.read(), dtype).reshape(shape, order="F" if fortran else "C")
-
-
-# ----------------------------------------------------------------------------------------------------
-# Writing.
 
 
 def check_file(option: str, path: Path, expected: str = "a file") -> Path:

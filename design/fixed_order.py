@@ -235,7 +235,6 @@ def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
 
 
 def _singular(Q: Array, U: Array) -> bool:
-    """Return whether a storage is singular to rounding."""
     return min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) <= 0
 
 

@@ -133,10 +133,7 @@ _POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep
 
 
 def _sweep_cost(G: Lti) -> float:
-    """Estimate the time [s] of a sweep of a large G; delays at the outputs of G cost nothing.
-
-    Calls, which add up to about 0.01 s, are neglected.
-    """
+    """Estimate the time [s] of a sweep of a large G; delays at the outputs of G cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
@@ -192,7 +189,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
     |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
 
     The difference between the responses of G and `meant` would be less useful: it is large as soon as a sharp peak
-    moves by its own width, and even a Schur form of badly scaled states moves the peak so far.
+    moves by its own width.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (

@@ -145,7 +145,7 @@ class SampledLoop:
         self._affine = none, of_G - none, of_mu - none, of_both - of_G - of_mu + none
 
     def _sample(self, where: str, w: Array) -> None:
-        """Sample Psi E at exp(jw)."""
+        """Store Psi E at exp(jw), and the slope of 1/V in B/delta."""
         delayed = Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
         self._delayed[where] = delayed
         self._rate[where] = damper_rate(delayed.z[0], delayed.T)[:, None] * self.delta
@@ -366,7 +366,6 @@ class LimiterLoop(SampledLoop):
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """Return x of the gains and the first value of c."""
         return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:

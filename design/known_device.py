@@ -742,10 +742,7 @@ class KnownDevice(Condition):
         return self.form(G, loop, values, hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Return the requirement with the best beta and multipliers, or with `multiplier`.
-
-        All members of ranges have the same beta and the same multipliers.
-        """
+        """Return the requirement with the best beta and multipliers, the same in all members, or with `multiplier`."""
         if reason := self.beyond(loop) or self.without(coupling):
             return refusal(self.name, loop.delta, reason, applies=False)
         m, expected = loop.channels, sum(self.multiplier_sizes(loop).values())

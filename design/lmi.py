@@ -232,10 +232,7 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
 
 
 def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
-    """Return the matrix of Lemma 3 and (24), with mu2 = mu^2.
-
-    For some U > 0 and X = U^-1 it is positive iff G is stable and ||G||_inf < mu.
-    """
+    """Return the matrix of Lemma 3 and (24), mu2 = mu^2; > 0 for some U > 0 and X = U^-1 iff ||G||_inf < mu."""
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
         [X, np.zeros((n, m)), A.T, C.T],

@@ -322,10 +322,7 @@ class _Search:
         return not self.options.limiter
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
-        """Return the limiters to design with: the certified limiter of the solution `before`, or those of _LAGS.
-
-        Without `options.limiter` return (None,).
-        """
+        """Return the certified limiter of the solution `before`, or those of _LAGS; (None,) without the limiter."""
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
@@ -385,10 +382,7 @@ class _Search:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
-        """Return whether a basis is small enough to be tried and its loop has more than `before` states.
-
-        The decision depends only on the numbers of states and unknowns, so that it is the same on a busy machine.
-        """
+        """Return whether a basis is small enough to be tried and its loop has more than `before` states."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own, full = int((span.used.sum(axis=1) > 0)[:, :m].sum()), span.used.shape[2] == m

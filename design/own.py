@@ -105,9 +105,6 @@ def is_refusal(error: BaseException) -> bool:
 
 
 def place_of(error: BaseException) -> str | None:
-    """Return the innermost line of the user's own code in the traceback, as `FILE, line N`, or None.
-
-    A file is the user's own code if it belongs neither to this package nor to the Python installation.
-    """
+    """Return the innermost line of the user's own code in the traceback, as `FILE, line N`, or None."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_OTHERS)]
     return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else None

@@ -172,15 +172,8 @@ class NotProved(ValueError):
         self.requirement, self.refuted = requirement, refuted
 
 
-# ----------------------------------------------------------------------------------------------------
-# Errors of designs.
-
-
 class DesignFailed(ValueError):
-    """No design could be verified. `problem` is the convex problem or None; `advice` is the message.
-
-    `results` are the attempts.
-    """
+    """No design could be verified. `problem` is the convex problem or None, `results` the attempts, `advice` a text."""
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice
@@ -191,10 +184,6 @@ class Infeasible(DesignFailed):
     """The design problem has no solution."""
 
 
-# ----------------------------------------------------------------------------------------------------
-# Figures as text.
-
-
 def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) -> str:
     """Return the values as "1.37, 0.5", with `digits` significant digits; None is printed as inf.
 
@@ -202,10 +191,6 @@ def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) 
     """
     texts = ["inf" if v is None else f"{v + 0.0:.{digits}g}" for v in values]
     return texts[0] if once and len(texts) > 2 and len(set(texts)) == 1 else ", ".join(texts)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Couplings with their conditions.
 
 
 @dataclass(frozen=True, eq=False)

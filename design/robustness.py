@@ -92,11 +92,11 @@ def robustness(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIR
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """Return `robustness`, with changes of ten percent, or None.
+    """Return `robustness`, or None if it does not apply.
 
-    Returns None in three cases. The condition holds in any environment, is not evaluated for varied loops
-    (`not_varied`) or does not cover the loop. The environment is no network, has walls, or contains a block E(z). A
-    stiffness or mass plus ten percent is too large.
+    It does not apply if the condition holds in any environment, is not evaluated for varied loops (`not_varied`) or
+    does not cover the loop, to walls, blocks E(z) and other environments than networks, and to values that are too
+    large when increased by ten percent.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop) or condition.beyond(loop.at(loop.environment)):
         return None

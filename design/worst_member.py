@@ -103,11 +103,7 @@ def _member(region: Region, point: Array) -> Member:
 
 
 def _points(region: Region) -> Iterator[Array]:
-    """Yield points of the unit cube: at vertices, on edges, on faces and inside.
-
-    With up to _MANY dimensions these include all vertices, and points on every edge. With more, vertices, points on
-    edges and points inside are random, and there are none on faces.
-    """
+    """Yield points of the unit cube: at vertices, on edges, on faces and inside (see _MANY for many dimensions)."""
     n = region.low.size
     rng = np.random.default_rng(_SEED)
     if n > _MANY:
