@@ -290,8 +290,8 @@ def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Pat
     """Report a scene's parts and the energy that adversaries gained. Return 0 if runs have a guarantee, 1 if not."""
     began = time.perf_counter()
     report = _reported(args, scenario, chosen, START_J)
-    with render.progress("attacking"):
-        least = least_at_port(scenario, chosen.coupling, args.seed)
+    with render.progress("simulating hands that try to draw energy") as move:
+        least = least_at_port(scenario, chosen.coupling, args.seed, move)
     report = replace(report, least_at_port_J=least, wall_s=time.perf_counter() - began)
     rows = [*_common_rows(report), *((f"least energy, {name}", _energy(value)) for name, value in least.items())]
     rows.append(("active parts", ", ".join(report.scene.active) or None))

@@ -309,6 +309,7 @@ RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the initial speeds of all bodies of devices and hands
 _NEVER = 1e3  # [J] W0 so large that the shell never acts
 _ADVERSARIES = 20  # sets of hands that start with random speeds and a shell that never acts
+_BRAKED = 10  # runs of the adversary that stops and turns
 _STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
 
 
@@ -373,11 +374,15 @@ def _lossless(hand: Any) -> Any:
     return msgspec.structs.replace(hand, links=links, voluntary=None)
 
 
-def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
-    """Return the least energy at the port [J] in ten runs of 1 s in which the springs' ends stop and turn at random."""
+def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Callable[[int], None]) -> float:
+    """Return the least energy at the port [J] in runs of 1 s in which the springs' ends stop and turn at random.
+
+    `done` is called with the number of finished runs.
+    """
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
-        for _ in range(10):
+        for finished in range(_BRAKED):
+            done(finished)
             port, at_port = scene.port(), 0.0
             goal, speed, left, before = np.zeros(scene.channels), np.zeros(scene.channels), 0, port.u
             for _ in range(round(1.0 / scenario.T)):
@@ -391,15 +396,20 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int) -> float:
     return least
 
 
-def least_at_port(scenario: Scenario, coupling: Coupling, seed: int) -> dict[str, float]:
+def least_at_port(
+    scenario: Scenario, coupling: Coupling, seed: int, progress: Callable[[int, int], None]
+) -> dict[str, float]:
     """Return for each adversary the least energy [J] that entered the port, without a shell or with an idle one.
 
-    It is negative if the scene gave energy, else 0.
+    It is negative if the scene gave energy, else 0. `progress` is called with the finished runs and their number.
     """
-    least = {"hit and brake": _hit_and_brake(scenario, coupling, seed)}
-    hands = thrown(scenario, coupling, _ADVERSARIES, seed, 1.0, _NEVER)
+    total = _BRAKED + _ADVERSARIES
+    least = {"hit and brake": _hit_and_brake(scenario, coupling, seed, lambda done: progress(done, total))}
+    of_hands = thrown(
+        scenario, coupling, _ADVERSARIES, seed, 1.0, _NEVER, lambda done, _: progress(_BRAKED + done, total)
+    )
     for kind in (RANDOM, LOSSLESS):
-        least[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
+        least[f"thrown {kind}"] = min(each.figures.port_least_J for each in of_hands if each.kind == kind)
     return least
 
 
