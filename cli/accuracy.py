@@ -24,7 +24,7 @@ _LEGEND = (
 
 @dataclass(frozen=True)
 class _Report:
-    """Speed and errors of every engine with each of its settings, on one loop."""
+    """Speed and errors of each setting of every engine, on one loop."""
 
     case: str
     scenario: str
@@ -36,7 +36,7 @@ class _Report:
 
 
 def main(argv: list[str]) -> int:
-    """Measure every engine. Return 0 if the default settings judge stability rightly, 1 if not, 130 if interrupted."""
+    """Measure every engine. Return 0 if the default settings have the right verdicts, 1 if not, 130 if interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.accuracy")
@@ -67,10 +67,7 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(judged: Sequence[bool], rows: Sequence[Row]) -> str:
-    """Say whether the default settings judge stability correctly, with the errors of the exponential integrator.
-
-    `judged` has one entry for each of the two defaults that was measured.
-    """
+    """Return whether the default settings have the right verdicts, which `judged` says for each measured default."""
     which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
     words = f"{which} stability as the exact engine does" if judged else which
     words = words if all(judged) else "A DEFAULT JUDGES STABILITY WRONGLY"

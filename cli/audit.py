@@ -1,4 +1,4 @@
-"""python -m design.audit: judge a coupling, with its margins and the frequency at which its condition binds."""
+"""python -m design.audit: assess a coupling, with its margins and the frequency at which its condition binds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _EXAMPLES = (
 
 @dataclass(frozen=True)
 class _CatalogueDevice:
-    """A device of the catalogue with its name."""
+    """A device of the catalogue."""
 
     name: str
     listed: Listed = off_table("inlined")
@@ -39,7 +39,7 @@ class _CatalogueDevice:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """An audit and the sources of its numbers, in SI units; a missing figure is null and has a "reason"."""
+    """An audit and the sources of its numbers, in SI units; null has a "reason"."""
 
     case: str
     scenario: str | None
@@ -146,10 +146,7 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """Return the options, completed by the numbers that the catalogue has for --device. Raises InputError.
-
-    With --device, `source` is added: the source of the catalogue's gains, or None if they are not used.
-    """
+    """Return the options with the catalogue's numbers for --device, and their `source`. Raises InputError."""
     if not args.device:
         return args
     with options.refused("--"):
@@ -174,7 +171,6 @@ _UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, 
 
 
 def _list_devices(args: argparse.Namespace) -> int:
-    """Print the catalogue of devices, with a source for every number."""
     parts: dict[str, dict[str, Any]] = render.plain(CATALOGUE)
     facts = [fact for part in parts.values() for fact in part.values() if isinstance(fact, dict)]
     numbered = {source: i for i, source in enumerate(dict.fromkeys(fact["source"] for fact in facts), start=1)}
@@ -194,7 +190,7 @@ def _list_devices(args: argparse.Namespace) -> int:
 
 
 def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
-    """Audit a coupling in a MuJoCo world, by default a moving average designed for it."""
+    """Audit a coupling in a MuJoCo world, by default a moving average that is designed here."""
     from haptic_loop.cli import world
     from haptic_loop.design.environments import ANY_ENVIRONMENT
     from haptic_loop.design.result import Chosen
@@ -263,8 +259,7 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     return span
 
 
-# ----------------------------------------------------------------------------------------------------
-# The report as tables and remarks.
+# ---- the report as tables and remarks
 
 
 def _tables(result: Audit) -> list[render.Table]:
@@ -294,19 +289,19 @@ def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
 
 
 def _percent(error: float | None) -> str:
-    """Return a relative error in percent, rounded down, so that the printed error is tolerated, too."""
+    """Return a tolerated relative error in percent, rounded down."""
     return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
-    """Return stiffnesses with five digits, rounded down, so that the printed values are certified, too."""
+    """Return certified stiffnesses with five digits, rounded down."""
     if None in K:
         return "-"
     units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)
     return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
 
 
-#: row name -> function that formats the cell from the requirement and the margins of one condition
+#: row name -> function from the requirement and the margins of a condition to the cell
 _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
     "needs damping": lambda r, _: f"{r.amounts()}: {render.certified(r, proof=False)}",
     "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),

@@ -35,10 +35,7 @@ _LONGEST = 3600.0  # [s] largest --duration, the time at full gain of an arming,
 
 
 def main(argv: list[str]) -> int:
-    """Run a session. Return 0 if it ended as planned, 130 after a signal other than SIGUSR1, 1 for any other end.
-
-    While the device is armed, the first such signal starts a ramp to zero force.
-    """
+    """Run a session. Return 0 if it ended as planned, 130 after a signal other than SIGUSR1, 1 for any other end."""
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
@@ -95,7 +92,7 @@ def main(argv: list[str]) -> int:
 
 
 def _counted(program: CertifiedCoupling, steps: Sequence[float]) -> CertifiedCoupling:
-    """Return the coupling with its assessment for the encoder steps (m,) [m] that the device reports."""
+    """Assess the coupling for the encoder steps (m,) [m] that the device reports."""
     encoder = encoder_steps(program.scenario, program.case, program.assessment, steps)
     return replace(program, assessment=replace(program.assessment, encoder=encoder))
 
@@ -158,7 +155,6 @@ def _parser() -> argparse.ArgumentParser:
 def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
-    """Print the measured ages and the certified couplings, before anything is armed."""
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old (median), {at[99]} us at the 99th percentile, {ages.missing} of "
@@ -183,7 +179,7 @@ def _print_certificate(
 
 
 def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
-    """Return the table row of a coupling, with the damping needed by the first condition that certifies it."""
+    """Return the table row of a coupling, with the required damping of the first condition that certifies it."""
     assessment = program.assessment
     gains, requirements = assessment.gains, (assessment.decisive, *assessment.requirements.values())
     certified = next(need for need in requirements if need.certified)
@@ -206,7 +202,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """Return a sentence on the lengths of ticks and on the energy that a tick longer than certified may give a hand."""
+    """Describe the lengths of ticks, and the energy that a tick longer than certified may give a hand."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest, shortest = 1e3 * (scenario.T_max or scenario.T), 1e3 * (scenario.T_min or scenario.T)
@@ -224,11 +220,8 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
 
 
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
-    """Print the session's log, and the figures of the link, of energy accounts and of the scene.
-
-    If the session ended before the assessment, print its last stage and cause first, because no verdict was printed.
-    """
-    if report.assessment is None:
+    """Print the session's log, and the figures of the link, of energy accounts and of the scene."""
+    if report.assessment is None:  # No verdict was printed.
         last = report.session.log[-1]
         console.print(f"[red]Not certified[/]: the session is {_colour(last.stage)}, {last.cause}.", soft_wrap=True)
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}

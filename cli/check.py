@@ -117,7 +117,6 @@ def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
 
 
 def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) -> Assessment | None:
-    """Assess the coupling in the loop of its file, with the certificate that was just verified."""
     claim = stored.certificate
     assert claim
     condition = own or claim.condition
@@ -127,7 +126,7 @@ def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) 
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
-    """Repeat the search between the vertices of the ranges if the file's guarantee is for ranges; else return None."""
+    """Repeat the search between the vertices of the ranges; return None if the file has no guarantee for ranges."""
     if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
     loop, coupling = stored.loop, stored.built()

@@ -1,9 +1,8 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
 Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. If the loop has
-neither walls nor friction, each coupling is also run with the scenario's hands. couplings.png shows these forces side
-by side; it omits the paper's gains. With --coupling, the named couplings are drawn over frequency: singular values,
-required damping, perceived stiffness and damping.
+neither walls nor friction, each coupling is also run with the scenario's hands, and couplings.png shows the forces
+(without those of the paper's gains). With --coupling, the named couplings are drawn over frequency.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
 from haptic_loop.sim.stability import MARGINAL
 
-_MOST = 6  # curves that can be told apart in one panel
+_MOST = 6  # number of curves that can be distinguished in one panel
 
 
 def main(argv: list[str]) -> int:
@@ -59,8 +58,7 @@ def _parser() -> options.Parser:
     return parser
 
 
-# ----------------------------------------------------------------------------------------------------
-# Every coupling with the same devices and hands.
+# ---- every coupling with the same devices and hands
 
 
 @dataclass(frozen=True)
@@ -89,11 +87,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _nearest(couplings: Sequence[Alternative]) -> str:
-    """Return a sentence that names the guaranteed coupling of least force error.
-
-    The sentence may also say that there is none, or that neither force error nor static stiffness is known.
-    If errors are equal, the coupling with dc_ratio nearest to 1 is named.
-    """
+    """Name the guaranteed coupling of least force error; of equal errors, that with dc_ratio nearest to 1."""
     guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
@@ -158,8 +152,7 @@ def _held(scenario: Scenario, case: str) -> list[str]:
     return [f"Held torques: {torques}."] if torques else []
 
 
-# ----------------------------------------------------------------------------------------------------
-# Couplings over frequency.
+# ---- couplings over frequency
 
 
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
@@ -192,7 +185,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, Chosen], list[str]]:
-    """Return the couplings by name, and one line per failed design. Raises DesignFailed if all failed."""
+    """Return the couplings by name, and one line for each failed design. Raises DesignFailed if all failed."""
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
     for name in names:
@@ -208,7 +201,7 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
 
 
 def _named(name: str) -> tuple[str, str | Condition | None]:
-    """Split NAME:CONDITION; the condition is None if it is missing. Raises InputError."""
+    """Split NAME:CONDITION; the condition is None if it is missing. Raises InputError for a wrong condition."""
     kind, _, words = name.partition(":")
     plain, words = (kind, words) if kind in NAMES else name.rpartition(":")[::2]
     try:
@@ -247,7 +240,6 @@ def _guarantees(report: Comparison) -> render.Table:
 
 
 def _guaranteed(report: Comparison) -> str:
-    """Return the verdict of the command: one sentence with the guarantee of each coupling."""
     words = [f"{coupling.name} ({coupling.assessment.guarantee_words or 'none'})" for coupling in report.couplings]
     return f"Guarantee: {', '.join(words)}."
 
@@ -259,12 +251,12 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    # Rounded to 1 mHz: a sweep may place a maximum at 0 up to 1e-5 rad/sample above 0.
+    # A sweep may place a maximum at 0 up to 1e-5 rad/sample too high; rounding to 1 mHz shows it as 0.
     return render.optional(hz and round(hz, 3), "{:.4g}")
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:
-    """Return the damping that the worst device needs: `scale` times required over available; green if certified."""
+    """Return `scale` times the worst device's required over available damping; green if certified."""
     need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
     return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
 
@@ -282,7 +274,7 @@ def _feel(report: Comparison) -> render.Table:
     named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}
 
     def at(hz: float, curves: Array) -> list[float]:
-        """Return the value of each channel's curve at `hz`, a point of the grid; nan above Nyquist's frequency."""
+        """Return the value of each channel's curve at `hz`; nan above Nyquist's frequency."""
         return [float(np.interp(hz, report.frequency_hz, column, right=np.nan)) for column in curves.T]
 
     rows = [[name, *(_list(at(hz, getattr(felt, what))) for what, _, hz in columns)] for name, felt in named.items()]
@@ -290,6 +282,6 @@ def _feel(report: Comparison) -> render.Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """Return the values separated by commas; a single value if all are equal."""
+    """Return the values separated by commas, or one value if all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)

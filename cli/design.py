@@ -100,7 +100,6 @@ def _parser() -> options.Parser:
 
 
 def _add_optimal_options(parser: options.Parser, title: str) -> None:
-    """Add the options of an optimal coupling as a group; their default is None."""
     group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     parser.add_band(to=group)
@@ -114,15 +113,8 @@ def _percent(text: str) -> float:
     return options.number(0.1, 90.0, "%")(text.removesuffix("%"))
 
 
-# ----------------------------------------------------------------------------------------------------
-# The request.
-
-
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """Return the loop with --ranges and --varying-delay; a missing args.condition becomes the coupling's usual one.
-
-    Raises InputError.
-    """
+    """Return the loop with --ranges and --varying-delay, and set args.condition. Raises InputError."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     loop = scenario.loop(args.case)
@@ -145,7 +137,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 
 def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """Return the options of a design by argument name. Raises InputError for options of another coupling."""
+    """Return the options of a design. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     values = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if kind_of(kind).limited and args.limiter is not None:
@@ -159,7 +151,7 @@ def _options_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
-    """Return a design, proved where a proof is found, and the decay after an impulse (None without --decay).
+    """Return a design, with a proof if one was found, and the decay after an impulse (None without --decay).
 
     Raises InputError for contradictory options, DesignFailed if no coupling was found.
     """
@@ -185,7 +177,7 @@ _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 def _that_decays(
     scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
-    """Design for less and less damping, and so softer couplings, until no mode's damping ratio is below `ratio`.
+    """Design softer couplings, for less and less damping, until no mode's damping ratio is below `ratio`.
 
     A coupling certified for less damping is also certified for the devices' damping. Raises DesignFailed if the ratio
     is not reached.
@@ -200,7 +192,7 @@ def _that_decays(
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
         decay = ringing(assemble(scenario, design.coupling))
-        assert decay  # `main` refuses worlds, and the spring of a coupling leaves no loop with free drifts only.
+        assert decay  # There is no world, and with the spring of a coupling not all modes are free drifts.
         return design, decay
 
     tried: list[Ringing] = []
@@ -227,12 +219,8 @@ def _that_decays(
     )
 
 
-# ----------------------------------------------------------------------------------------------------
-# Figures and file of the design.
-
-
 def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
-    """Assess the design in its loop, with the design's own proof and its own search between the vertices."""
+    """Assess the design in its loop, with the proof and the search between vertices that the design made."""
     from haptic_loop.sim.couplings import qualified
 
     with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
@@ -272,7 +260,6 @@ def _bound_and_robustness(
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
-    """Return the report on a stored design, with its bound and its robustness."""
     from haptic_loop.design import coverage
     from haptic_loop.design.optimal import Optimal
 
@@ -304,8 +291,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     )
 
 
-# ----------------------------------------------------------------------------------------------------
-# The report as tables.
+# ---- the report as tables
 
 
 def _assessment_rows(assessment: Assessment) -> render.Rows:
@@ -411,7 +397,7 @@ _LESS = (
 
 
 def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], list[str]]:
-    """Return the tables, and a line that names the rows left out of the first table, if any."""
+    """Return the tables, and lines on the rows that are left out of the first table."""
     title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
     rows, left_out = render.shortened(rows, _LESS, len(report.price or ()))
@@ -423,7 +409,7 @@ def _tables(scenario: Scenario, report: _Report) -> tuple[list[render.Table], li
 
 
 def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
-    """Return the function that formats a figure: nominal environment / worst vertex."""
+    """Return a function from a row to the text: figure in the nominal environment / at the worst vertex."""
 
     def cell(row: coverage.OverRanges) -> str:
         figures: coverage.NominalWorst = getattr(row, name)

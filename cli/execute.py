@@ -29,8 +29,8 @@ from haptic_loop.sim.scenario import InputError
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
     """Run a command and exit with its exit code. For bad input, print one line on standard error.
 
-    The reader of standard output may stop at any line (`| head -1`) without changing the exit code, also under
-    `set -o pipefail`. Temporary files are removed if SIGTERM or Ctrl-C ends the command.
+    The reader of standard output may stop at any line (`| head -1`) without changing the exit code. Temporary files are
+    removed if SIGTERM or Ctrl-C ends the command.
     """
     code: str | int | None
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for SciPy's BLAS, which is loaded later, and for child processes
@@ -75,8 +75,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         nobody_reads()
     except OSError as error:
         code = _cannot(error)
-    # If Ctrl-C ended a call of exec(), such as that of dataclass, Python would end by sending itself SIGINT. The empty
-    # call below makes Python forget that interrupt.
+    # If Ctrl-C interrupted a call of exec(), as dataclass makes, Python would end by SIGINT unless exec() ran again.
     exec("")
     sys.exit(code)
 
@@ -99,7 +98,6 @@ def _say(message: str, code: int) -> int:
 
 
 def _cannot(error: OSError) -> int:
-    """Print an error of the operating system in one line; later output is discarded."""
     nobody_reads()
     return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
 
@@ -124,7 +122,7 @@ _MOMENT = 0.05  # [s] time after which an ignored Ctrl-C is repeated
 def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__unraisablehook__) -> None:
     """Repeat a moment later a Ctrl-C that came during a clean-up such as __del__, where Python ignores it.
 
-    Python would also ignore one that is raised here. `shown` is an argument because Python deletes `sys` at its end.
+    `shown` is an argument because Python deletes `sys` at its end.
     """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         shown(unraisable)

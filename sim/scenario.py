@@ -1,7 +1,7 @@
 """Scenarios: devices, humans, environment, delays and timing of one loop, read strictly from TOML.
 
-Unknown keys and impossible numbers are refused. Humans can be in a separate file with one [[human]] per device, so that
-humans that a search found (sim.adversary) can be stored and simulated again.
+Unknown keys and impossible numbers are refused. Humans can be in a separate file, so that humans that a search found
+(sim.adversary) can be simulated again.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
-_MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take 2 CPU s, of 2000 8 s
+_MOST_DELAYS = 1000  # total of all channels [samples]; the eigenvalues of 1000 states take 2 s of CPU time
 _MOST_CHANNELS = 32  # sim.run with 32 channels and no coupling takes 6 s of CPU time
-_LONGEST_NAME = 200  # characters; tables and pictures have no room for more
+_LONGEST_NAME = 200  # characters
 _TIMING_STREAM = 6  # random stream of the timing, independent of the humans' stream with the same seed
 _Delays = tuple[int, ...]
 _UNSAID: Any = None  # placeholder of a default that depends on the number of channels or devices
@@ -64,17 +64,14 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i: 0.3 kg on a spring whose other end swings with 15 mm of amplitude at 0.6 Hz.
-
-    Devices are counted from 0. Each hand is a quarter period ahead of the hand of the device before.
-    """
+    """Return the default hand of device i (from 0): 0.3 kg on a spring whose other end swings 15 mm at 0.6 Hz."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Devices, humans, environment, delays and timing of one loop, with one human per device.
 
-    A channel is a free axis of a device. Delays and latencies are given per device or per channel, and stored per
+    A channel is a free axis of a device. A file has delays and latencies per device or per channel; they are stored per
     channel.
     """
 
@@ -155,7 +152,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
     def _check_counts(self) -> None:
-        """Raise ValueError unless lists have one entry per channel, and each device has one human."""
         contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
         if (axes := sum(len(device.free) for device in self.device)) != self.channels:
             several = any(device.axes > 1 for device in self.device)
@@ -197,14 +193,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def axis_devices(self) -> tuple[Any, ...]:
-        """Every channel as a Device whose fields are numbers; `device` itself where all devices have one axis."""
+        """One device per channel, with numbers as fields; `device` itself if all devices have one axis."""
         if all(device.axes == 1 for device in self.device):
             return self.device
         return tuple(axis for device in self.device for axis in device.channels())
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """Names (m,) such as "left.x" if devices have several axes; otherwise (), since channels then have numbers."""
+        """Names (m,) such as "left.x" if devices have several axes; otherwise ()."""
         return () if self.axis_devices is self.device else self.environment.contacts
 
     @property
@@ -228,7 +224,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def lead(self) -> list[int]:
-        """For each channel, the first channel of its device; all axes share this channel's drawn delay and latency."""
+        """For each channel, the first channel of its device, whose drawn delay and latency all axes share."""
         counts = [len(device.free) for device in self.device]
         return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
@@ -282,7 +278,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delta(self) -> tuple[float, ...]:
-        """The guaranteed damping on each channel [N s/m]; of a damping matrix (in `Loop.levels`), the diagonal."""
+        """The guaranteed damping on each channel [N s/m]; of a damping matrix, the diagonal."""
         return tuple(device.passivity_level for device in self.axis_devices)
 
     @property
@@ -298,7 +294,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def samples(self) -> int:
-        """Number of ticks of a run: its duration over the mean period."""
+        """Number of ticks of a run."""
         return max(1, round(self.duration / (self.period.mean if self.period else self.T)))
 
     @property
@@ -317,7 +313,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def known_devices(self) -> tuple[DeviceBounds, ...] | None:
-        """The guaranteed bounds of every device; None unless all devices have guaranteed bounds."""
+        """The guaranteed bounds of every channel's device; None unless all devices have such bounds."""
         known = tuple(device.guaranteed for device in self.axis_devices if device.guaranteed)
         return known if len(known) == self.channels else None
 
@@ -363,7 +359,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def title(self, case: str) -> str:
-        """Return the title of reports and pictures, which names a case for the paper's loop only."""
+        """Return the title of reports and pictures. Only the paper's loop has a case in its title."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         if case == "none":
@@ -391,10 +387,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
-        """Return `known_devices` and `T_min` of a loop with the first `channels` channels (default: all channels).
-
-        The result is {} unless every device has guaranteed bounds, so that loops on unknown devices keep their digest.
-        """
+        """Return fields of a loop on known devices; {} for other devices, so that their loops keep their digest."""
         known = self.known_devices
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
 
@@ -415,10 +408,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """Return the scenario with some fields changed; `delta` is another guaranteed damping per device [N s/m].
 
-        Values are checked and normalised like those of a file: lists become tuples. Three fields may also be objects of
-        a user's own class: humans (models.human.Hand), a population with `draw(rng, n)`, which returns n humans, and an
-        environment with `contacts` and `E(T)` or `parts()`, which becomes a network. Raises InputError with the field,
-        its value and the allowed values.
+        Values are checked and normalised like those of a file. Three fields may also be objects of a user's own class:
+        humans (models.human.Hand), a population with `draw(rng, n)`, which returns n humans, and an environment with
+        `contacts` and `E(T)` or `parts()`. Raises InputError for a wrong value.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
@@ -439,10 +431,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def own_environment(text: str) -> Any:
-    """Return the environment of FILE.py:NAME: a Network, or an object with contacts and E or parts().
+    """Return the environment of FILE.py:NAME, for `Scenario.replace`; a class or a function is called.
 
-    `Scenario.replace` accepts both. A class or a function is called without arguments. Raises InputError if the file
-    or the call fails.
+    Raises InputError if the file or the call fails.
     """
     own = named("--environment", text)
     return called(f"--environment {text}", own) if callable(own) else own
@@ -481,17 +472,15 @@ def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenari
 
 
 def built_in() -> list[str]:
-    """Return the names of the built-in scenarios."""
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
 def is_world(scenario: Scenario) -> bool:
-    """Return whether the scenario's environment is a MuJoCo scene."""
     return scenario.environment.world is not None
 
 
 def require_no_world(scenario: Scenario, what: str) -> None:
-    """Raise InputError if the environment is a MuJoCo scene, for commands that cannot use one."""
+    """Raise InputError if the environment is a MuJoCo scene; `what` names the caller in all messages."""
     if is_world(scenario):
         able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge accept worlds"
         raise InputError(
@@ -511,21 +500,21 @@ def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raise InputError if there is a table varying_delay, for commands that cannot simulate it."""
+    """Raise InputError if there is a table varying_delay."""
     if scenario.varying_delay is not None:
         instead = "or use sim.run"
         raise InputError(f"varying_delay: {what} does not simulate varying delays; remove the table, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
-    """Raise InputError if the scenario has `period` or `latency`, for commands that cannot simulate them."""
+    """Raise InputError if the scenario has `period` or `latency`."""
     for name in ("period", "latency"):
         if getattr(scenario, name) is not None:
             raise InputError(f"{name}: {what} does not simulate this key; remove it, or use sim.run")
 
 
 def require_latch_at_ticks(scenario: Scenario) -> None:
-    """Raise InputError if forces have a latency, for energy budgets and shells."""
+    """Raise InputError if forces have a latency."""
     if scenario.latency:
         raise InputError("latency: an energy account assumes forces that latch at ticks; add a sample to theta instead")
 
@@ -560,10 +549,7 @@ def held_by(scenario: Scenario, text: str) -> Scenario:
 
 
 def _load_humans(text: str, devices: int) -> _HumanFile:
-    """Load humans, one per device, and the persons who hold several devices, from a TOML file or FILE.py:NAME.
-
-    Raises InputError with one line that names the file and the field.
-    """
+    """Load the people of a TOML file or of FILE.py:NAME. Raises InputError for an invalid file."""
     own = ".py" in text
     try:
         people = _own_humans(text) if own else _humans_of(read_text(text, f"--human {text}"), f"--human {text}")
@@ -583,7 +569,6 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 
 
 def _humans_of(text: str, source: str) -> _HumanFile:
-    """Return the humans of a file: measured hands (A, B, C, D) and chains. Raises InputError for other humans."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     if people.population is not None:
         raise InputError(f"{source}: [population] belongs in a scenario; a file of humans has [[human]] and [[person]]")
@@ -602,11 +587,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 
 
 def _own_humans(text: str) -> _HumanFile:
-    """Return the people of FILE.py:NAME.
-
-    NAME is a list of hands and persons, a population with draw(rng, n), or a function or class that makes one of them.
-    Raises ValueError for any other value.
-    """
+    """Return the people of FILE.py:NAME: a list, a population, or a function or class that makes one of them."""
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
         people = called(f"--human {text}", people)
@@ -621,7 +602,6 @@ def _own_humans(text: str) -> _HumanFile:
 
 
 def _toml(value: Any) -> str:
-    """Write a number, a list or a matrix of numbers in TOML."""
     return f"[{', '.join(map(_toml, value))}]" if isinstance(value, tuple) else repr(value)
 
 
@@ -632,10 +612,7 @@ def save_humans(
     persons: tuple[Person, ...] = (),
     mechanics: Sequence[Mechanics] = (),
 ) -> Path:
-    """Write humans and persons, without their voluntary motion, with all digits of their numbers.
-
-    `remark` becomes a comment. `mechanics` are the drawn mechanics of the devices, if there are any.
-    """
+    """Write humans, persons and drawn mechanics of the devices, without voluntary motion. `remark` is a comment."""
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
         rows = (
@@ -656,7 +633,6 @@ def save_humans(
 
 
 def _is_rotary(text: str) -> bool:
-    """Return whether a file has unit = "rad", even if the file is refused for another reason."""
     try:
         return toml(text, "").get("unit") == "rad"
     except InputError:
@@ -667,7 +643,6 @@ _NEEDED = ("name", "T", "theta", "device", "environment")
 
 
 def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
-    """Convert TOML text to `kind`. Raises InputError with the path of the field and its value."""
     raw = toml(text, source)
     try:
         if kind is Scenario:
@@ -682,11 +657,9 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 
 
 def _require_keys(raw: dict[str, Any]) -> None:
-    """Raise ValueError if a key is missing that every scenario or every rotary device needs.
-
-    Missing keys of a scenario pass here if the file has unknown keys, because `msgspec.convert` reports unknown keys.
-    """
+    """Raise ValueError if a key is missing that every scenario or every rotary device needs."""
     missing = [name for name in _NEEDED if name not in raw]
+    # Unknown keys, such as misspelt ones, are reported first, by msgspec.convert.
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
     devices = raw.get("device") if raw.get("unit") == "rad" else None
@@ -702,10 +675,7 @@ def _require_keys(raw: dict[str, Any]) -> None:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace each name of a device in the catalogue by the device's fields, in `device` and in [[device]] tables.
-
-    Raises InputError for an unknown name or a missing field.
-    """
+    """Replace names of devices in the catalogue by their fields. Raises InputError for an unknown name."""
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -727,14 +697,13 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     """Give each point of an environment one node per axis if the devices have several axes.
 
-    The node of a clamped axis is the ground. Raises ValueError if the devices have different numbers of axes, if the
-    number of contacts is not that of the devices, or for an impossible spring (`_along_axes`).
+    The node of a clamped axis is the ground. Raises ValueError if contacts or springs do not fit the devices.
     """
     devices, table = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
-        return raw  # There is one axis, or the fields' checks refuse the number of axes.
+        return raw  # Either there is one axis, or msgspec.convert refuses the number of axes.
     if not isinstance(table, dict) or table.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
@@ -768,8 +737,8 @@ def _listed(value: Any) -> list[str]:
 def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     """Convert a spring whose stiffness or damping is a list or a matrix to springs along its principal directions.
 
-    Any other spring is returned unchanged. Raises ValueError if such a spring also has `along`, and for a matrix that
-    is not symmetric and positive semidefinite.
+    Raises ValueError if such a spring also has `along`, and for a matrix that is not symmetric and positive
+    semidefinite.
     """
     fields = ("stiffness", "damping")
     several = [f for f in fields if isinstance(spring, dict) and isinstance(spring.get(f), list)]
@@ -802,10 +771,7 @@ _DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact.
-
-    Raises ValueError for an impossible world, and for keys of worlds in another environment.
-    """
+    """Add the path and the digest of a world's MJCF file, and directions. Raises ValueError for an impossible world."""
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
         _require_no_along(table)
@@ -832,7 +798,7 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
-    """Return the directions x, y, z in which a contact with these coordinates slides."""
+    """Return the unit vectors along which a contact with these coordinates slides."""
     return [row for row, node in zip(np.eye(len(AXES)).tolist(), nodes, strict=False) if node != GROUND]
 
 
@@ -845,14 +811,13 @@ def world_environment(table: dict[str, Any]) -> Network:
 
 
 def _require_no_along(environment: Any) -> None:
-    """Raise ValueError if an environment without a world has a key that belongs to worlds."""
     extra = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
     if extra:
         raise ValueError(f"environment.{extra[0]} is allowed only with environment.world")
 
 
 def _direction(number: int, row: Any) -> list[float]:
-    """Return a direction x, y, z scaled to unit length. Raises ValueError unless `row` is a direction."""
+    """Return the direction `row` scaled to unit length. Raises ValueError unless it is a direction."""
     length = 0.0
     if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) and abs(c) < 1e6 for c in row):
         length = float(np.linalg.norm(row))
@@ -862,7 +827,7 @@ def _direction(number: int, row: Any) -> list[float]:
 
 
 def _without_folder(environment: Network) -> Network:
-    """Return the environment with the name of a world's file in place of its path."""
+    """Return the environment with the file name of a world in place of its path."""
     if not environment.world:
         return environment
     world = msgspec.structs.replace(environment.world, file=Path(environment.world.file).name)
@@ -870,7 +835,7 @@ def _without_folder(environment: Network) -> Network:
 
 
 def _network(own: Any, T: Any) -> Network:
-    """Convert an object with `contacts` and `E(T)` or `parts()` to a network. Raises InputError for other objects."""
+    """Convert a user's own object to a network. Raises InputError for an object that lacks methods."""
     label = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
     has_E = getattr(type(own), "E", Environment.E) is not Environment.E
@@ -888,7 +853,7 @@ def _network(own: Any, T: Any) -> Network:
 
 
 class _Damped(msgspec.Struct, frozen=True):
-    """Devices, and another guaranteed damping for each of them."""
+    """Devices, and a new guaranteed damping for each of them."""
 
     delta: tuple[float, ...]  # [N s/m]
     device: tuple[Device, ...]
@@ -926,7 +891,6 @@ def _plain(name: str, value: Any) -> Any:
 
 
 def _lists(value: Any) -> Any:
-    """Return the value with lists in place of tuples, at every level."""
     if isinstance(value, dict):
         return {name: _lists(part) for name, part in value.items()}
     return [_lists(part) for part in value] if isinstance(value, list | tuple) else value
@@ -945,7 +909,7 @@ def _is_own(name: str, value: Any) -> bool:
 
 
 def _checked_own(value: Any) -> Any:
-    """Return a user's own population as it is, or humans of any class. Raises ValueError for an invalid human."""
+    """Return the value. Raises ValueError for an invalid human in a list; a population is not checked here."""
     if not isinstance(value, list | tuple):
         return value
     for i, human in enumerate(value, start=1):
@@ -961,7 +925,7 @@ def _checked_own(value: Any) -> Any:
 
 
 def _given_fields(device: Device) -> dict[str, Any]:
-    """Return the fields of a device, without newer ones of default value, so that old digests stay valid."""
+    """Return the fields of a device, without newer fields of default value, so that old digests stay valid."""
     fields = msgspec.to_builtins(device)
     for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
         if fields.get(name) == default:
@@ -988,7 +952,7 @@ def _located(message: str, raw: dict[str, Any]) -> str:
             value = None
             break
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
-    if problem[1:2].islower():  # The message starts with a word, not with a symbol.
+    if problem[1:2].islower():  # The message does not start with a symbol.
         problem = problem[0].lower() + problem[1:]
     return f"{counted(path)}{shown}: {problem}" if path else problem
 

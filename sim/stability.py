@@ -43,7 +43,6 @@ def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
 
 
 def verdict(growth: float) -> str:
-    """Return "stable" or "unstable" for a growth rate [1/s]."""
     return "unstable" if unstable(growth) else "stable"
 
 
@@ -83,7 +82,7 @@ class Mode:
 
     @classmethod
     def worst(cls, modes: Sequence[Mode]) -> Mode:
-        """Return, for each loop, the mode of largest modulus among several."""
+        """Return, for each loop of a stack, the mode of largest modulus among `modes`."""
         values = np.stack([mode.eigenvalue for mode in modes])
         largest = np.argmax(np.abs(values), axis=0)[None]
         return cls(np.take_along_axis(values, largest, axis=0)[0], modes[0].T)
@@ -104,7 +103,7 @@ class Mode:
 
     @property
     def verdict(self) -> str:
-        """The verdict on a single loop."""
+        """The verdict on a single loop (not on a stack)."""
         return verdict(float(self.growth))
 
 
@@ -121,7 +120,7 @@ def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
 
 
 def dominant_mode(loop: ClosedLoop) -> Mode:
-    """Return the mode of largest modulus of one loop, or of each loop of a stack."""
+    """Return the mode of largest modulus."""
     largest = np.argmax(np.abs(loop.eigenvalues), axis=-1)[..., None]
     return Mode(np.take_along_axis(loop.eigenvalues, largest, axis=-1)[..., 0], loop.T)
 
@@ -142,7 +141,7 @@ def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
 
 
 def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
-    """Return the exact closed loops, one for each set of humans; forces latch `late` (m,) [s] after ticks."""
+    """Return one exact closed loop for each set of humans; forces latch `late` (m,) [s] after ticks."""
     return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
@@ -154,17 +153,17 @@ def mujoco_plants(
     nthread: int = 0,
     late: Sequence[float] | None = None,
 ) -> HeldPlant:
-    """Return MuJoCo's map of the plants over one period; with `late` (m,) [s], held forces are states.
+    """Return MuJoCo's map of the plants over one period; if forces latch `late` (m,) [s], held forces are states.
 
-    The plants are linear, so a step from each basis state and with each force alone gives the map of a step. The map of
-    a period is a power of the map of a substep, unless forces latch between substeps.
+    The plants are linear, so steps from each basis state and with each force alone give the map. Without `late` it is a
+    power of the map of a substep.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     substeps = least_substeps(integrator) if substeps is None else substeps
     n = variants.states + (m if late else 0)
     timing = Timing(np.array([T]), np.array([late])) if late else None
     once, powers = (substeps, 1) if late else (1, substeps)
-    # unit forces stay within the actuators' limits
+    # Forces must stay within the actuators' limits.
     unit = np.concatenate([np.ones(n), np.minimum(1.0, process.force_limit / 2)])
     unit[n - m : n] = unit[n:] if late else 1.0
     buffer = StepBuffer(process, 1, n, variants.scene.outside, nsim)
@@ -186,12 +185,12 @@ def mujoco_plants(
 
 
 def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
-    """Return the dominant mode for every set of touching walls; one entry without walls."""
+    """Return the dominant mode for every set of touching walls."""
     return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.law.frozen().items()}
 
 
 def worst_mode(simulation: Simulation) -> Mode:
-    """Return the dominant mode of the exact loop; with walls, of its worst frozen contact state."""
+    """Return the dominant mode of the exact loop; with walls, that of its worst frozen contact state."""
     return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
@@ -217,7 +216,7 @@ class Ringing:
 
     @property
     def words(self) -> str:
-        """The figures as the text of a report's row."""
+        """The figures in words."""
         speed = f"{'grows' if self.decay_per_s < 0 else 'decays'} {abs(self.decay_per_s):.4g} 1/s"
         slowest = f"{speed} at {self.frequency_hz:.2f} Hz, damping ratio {self.damping_ratio:.4f}"
         if self.least_damping_ratio == self.damping_ratio:
@@ -229,7 +228,7 @@ _FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return the decay after an impulse over all sets of touching walls.
+    """Return the decay after an impulse, the slowest over all sets of touching walls.
 
     Return None in a world, which has no eigenvalues, and for a loop whose modes are all free drifts.
     """
@@ -243,21 +242,21 @@ def ringing(simulation: Simulation) -> Ringing | None:
         return None
     ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
     slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
-    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # Both belong to one conjugate pair.
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9, atol=0):  # They are one conjugate pair.
         least = slowest
     shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
     return Ringing(*map(float, shown))
 
 
 def exact_growth(simulation: Simulation) -> float:
-    """Return the growth rate [1/s] of the exact loop, or of its worst frozen contact state."""
+    """Return the growth rate [1/s] of `worst_mode`."""
     return float(worst_mode(simulation).growth)
 
 
 _NOT_EXCITED = "not excited: the motion does not follow the dominant mode; the verdict is that of the eigenvalues"
 _VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest entry
 _UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
-_AT_ONCE = 1 << 16  # ticks that are projected at a time, because a long trace may exceed the memory
+_AT_ONCE = 1 << 16  # ticks that are projected together, to save memory
 
 
 def _measured_growth(
@@ -276,7 +275,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # The error of y is proportional to the terms that cancel in y, and to the error of the eigenvector.
+    # The error of y consists of rounding of its terms, which may cancel, and of the eigenvector's error.
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -303,8 +302,6 @@ class ExactVerdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Eigenvalues(ExactVerdict):
-    """The verdict of the exact loop with its spectral radius."""
-
     spectral_radius: float
 
 
@@ -338,7 +335,6 @@ class Stability(Eigenvalues):
 
 
 def eigenvalues(mode: Mode) -> Eigenvalues:
-    """Return the figures of a mode for a report."""
     return Eigenvalues(**_exact(mode), spectral_radius=float(mode.spectral_radius))
 
 
@@ -411,8 +407,7 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
 
 # ---- the impulse test: short traces of many humans at once
 #
-# Every axis of every handle is pushed once, from rest at x = 0, and then left alone. Sums are accumulated while the
-# simulation runs, so that no trace is kept.
+# Every axis of every handle is pushed once, from rest at x = 0. No trace is stored, only sums.
 
 _IMPULSE = 10e-3  # [s] duration of the push
 _TO_THE_WALL = 20.0  # [N] force on handle 1 in loops with walls; a hand of 0.3 kg then swings over a few centimetres
@@ -421,7 +416,7 @@ _NOISE_FLOOR = 1e-8  # share of the state below which a mode is noise of the eng
 
 @dataclass(frozen=True, eq=False)
 class ImpulseTest:
-    """The results of an impulse test, with one entry per simulation."""
+    """The results of an impulse test."""
 
     growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan without fit
     error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
@@ -442,17 +437,12 @@ class Balance:
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
-        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None.
-
-        Periods and latencies are constant, so the parts of a period have the lengths `late` and T - `late`. With the
-        longest possible parts, this bound would be below that of a certificate for a range of latencies (Q in
-        design.facts.Latency).
-        """
+        """Return the balance of held devices; forces latch `late` (m,) [s] after ticks, or at ticks if it is None."""
         delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
             return Balance(delta / loop.T, Delta)
         first = np.array(late)[:, None]
-        before = np.divide(delta, first, out=np.zeros_like(delta), where=first > 0)  # 0 if latency is 0
+        before = np.divide(delta, first, out=np.zeros_like(delta), where=first > 0)
         return _LateBalance(delta / (loop.T - first), Delta, before, at_the_latch(variants.plants(), late))
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
@@ -471,7 +461,7 @@ class Balance:
 class _LateBalance(Balance):
     """The energy of each tick if forces latch within the tick, so that each period has two parts."""
 
-    before: Array  # (m, 1) [N/m] delta/(latency), until the latch; `damping` is delta/(T - latency)
+    before: Array  # (m, 1) [N/m] delta/latency until the latch, or 0 if it is at the tick; damping: delta/(T - latency)
     seen: Array  # (nsim, m, entries) maps to the positions at the latch (models.hold.at_the_latch)
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
@@ -502,7 +492,7 @@ def impulse_test(
 ) -> ImpulseTest:
     """Simulate `ticks` periods with every set of humans after an impulse. `loops` are the exact closed loops.
 
-    With walls the impulse is large enough to reach them, and the growth of the trace is not measured.
+    With walls the impulse is larger, to reach them, and growth is not measured.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, balance, ticks)
@@ -522,8 +512,7 @@ def impulse_growth(
     """Return growth and clipping, (nsim,) each, after an impulse on every handle, for constant or varying timing.
 
     `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
-    the second: inf where numbers overflow, -inf at exact rest. Without force limits the growth does not depend on the
-    size of the impulse.
+    the second: inf where numbers overflow, -inf at exact rest.
     """
     T, quarter = process.F.T, ticks // 4
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
@@ -566,7 +555,7 @@ def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[floa
 
 
 def _parts(weights: NDArray[np.complex128]) -> Array:
-    """Return the real and the imaginary parts of weights (nsim, entries), (2, entries, nsim), for `_projected`."""
+    """Return real and imaginary parts of weights (nsim, entries) as an array (2, entries, nsim) for `_projected`."""
     return np.ascontiguousarray([weights.real.T, weights.imag.T])
 
 
@@ -598,7 +587,7 @@ class _Audit:
         self._process, self._law = process, process.ticked
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
         self._T = loops.T
-        if not process.walls:  # with walls the loop switches between linear loops, so it has no single mode
+        if not process.walls:
             left = _left_eigenvector(loops).conj()
             self._left, self._pushed = _parts(left), _parts(np.einsum("ns,nsw->nw", left, loops.B))
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))

@@ -7,8 +7,8 @@ that G sent in the last d_i ticks, where d_i is the largest delay on channel i.
 The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick the delays in
 [lo, hi] allow several forces; each device receives the one with the most power -f v. Ages grow by at most one per tick,
 because a device holds its newest force. Candidates for the worst period are windows of this sequence that may be
-repeated, and constant delays at the ends of their ranges. Over the worst candidate the product of the mode matrices
-grows fastest per tick. A spectral radius above 1 proves instability.
+repeated, and constant delays at the ends of their ranges. The worst candidate has the product of mode matrices with the
+largest growth per tick; a spectral radius above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst pe
 _LONGEST_PERIOD = 250  # [ticks] largest length of a searched window
 _STARTS = 6  # number of windows of the greedy sequence
 _MOST_ENDS = 256  # largest number of combinations of constant delays at the ends of their ranges
-_SHORTEST = 4  # least number of ticks, because a growth rate compares quarters of the trace
+_SHORTEST = 4  # least number of ticks, as a growth rate compares quarters of the trace
 _STREAM = 5  # random stream of the delays, independent of the humans' stream with the same seed and index
 
 
@@ -59,7 +59,7 @@ class Period:
 
 
 def switching(simulation: Simulation, seed: int, ticks: int) -> tuple[Simulation, Period | None]:
-    """Return the loop under the scenario's varying delays, and their period if they are adversarial."""
+    """Return the loop under the scenario's varying delays, and their period if the pattern is adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
     period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
@@ -69,7 +69,6 @@ def switching(simulation: Simulation, seed: int, ticks: int) -> tuple[Simulation
 
 
 def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
-    """Return the fastest growing periodic switching that the search finds in this loop."""
     plant, process = simulation.plant, simulation.process
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
     ages = _greedy_ages(process, one, simulation.scene, varying, _SEARCHED)
@@ -77,7 +76,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
-    """Draw the delays (ticks, m) of run `index` from (seed, index); `recorded` are adversarial delays."""
+    """Draw the delays (ticks, m) of run `index`; `recorded` are adversarial delays."""
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else recorded
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
@@ -135,7 +134,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
         engine.advance(0)
         buffer.rewind(1)
         ages[k] = age
-        if k % 32 == 31 and not pushed[k:].any():  # rescaling does not change the choice
+        if k % 32 == 31 and not pushed[k:].any():  # Rescaling avoids overflow, and does not change the ages.
             size = np.maximum(np.abs(buffer.s[0]).max(axis=0), 1e-200)
             buffer.s[0] /= size
             buffer.z[0] /= size
@@ -177,10 +176,10 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
     return np.stack(products), np.array(scales)
 
 
-# ---- many humans in one batch, each under its own varying delays, drawn or adversarial
+# ---- many humans in one batch, each under different varying delays
 
 _SHORTEST_CROWD = 2.0  # [s] least duration of a trace; in a shorter one the spreading impulse hides a growth of 1 1/s
-_LONGER = 5  # duration of a second trace relative to the first, for hands whose rate is too slow for the first
+_LONGER = 5  # duration of the second trace of slow hands, relative to the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +243,6 @@ def _crowd_delays(
     seed: int,
     ticks: int,
 ) -> Ticks:
-    """Return the delays (ticks, m, nsim) of a batch."""
     assert scenario.varying_delay is not None
     recorded: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
@@ -254,7 +252,7 @@ def _crowd_delays(
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
 
 
-# ---- certificates for varying delays: from the coupling's file, or made here
+# ---- certificates for varying delays
 
 
 @dataclass(frozen=True)
@@ -268,7 +266,7 @@ class DelaysCovered:
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:
-        """Judge the coupling; `on_file` is the range of delays for which its file proves any switching."""
+        """Examine the coupling; `on_file` is the range of delays for which its file proves any switching."""
         constant_delays = (need for name, need in assessment.requirements.items() if name != SWITCHING.name)
         certified = any(need.certified for need in constant_delays)
         varying, span = scenario.varying_delay, scenario.delay_range

@@ -39,14 +39,13 @@ _UNITS = {"x": "m", "f": "N", "x_handle": "m", "v_handle": "m/s"}
 
 
 def _real(name: str, values: NDArray[Any]) -> Array:
-    """Return an array of real numbers. Raises ValueError for any other array."""
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} is of type {values.dtype}, expected real numbers")
     return values
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Return whether an array is a read-only float array, which needs no copy."""
+    """Return whether a value is a read-only float array, which needs no copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
@@ -64,7 +63,7 @@ class Trace(ReadOnly):
         x_handle: (N, m) displacements of the handles [m].
         v_handle: (N, m) velocities of the handles [m/s].
         w: (N, outside) external forces [N], voluntary or of a tap.
-        meta: Settings and verdicts of the run as in its JSON, for example `meta["stability"]` and `meta["assessment"]`.
+        meta: Settings and verdicts of the run, as in its JSON.
         z: (N, order) states of the controller.
         s: (N, states) states of the plant: positions [m], velocities [m/s], states of the hands' impedances, and with
             latencies the held forces [N].
@@ -119,7 +118,7 @@ class Trace(ReadOnly):
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """Return the strongest frequency >= 10 Hz in the last quarter of the forces; None for a short or calm trace."""
+        """Return the forces' strongest frequency from 10 Hz up, in the last quarter; None for a short or calm trace."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -147,15 +146,11 @@ class Trace(ReadOnly):
         return pandas.DataFrame(columns, index=pandas.Index(self.t, name="t [s]"))
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Any:
-        """Draw displacements and forces over time.
+        """Draw displacements and forces over time, and return the matplotlib figure.
 
         Args:
-            path: The file of the picture, ending in .png, .pdf or .svg, or None to write none. A .pdf or .svg is at
-                most as wide as the page of a two-column paper.
+            path: The file of the picture, ending in .png, .pdf or .svg, or None to write none.
             title: The title; default: the name of the scenario with the verdict.
-
-        Returns:
-            The matplotlib figure, which a notebook shows.
 
         Raises:
             InputError: Another suffix, or the file cannot be written.
@@ -175,16 +170,13 @@ class Trace(ReadOnly):
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of the trace's file: signals, the metadata as JSON text, and the names of named channels."""
+        """The arrays of the trace's file: signals, the metadata as JSON text, and names of channels, if any."""
         signals = {name: getattr(self, name) for name in _MEASURED}
         names = {"names": np.array(self.names)} if self.names else {}
         return signals | {"meta": np.array(json.dumps(with_unit(self.meta)))} | names
 
     def save_npz(self, path: Path) -> Path:
-        """Write the arrays of `arrays` to an .npz file, without pickle, and return its path.
-
-        Compression would take more than ten times as long, and make the file only a tenth smaller.
-        """
+        """Write `arrays` to an .npz file without pickle, uncompressed (compression would save only a tenth)."""
 
         def content(file: BinaryIO) -> None:
             np.savez(file, allow_pickle=False, **self.arrays)
@@ -268,15 +260,15 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
 def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
     """Split x (ticks, m, nsim), less its slow part, into octaves.
 
-    Returns the amplitude of a sinusoid of the octave's power and the frequency [Hz] of its strongest line, both
-    (octaves, m, nsim), and the octave's share of all lines, (octaves,).
+    Returns each octave's amplitude (that of a sinusoid of equal power), the frequency [Hz] of its strongest line, both
+    (octaves, m, nsim), and its share of all lines, (octaves,).
     """
     ticks = x.shape[0]
     window = np.hanning(ticks)
     basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), _TREND + 1))
     flat = x.reshape(ticks, -1)
     fast = flat - basis @ (basis.T @ flat)
-    # A sinusoid of amplitude a has the power a^2/2, of which a window w keeps the share sum w^2 / ticks.
+    # A sinusoid of amplitude a has the power a^2/2; a window w reduces it by the factor sum w^2 / ticks.
     power = 4 * np.abs(np.fft.rfft(window[:, None] * fast, axis=0)) ** 2 / (ticks * (window**2).sum())
     frequency = np.fft.rfftfreq(ticks, T)
     lowest = _PERIODS / (ticks * T) * (1 - 1e-9)
@@ -302,13 +294,13 @@ _SHORTEST = 200  # ticks that a growth rate needs
 _FLOOR = 3.0  # an oscillation must exceed this multiple of the encoders' rounding in its octave
 _CLEAR = 4.0  # standard errors by which a slope must differ from zero, because a line may have only four points
 _FARTHEST = 1e100  # [m] the square of a larger number may overflow
-_EVEN = 1e-3  # largest relative difference of a trace's periods; rounding of long times is smaller
-_FINEST = 1e-9  # [m] step assumed for an ideal encoder, above floating-point noise
+_EVEN = 1e-3  # largest relative difference between periods of a trace
+_FINEST = 1e-9  # [m] step that is assumed for an ideal encoder
 
 
 @dataclass(frozen=True)
 class Growth:
-    """The strongest growing oscillation in a part of a trace, else the strongest one, or why there is no rate."""
+    """The growth of an oscillation in a part of a trace (see `growth`)."""
 
     first: int  # the part has the ticks [first, stop)
     stop: int
@@ -318,7 +310,7 @@ class Growth:
     amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
     slowest_hz: float | None = None  # slower oscillations are not seen
     trend: str | None = None  # "grows" or "decays", by more than _CLEAR standard errors, or "neither"
-    reason: str | None = None
+    reason: str | None = None  # why there is no rate
 
     def words(self, T: float) -> str:
         """Describe the growth in one line, for ticks of T [s]."""
@@ -335,7 +327,7 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
 
     The second half of x is examined first. If no oscillation is seen there for long enough, the last quarter is
     examined, and so on, because a fast growing mode may appear late. The strongest growing octave is reported, or the
-    strongest one if none grows. `first` is the number of the first tick.
+    strongest octave if none grows. `first` is the number of the first tick.
     """
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:
@@ -375,7 +367,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
     hop = min(round(_WINDOW / T), 2 * len(x) // (_WINDOWS + 1)) // 2
     windows = [x[start : start + 2 * hop] for start in range(0, len(x) - 2 * hop + 1, hop)]
     amplitude, line, part = map(np.array, zip(*(_octaves(w[:, :, None], T) for w in windows), strict=True))
-    seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves): a mode moves all channels
+    seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves), over all channels
     # Rounding is white noise of variance step^2/12, and a sinusoid's amplitude is the root of twice its power.
     floor = _FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)
     lines = []
@@ -390,7 +382,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the indices of the longest run of True; of several equally long runs, the last one."""
+    """Return the indices of the longest run of True, the last one of equally long runs."""
     runs = np.split(np.arange(len(on)), np.flatnonzero(np.diff(on)) + 1)
     return max((run for run in reversed(runs) if on[run[0]]), key=len, default=np.zeros(0, np.intp))
 
@@ -407,8 +399,8 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 def growths(trace: Trace) -> list[Growth]:
     """Measure the growth in each part of a trace in which the loop was linear (`run.steady_ticks` of its metadata).
 
-    Without this entry the trace is one part. Raises InputError if the parts are not ticks of the trace, or if its
-    samples are not finite and evenly spaced.
+    Without this entry the trace is one part. Raises InputError for wrong parts, and for samples that are not finite and
+    evenly spaced.
     """
     n, m = trace.x.shape
     run = trace.meta.get("run") if isinstance(trace.meta, dict) else None

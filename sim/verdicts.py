@@ -34,7 +34,7 @@ class Unstable:
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
-        """Return the record of two counts; `other` is by the engine that is compared with the exact one."""
+        """Return the record of two counts; `other` is that of the engine that is compared with the exact one."""
         if other is None or question.engine == "exact":
             return cls(exact, None)
         if isinstance(question.engine, str):
@@ -69,10 +69,7 @@ class EnvironmentsMet:
 
 
 def disagreement_words(question: Validation, findings: Findings) -> str:
-    """Return the number of disagreements, and for the first three of them the rates of both engines.
-
-    If a file can hold the humans, a command that simulates them again is added.
-    """
+    """Return the number of disagreements; for three, also the rates of both engines and a command to repeat them."""
     engine = "MuJoCo" if isinstance(question.engine, str) else engine_name(question.engine)
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
@@ -229,7 +226,7 @@ _Met = TypeVar("_Met")  # delays or ticks
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """The number of humans with whom the loop grows while delays or ticks vary; it must be 0 if `covered`."""
+    """The number of humans with whom the loop grows while delays or ticks vary; if `covered`, it must be 0."""
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # whether certificates cover the variation
@@ -291,6 +288,5 @@ def _held(humans: tuple[Hand, ...]) -> list[_Held]:
 
 
 def largest(values: Array) -> float | None:
-    """Return the largest finite value, or None."""
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else None

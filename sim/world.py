@@ -47,11 +47,9 @@ class WorldFigures(ShellFigures):
     given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
     port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
-    created_J: (
-        float  # upper bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
-    )
+    created_J: float  # bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
     unsettled_steps: int  # steps of the scene in which limited forces still changed after the last repetition
-    warnings: list[str]  # the texts of MuJoCo's warnings
+    warnings: list[str]  # texts of MuJoCo's warnings
 
 
 @dataclass(frozen=True)
@@ -99,11 +97,7 @@ class Claim:
 
     @classmethod
     def of(cls, assessment: Assessment, certified_for: Network | None = None) -> Claim:
-        """Return the claim of a run in a world, from the assessment of exactly this run.
-
-        Without a guarantee the claim names the linear network that the coupling is `certified_for`, if there is one,
-        and says whether the scene that runs has other contents than the scene of that network.
-        """
+        """Return the claim of the assessed run; without a guarantee it names the network `certified_for`, if any."""
         guarantee = assessment.guarantee
         if guarantee is None or guarantee.energy_J is None:
             return cls(False, f"No guarantee: {assessment.reason}.{_elsewhere(assessment, certified_for)}")
@@ -117,7 +111,6 @@ class Claim:
 
 
 def _elsewhere(assessment: Assessment, network: Network | None) -> str:
-    """Return a sentence on the linear network for which the coupling is certified, or "" without one."""
     if network is None:
         return ""
     scene = getattr(assessment.environment, "world", None)
@@ -130,15 +123,11 @@ def _energy(joules: float) -> str:
     return f"{1e3 * joules:g} mJ"
 
 
-# ----------------------------------------------------------------------------------------------------
-# The scene behind a coupling
-
-
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError for a coupling without V, and for one whose direct part D_V is not symmetric and positive definite
-    or couples devices. Raises it also for a scene that is invalid or has changed since the scenario was loaded.
+    Raises InputError for a coupling without V, or whose direct part D_V is not symmetric and positive definite or
+    couples devices, and for a scene that is invalid or has changed since the scenario was loaded.
     """
     world = scenario.environment.world
     assert world is not None
@@ -156,7 +145,6 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
 
 
 def _check_unchanged(world: SceneFile) -> None:
-    """Raise ValueError if the files of the scene have changed since the scenario was loaded."""
     from haptic_loop.models.world import digest_of
 
     if digest_of(Path(world.file)) != world.digest:
@@ -164,7 +152,7 @@ def _check_unchanged(world: SceneFile) -> None:
 
 
 def _no_spring(coupling: Coupling) -> str:
-    """Return the reason why a coupling without a direct part of V gives no spring between scene and devices."""
+    """Return why a coupling gives no spring between scene and devices."""
     if coupling.holds_model:
         return (
             "an optimal coupling filters the forces of its linear model and has no V; take a spring-damper or another V"
@@ -173,7 +161,6 @@ def _no_spring(coupling: Coupling) -> str:
 
 
 def _contacts_of(environment: Network) -> list[Contact]:
-    """Return the bodies that the devices touch, with the directions in which they slide."""
     from haptic_loop.models.world import Contact
 
     world = environment.world
@@ -206,7 +193,7 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """The settings of a net (sim.passivity_layer) that puts the scenario's world behind coupling and energy shell."""
+    """Settings of a net (sim.passivity_layer): the scenario's world behind coupling and energy shell."""
 
     start: float = START_J  # W0 [J]
     gravity: bool = True  # False switches the scene's gravity off
@@ -234,7 +221,7 @@ def live(simulation: Simulation) -> Simulation:
     def late(nsim: int) -> Net:
         return Late(touched.net(simulation, process, nsim), simulation.scenario.theta)
 
-    late(1)  # raises InputError for a coupling that no world can use
+    late(1)  # An impossible coupling raises InputError here, before the run.
     return replace(simulation, process=replace(process, net=late))
 
 
@@ -259,7 +246,7 @@ class Late:
 
 
 class InWorld:
-    """A world, its shell, and the energy that hands and devices received."""
+    """The net of a world: the world behind its shell, and the energy that hands and devices received."""
 
     def __init__(self, shell: Shell, ports: list[WorldPort], damping: Array) -> None:
         """`damping` (m, m) [N/m] is Delta over the longest period: devices dissipate at least dx' damping dx a tick."""
@@ -308,14 +295,14 @@ class InWorld:
 RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the initial speeds of all bodies of devices and hands
 _NEVER = 1e3  # [J] W0 so large that the shell never acts
-_ADVERSARIES = 20  # sets of hands that start with random speeds and a shell that never acts
+_ADVERSARIES = 20  # number of sets of hands in `least_at_port`
 _BRAKED = 10  # runs of the adversary that stops and turns
 _STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
 
 
 @dataclass(frozen=True)
 class HandsInWorld:
-    """The energy that one set of hands received in a world after a start with random speeds."""
+    """Energy figures of one set of hands in a world, after a start with random speeds."""
 
     kind: str
     number: int
@@ -338,8 +325,7 @@ def thrown(
 ) -> list[HandsInWorld]:
     """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
 
-    In every second set all chains are lossless, without dampers; persons and measured hands are unchanged. `start` is
-    W0 [J].
+    In every second set all chains have no dampers. `start` is W0 [J].
     """
     from haptic_loop.sim.crowds import Validation
 
@@ -367,7 +353,7 @@ def thrown(
 
 
 def _lossless(hand: Any) -> Any:
-    """Return a chain without its dampers and its voluntary motion, and any other hand unchanged."""
+    """Return a chain without dampers and voluntary motion, and any other hand unchanged."""
     if not isinstance(hand, Human):
         return hand
     links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
@@ -375,7 +361,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Callable[[int], None]) -> float:
-    """Return the least energy at the port [J] in runs of 1 s in which the springs' ends stop and turn at random.
+    """Return the least energy [J] that entered the port in runs of 1 s in which the springs' ends stop and turn.
 
     `done` is called with the number of finished runs.
     """
@@ -399,9 +385,9 @@ def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Call
 def least_at_port(
     scenario: Scenario, coupling: Coupling, seed: int, progress: Callable[[int, int], None]
 ) -> dict[str, float]:
-    """Return for each adversary the least energy [J] that entered the port, without a shell or with an idle one.
+    """Return for each adversary the least energy [J] that entered the port; it is negative if the scene gave energy.
 
-    It is negative if the scene gave energy, else 0. `progress` is called with the finished runs and their number.
+    The scene has no shell, or one that never acts. `progress` is called with the finished runs and their number.
     """
     total = _BRAKED + _ADVERSARIES
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed, lambda done: progress(done, total))}
@@ -413,10 +399,6 @@ def least_at_port(
     return least
 
 
-# ----------------------------------------------------------------------------------------------------
-# A linear model
-
-
 def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence[str] = (), T: float = 1e-3) -> Network:
     """Return the linear network of a scene near a pose, for designs that need an environment.
 
@@ -425,9 +407,9 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
 
     Args:
         world: A scenario with a world, or an MJCF file.
-        pose: Positions (nq,) of the scene with its slides, the name of a keyframe, or None for the initial pose.
-        contacts: Names of bodies in an MJCF file, which slide along x; a scenario names its own contacts.
-        T: Period [s] for an MJCF file; a scenario has its own period.
+        pose: Positions (nq,) of the scene, the name of a keyframe, or None for the initial pose.
+        contacts: For an MJCF file: names of bodies, which slide along x.
+        T: For an MJCF file: the period [s].
 
     Returns:
         The network, whose `block` is the linear model.

@@ -2,9 +2,8 @@
 
 With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
 against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact.
-For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with humans of a population: with a
-few humans first, and with all others if none of these is unstable. For a few cells it runs MuJoCo with the encoder
-steps, friction and walls of the scenario.
+For each cell a map evaluates the conditions, and the eigenvalues of the exact loop with humans of a population. For a
+few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
 """
 
 from __future__ import annotations
@@ -45,10 +44,6 @@ from haptic_loop.sim.run import Progress
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import MARGINAL
 
-# ----------------------------------------------------------------------------------------------------
-# Sweeps over K and B.
-
-
 MODEL_KEPT = "model kept"  # the second case of `EnvironmentSweep`, listed beside the conditions
 
 
@@ -63,11 +58,11 @@ class _Sweep(ABC):
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of a condition at one point, by a separate frequency sweep that checks the map."""
+        """Return the requirement of a condition at one point, by a separate frequency sweep, to check the map."""
 
     @cached_property
     def judges(self) -> dict[str, Condition]:
-        """The conditions by their names."""
+        """The conditions by name."""
         names = CONDITIONS if self.loop.known_devices else PLAIN_CONDITIONS
         return {each.name: each for each in (*map(named, names), *([self.own] if self.own else []))}
 
@@ -78,7 +73,7 @@ class _Sweep(ABC):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the conditions by which every cell is judged."""
+        """Names of the conditions, and of further cases, that are evaluated in every cell."""
         return tuple(self.judges)
 
     @property
@@ -119,19 +114,18 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """For each condition: the multiplier (m,) for all couplings, or None; why the loop is not covered, or None."""
+        """condition -> (multiplier (m,) for all couplings, or None; reason why the loop is not covered, or None)."""
         return {name: each.least_multiplier(self.loop) for name, each in self.judges.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """Return F of every coupling, a stack for each set of touching walls, the set of all walls first.
 
-        A rigid wall always touches, because a device without contact is safe. Random hands are tested with each set;
-        certificates cover walls that make and break contact.
+        A rigid wall always touches, because a device without contact is safe.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
     def processes(self, K: Array, B: Array) -> list[Process]:
-        """Return the computer's process with each coupling, with motors that never clip."""
+        """Return one process per coupling, with motors that never clip."""
         limits, steps = self._actuators()
         V = self._couplings(K, B).compliance(self.loop.T)
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
@@ -139,7 +133,7 @@ class CouplingSweep(_Sweep):
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Return required over available damping (n,); with walls, for contact that makes and breaks.
 
-        The ratio is inf if the condition is refused or if no damping is enough.
+        The ratio is inf if the condition does not apply, or if no damping is enough.
         """
         judge, (multiplier_of, reason) = self.judges[condition], self._multipliers[condition]
         if reason:
@@ -156,7 +150,6 @@ class CouplingSweep(_Sweep):
         return np.max(known, axis=0) if known else self._one_by_one(condition, K, B)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of one coupling by a separate sweep, to check maps."""
         judge, coupling = self.judges[condition], self._coupling(K, B)
         multipliers, reason = self._multipliers[condition]
         if reason:
@@ -177,13 +170,12 @@ class EnvironmentSweep(_Sweep):
     """A sweep over K and B of every spring at a contact, for a fixed coupling.
 
     An optimal coupling is a fixed filter R, and its model is that of the cell's environment E: F = Theta R Psi E. A
-    coupling of kind internal-model is a fixed Q and a model of the environment. It is judged in two cases:
+    coupling of kind internal-model is a fixed Q and a model of the environment, with two cases:
 
         this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
-    No coupling is designed for a cell: every cell would then be certified, because a Q near E^-1 makes the force nearly
-    0. Raises ValueError if the network has walls or a block, or no spring at a contact.
+    Raises ValueError if the network has walls or a block, or no spring at a contact.
     """
 
     coupling: Coupling
@@ -208,12 +200,10 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the conditions by which every cell is judged."""
         return (*self.judges, MODEL_KEPT) if self._model_kept else tuple(self.judges)
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Conditions that do not apply to this map, with the reason."""
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
@@ -221,19 +211,18 @@ class EnvironmentSweep(_Sweep):
         return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array) -> list[Process]:
-        """Return the computer's process in each environment, with motors that never clip."""
+        """Return one process per environment, with motors that never clip."""
         (limits, steps), sent = self._actuators(), self._at(K, B).sent(self.coupling)
         return [Process(Law(sent[i], self.loop.theta), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Return required over available damping (n,); inf if refused or no damping is enough."""
+        """Return required over available damping (n,); inf if the condition does not apply, or no damping is enough."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
         shares = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
         return self._one_by_one(condition, K, B) if shares is None else shares
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """Return the requirement of a condition in one environment, by a separate sweep."""
         if condition in self._everywhere:
             return self._everywhere[condition]
         network, varied = self.loop.network, contact_springs(self.loop.network)
@@ -243,7 +232,7 @@ class EnvironmentSweep(_Sweep):
 
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
-        """Requirements that do not depend on the springs, and refusals of inapplicable conditions, by condition."""
+        """condition -> requirement, for conditions that do not depend on the springs, or do not apply."""
         requirements: dict[str, Requirement] = {}
         for name, each in self.judges.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
@@ -256,7 +245,6 @@ class EnvironmentSweep(_Sweep):
         return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.judges[condition]
 
     def _facing(self, condition: str) -> Coupling:
-        """Return the coupling; for MODEL_KEPT the V whose model stays that of the scenario's environment."""
         return (self._model_kept if condition == MODEL_KEPT else None) or self.coupling
 
     @cached_property
@@ -264,7 +252,7 @@ class EnvironmentSweep(_Sweep):
         return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
     def _at(self, K: Array, B: Array) -> Loop:
-        """Return the loop around a stack of environments, for K and B (n,)."""
+        """Return the loop with a stack of environments, for K and B (n,)."""
         network = self.loop.network
         M, D, S = network.matrices()
         varied = contact_springs(network)
@@ -281,22 +269,17 @@ Sweep = CouplingSweep | EnvironmentSweep
 
 
 def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
-    """Return the springs that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
 
 
 def _press_directions(loop: Loop) -> Array:
-    """Return the directions (m,) of the press, +1 or -1: into walls at contacts with walls, else alternately."""
+    """Return the signs (m,) of the hands' steady forces: into walls at contacts with walls, else alternately +1, -1."""
     directions = (-1.0) ** np.arange(loop.channels)
     for i, name in enumerate(loop.environment.contacts):
         for wall in loop.environment.walls:
             if name in wall.between:
                 directions[i] = 1.0 if wall.between[0] == name else -1.0
     return directions
-
-
-# ----------------------------------------------------------------------------------------------------
-# The plane of a map.
 
 
 #: allowed K [N/m] and B [N s/m], as in design.audit; within these bounds all arithmetic is far from overflow
@@ -306,7 +289,7 @@ _Range = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The grid of a map, every K with every B."""
+    """The cells of a map: every K with every B."""
 
     K: Array  # (n,) [N/m]
     B: Array  # (n,) [N s/m]
@@ -318,12 +301,12 @@ class _Grid:
 
     @property
     def flat(self) -> tuple[Array, Array]:
-        """K and B of every cell, (n * n,) each: B runs fastest."""
+        """K and B of every cell, (n * n,) each; B runs fastest."""
         K, B = np.meshgrid(self.K, self.B, indexing="ij")
         return K.ravel(), B.ravel()
 
     def subset(self, count: int) -> limit_cycles.Cells:
-        """Return flat indices (k,) of at most `count` rows and columns, evenly spread, with the corners."""
+        """Return flat indices (k,) of the cells in at most `count` rows and columns, with the corners."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
@@ -355,7 +338,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
-    """Widen a range so that positive marks lie well inside; a logarithmic map cannot contain a mark at 0."""
+    """Widen a range so that positive marks lie well inside."""
     low, high = usual
     return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
@@ -370,12 +353,8 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
         raise InputError(f"{option} begins at 0, which a logarithmic map cannot show: choose a lower end above 0")
 
 
-# ----------------------------------------------------------------------------------------------------
-# The map: conditions and population in every cell, MuJoCo in a few cells.
-
-
-_SLICE = 60  # cells in one pass of a condition; with walls one
-_SAMPLE = 25  # cells that decide which humans lead, that is, are tried first
+_SLICE = 60  # number of cells whose ratios are computed together; with walls 1
+_SAMPLE = 25  # number of cells that decide which humans are tried first (`HeldDevices.leading`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +363,7 @@ class Map:
 
     grid: _Grid
     ratio: dict[str, Array]  # condition -> required over available damping
-    growth: Array  # [1/s] worst over the tried humans; all humans are tried if no leading one is unstable
+    growth: Array  # [1/s] worst over the tried humans (`_population`)
     unstable: Array  # number of tried humans that make the cell unstable
     points: limit_cycles.Points
     seconds: dict[str, float]  # wall time of each stage
@@ -398,7 +377,7 @@ def draw_map(
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],
 ) -> Map:
-    """Compute all stages of the map; `progress` is called with (stage, done, total). Ctrl-C keeps finished cells."""
+    """Compute the map; `progress` is called with (stage, done, total). After Ctrl-C, return the finished cells."""
     K, B = grid.flat
     seconds, n = {}, K.size
     ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.conditions}
@@ -415,7 +394,7 @@ def draw_map(
         return sweep.force_maps(K[some], B[some])[0], sweep.processes(K[some], B[some])
 
     begin = time.perf_counter()
-    _ = sweep.refusals  # fills the cache before threads read it
+    _ = sweep.refusals  # This fills the cache before threads read it.
     parts, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
     for part, values in parts:
         for name, value in zip(sweep.conditions, values, strict=True):
@@ -442,9 +421,9 @@ def draw_map(
 
 
 def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
-    """Return the worst growth and the number of unstable humans; all are tried if no leading one is unstable.
+    """Return the worst growth [1/s] in a cell with the force maps `states`, and the number of unstable humans.
 
-    `states` are the force maps of one cell; a human is unstable if the loop with any of these maps is unstable.
+    The humans of the mask `leading` are tried first, and the others only if none of these is unstable.
     """
     growth = np.max([held.growth(F, leading)[0] for F in states], axis=0)
     if not (growth > MARGINAL).any() and not leading.all():
@@ -459,9 +438,9 @@ _Part = TypeVar("_Part")
 def _in_slices(
     task: Callable[[slice], _Part], count: int, size: int, progress: Progress
 ) -> tuple[list[tuple[slice, _Part]], bool]:
-    """Return task(slice) for slices of `size` that cover range(count), and whether the keyboard interrupted.
+    """Return (slice, task(slice)) for slices of `size` that cover range(count), and whether the keyboard interrupted.
 
-    Threads use all cores, because NumPy's kernels release Python's lock. Finished slices are returned in any case.
+    After an interruption, only the finished slices are returned.
     """
     finished_parts: list[tuple[slice, _Part]] = []
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -483,12 +462,8 @@ def _in_slices(
     return finished_parts, False
 
 
-# ----------------------------------------------------------------------------------------------------
-# Single points of the plane: marks of the user, and the error of the map.
-
-
-_COLUMNS = 4  # columns at which the map's edge is compared with a bisection on single sweeps
-_STEPS = 48  # stiffnesses between the softest and the stiffest of map and mark that are tried to find the edge
+_COLUMNS = 4  # number of columns at which `map_error` compares the map's edge
+_STEPS = 48  # number of stiffnesses that are tried to find an edge, before the bisection
 _HALVINGS = 20  # bisections, which give an edge of the population with a relative error below 1e-6
 
 
@@ -506,15 +481,15 @@ class Mark:
 
 @dataclass(frozen=True)
 class MapError:
-    """Errors of the map against single sweeps, over the compared columns."""
+    """Largest errors of the map against single sweeps."""
 
-    figure_relative: float  # largest relative error of required over available damping, in cells beside the edge
-    edge_relative_in_K: float  # largest relative error in K of the edge, interpolated between two rows
+    figure_relative: float  # relative error of required over available damping, in cells beside the edge
+    edge_relative_in_K: float  # relative error of the K at the edge, interpolated between two rows
     columns_compared: int
 
 
 def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
-    """Judge (K, B) by each condition and the population, and find the largest K that each of them allows at this B."""
+    """Evaluate each condition and the population at (K, B), and find the largest K that each of them allows at B."""
 
     def calm(k: float) -> bool:
         return bool((_growth(sweep, held, k, B) <= MARGINAL).all())
@@ -563,7 +538,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Return the growth [1/s] with every human, for the set of touching walls with which it is largest."""
+    """Return the growth [1/s] with every human, the largest over all sets of touching walls."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 

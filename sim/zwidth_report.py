@@ -37,7 +37,7 @@ class _Ratio:
 
 @dataclass(frozen=True, eq=False)
 class _Population:
-    """The figures of the random humans over the cells."""
+    """The figures of the random humans."""
 
     humans: int
     seed: int
@@ -50,7 +50,7 @@ class _Population:
 
 @dataclass(frozen=True)
 class Shown:
-    """The nonlinear effects in the simulation of the points."""
+    """The nonlinear effects in the simulation of cells."""
 
     encoder_step_m: list[float]
     friction_n: list[float]
@@ -91,7 +91,7 @@ class _Marked:
 
 @dataclass(frozen=True)
 class _ContactSpring:
-    """One spring at a contact of the scenario's environment."""
+    """One spring at a contact."""
 
     between: tuple[str, str]
     K: float  # [N/m]
@@ -103,13 +103,12 @@ class FixedCoupling:
     """The coupling of a map over environments."""
 
     kind: str
-    contact_springs: list[_ContactSpring]  # the springs at contacts of the scenario's environment
-    assessment: Assessment  # the assessment in the scenario's environment
+    contact_springs: list[_ContactSpring]  # springs of the scenario's environment
+    assessment: Assessment  # in the scenario's environment
     remarks: tuple[str, ...]
 
     @classmethod
     def of(cls, chosen: Chosen, assessment: Assessment, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
-        """Describe a coupling with its assessment in the scenario's environment, which is `network`."""
         springs = [_ContactSpring(s.between, s.stiffness, s.damping) for s in contact_springs(network)]
         return cls(chosen.kind, springs, assessment, remarks)
 
@@ -140,7 +139,6 @@ class _Simulated:
 
     @classmethod
     def of(cls, sweep: Sweep, drawn: Map, plan: Plan) -> _Simulated:
-        """Return the simulated points and their nonlinear effects."""
         points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
         figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
         steps = [float(np.max(device.encoder_step)) for device in sweep.devices]
@@ -203,7 +201,6 @@ class MapReport:
         humans: int,
         seed: int,
     ) -> MapReport:
-        """Return the report of a map; `humans` is the number of random sets of humans."""
         loop, complete, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
@@ -273,7 +270,7 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
 
 
 def save_csv(drawn: Map, path: Path) -> Path:
-    """Write one line per cell, SI units in the header; unknown figures are empty, infinite ones inf."""
+    """Write one line per cell, with SI units in the header; nan becomes an empty field."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     figures = [f"{name} required/available" for name in drawn.ratio]
