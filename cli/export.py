@@ -37,7 +37,7 @@ from haptic_loop.sim.scenario import InputError
 
 @dataclass(frozen=True)
 class _Proof:
-    """Whether the certificate of the file holds."""
+    """Whether the file's certificate holds."""
 
     proved: bool
     reason: str | None
@@ -135,7 +135,7 @@ def _parser() -> options.Parser:
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
-    """Return the block to export, with comment lines on its source. Raises InputError."""
+    """Return the block to export, with comment lines on its source. Raises InputError if the coupling has none."""
     limit, balls = _force_limits(args.force_limit, stored.loop) if args.force_limit else (None, ())
     try:
         block = process_block(stored, not args.without_theta, limit, balls) if args.process else coupling_block(stored)
@@ -146,10 +146,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
 
 
 def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ...], tuple[slice, ...]]:
-    """Return limits (m,) [N] and the channels of each force vector that they limit; () limits each channel alone.
-
-    Raises InputError for a wrong number of limits.
-    """
+    """Return limits (m,) [N], and the channels of each force vector whose length they limit. Raises InputError."""
     vectors = tuple(own for own in loop.devices if own.stop > own.start + 1)
     if not vectors or len(given) == loop.channels:
         return options.per_channel("--force-limit", given, loop.channels), ()
@@ -160,7 +157,6 @@ def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ..
 
 
 def _error(block: ExportedBlock) -> str:
-    """Return one line on how far single precision differs from double in 4096 random ticks."""
     error, largest = single_precision_error(block)
     unit = "N" if block.output.letter == "f" else "m"
     return (

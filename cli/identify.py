@@ -1,8 +1,7 @@
 """python -m hw.identify: measure the damping that a device guarantees, by chirps, a slow swing and a free release.
 
 By default two sittings (sessions) are recorded; with --port, the user moves the handles between them. Nobody may hold a
-handle; if a hand damps a handle in one sitting, the other reveals it. Each sitting plays the excitation in a session
-like that of hw.bridge; its force cap is the excitation's largest force. With --transmission two sittings with clamped
+handle; if a hand damps a handle in one sitting, the other reveals it. With --transmission two sittings with clamped
 handles follow, for bounds of motor mass and transmission (hw/transmission.py), which the known-device conditions need.
 """
 
@@ -67,7 +66,7 @@ class _Sitting:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """The last session with free handles, one estimate per axis, and whether the bounds hold."""
+    """The report of all sittings; `session` is the last one with free handles."""
 
     session: SessionReport = off_table("inlined")
     axes: list[Estimate] = off_table()
@@ -80,7 +79,7 @@ class _Report:
 
     @property
     def verdict(self) -> str:
-        """The bounds of all axes, or why there are none, in one line."""
+        """The bounds of all axes, or why there are none."""
         if not self.bounded:
             return f"No bound of the damping: {self.reason or 'see the warnings'}."
         speed = math.floor(1e2 * min(axis.viscosity.speed for axis in self.axes)) / 1e2
@@ -88,7 +87,6 @@ class _Report:
         return f"By these records the damping is at least {bounds}, up to {speed:.2f} m/s."
 
     def lines(self) -> list[str]:
-        """Return the lines below the table."""
         refused = [f"no bounds of motor and transmission: {self.no_transmissions}"] if self.no_transmissions else []
         return [*refused, *(f"[yellow]{warning}[/]" for warning in self.warnings)]
 
@@ -173,12 +171,12 @@ def _sitting(
 ) -> _Sitting:
     """Play the excitation to every axis, record the motion and estimate.
 
-    `clamped` is for a sitting with clamped handles: a chirp at this share of --force is recorded, nothing is estimated.
+    `clamped` is the share of --force for a sitting with clamped handles, in which only a chirp is recorded.
     """
     undamped = scenario.replace(delta=(1e-6,) * len(scenario.device))  # The damping is unknown: almost none is assumed.
     r = scenario.lever  # [m] radius of the hand on a rotary device, 1 otherwise: the options are figures at the hand
     swing = Swing.of(scenario, args.speed / r, 1e-3 * args.travel / r)
-    fastest = min(2.5, max(1.0, 2 * args.speed))  # This limit stops a device that is lighter than declared.
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # [m/s] stops a device that is lighter than declared
     session = session_for(undamped, settings, cap=max(args.force, *(f / r for f in swing.force)), speed=fastest / r)
     session.record = recorder = Recorder(scenario.channels)
 
@@ -197,7 +195,7 @@ def _sitting(
         count = args.sittings + len(_LEVELS) * args.transmission
         render.console(args).print(f"sitting {number} of {count}: {told}")
     alone = nobody(scenario, r**2 * args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
-    # `hold_session` counts time at full gain; the gain rises while the excitation begins with 0.3 s of zero force.
+    # `hold_session` counts time at full gain, which the gain reaches in the first 0.3 s, with zero force.
     seconds = played(1).seconds - 0.2
     live = hold_session(args, session, plan, seconds, out, alone, r * args.coulomb)
     if number == 1:
@@ -218,7 +216,6 @@ def _sitting(
 
 
 def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
-    """Report all sittings, with one estimate per axis."""
     session, told = sittings[-1].session, [sitting.axes for sitting in sittings if sitting.axes]
     left_out = [f"sitting {k}: {sitting.reason}" for k, sitting in enumerate(sittings, start=1) if sitting.reason]
     axes, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
@@ -254,15 +251,15 @@ def _with_transmissions(
 
 
 def _table(device: Device, axes: Sequence[Estimate], bounds: Sequence[TransmissionBounds] | None) -> str:
-    """Return a device's [[device]] table; its stiffness is declared unless `bounds` or all axes have estimates of it.
+    """Return a [[device]] table. `axes` and `bounds` have one entry per free axis.
 
-    `axes` and `bounds` have one entry per free axis. Masses and the transmission are means over the axes; each bound is
-    the worst of the axes.
+    Masses and the transmission are means over the axes; each bound is the worst of the axes. Without bounds, and
+    without an estimate for every axis, the stiffness is the declared one.
     """
 
     def listed(figures: Sequence[str]) -> str:
         by_axis = dict(zip(device.free, figures, strict=True))
-        each = [by_axis.get(k, figures[0]) for k in range(device.axes)]  # the list has a number for clamped axes, too
+        each = [by_axis.get(k, figures[0]) for k in range(device.axes)]  # The list includes clamped axes.
         return f"[{', '.join(each)}]" if device.axes > 1 else figures[0]
 
     def mean(figures: Iterable[float]) -> float:
@@ -306,7 +303,6 @@ def _floored(value: float, decimals: int) -> str:
 
 
 def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
-    """Return the bounds of motors and transmissions, axis by axis."""
     cells = []
     for i, each in enumerate(known, start=1):
         least, most = each.transmission_damping_min, each.transmission_damping_max

@@ -1,6 +1,6 @@
 """Run the commands: as haptic-loop COMMAND, and as python -m sim.run and other modules, which call `door`.
 
-This module imports nothing that takes time, so that the second process, which draws the picture, starts at once.
+This module imports nothing that takes time, so that the process that draws the picture (cli.painter) starts at once.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LEADING = 5  # number of commands that --help shows first
 
 
 def door(command: str) -> NoReturn:
-    """Run the command of this name with the arguments of the command line."""
+    """Run a command with the arguments of the command line."""
     _run(command, sys.argv[1:])
 
 
@@ -56,7 +56,7 @@ def main() -> NoReturn:
 def _run(command: str, words: list[str]) -> NoReturn:
     if command == "run" and not {"--no-plot", "-h", "--help"} & {*words}:
         painter.begin()
-    atexit.register(gc.freeze)  # Otherwise Python would search all objects for garbage at the end, for 0.1 s.
+    atexit.register(gc.freeze)  # This prevents a last search for garbage, which takes 0.1 s.
     from haptic_loop.cli.execute import execute  # This import loads NumPy.
 
     execute(lambda argv: _command(command).main(argv), words)

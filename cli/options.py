@@ -1,7 +1,7 @@
 """Options that several commands share, the types of their values, exit codes, and one-line errors for bad input.
 
 A type parses the text of one option; its error names the value and the allowed values, and `Parser` adds the option's
-name. Values that depend on the scenario, such as one number per channel, are checked by `per_channel`.
+name.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # mes
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser with one-line errors; --help shows the `first` options first and the examples last."""
+    """An argparse parser with one-line errors; --help begins with the options in `first` and ends with examples."""
 
     def __init__(self, prog: str, description: str, *examples: str, first: str = "") -> None:
         super().__init__(
@@ -65,21 +65,17 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse values of the options `names` other than the defaults, unless `acts` is true for the arguments.
-
-        The error ends in `where`.
-        """
+        """Refuse the options `names`, with an error that ends in `where`, unless `acts` is true for the arguments."""
         self._only.append((where, acts, names))
 
     def refuse(self, where: str, *names: str) -> None:
-        """Refuse the options `names`, with an error that ends in `where`, and leave them out of --help."""
+        """Always refuse the options `names`, and leave them out of --help."""
         self.only(where, lambda args: False, *names)
         for action in self._actions:
             if action.dest in names:
                 action.help = argparse.SUPPRESS
 
     def format_help(self) -> str:
-        """Return the usage in one line, the first options, and the other options by groups."""
         arguments = [action for action in self._actions if not action.option_strings]
         by_name = {name.removeprefix("--"): action for action in self._actions for name in action.option_strings}
         first = [by_name[name] for name in self._first]
@@ -99,7 +95,7 @@ class Parser(argparse.ArgumentParser):
         return text.format_help()
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # argparse's parse_args calls this
-        """Parse; refuse unknown or excluded options, empty values, and a --json file that cannot be written."""
+        """Parse. Raises InputError for unknown or excluded options, empty values, and an impossible --json file."""
         self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
@@ -129,7 +125,7 @@ class Parser(argparse.ArgumentParser):
         return did_you_mean(word.partition("=")[0], known)
 
     def error(self, message: str) -> NoReturn:
-        """Raise InputError with a message in metres or radians, whichever the scenario of --scenario uses."""
+        """Raise InputError with a message in the unit of --scenario, metres or radians."""
         scenarios = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         scenarios.add_argument("--scenario", default=DEFAULT)
         with suppress(argparse.ArgumentError, InputError):
@@ -143,7 +139,6 @@ class Parser(argparse.ArgumentParser):
     # options of several commands
 
     def add_loop(self) -> None:
-        """Add the options that describe a loop."""
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)
@@ -181,7 +176,6 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
-        """Add --coupling and --condition."""
         what = f"{names}, FILE.json or FILE.py:NAME of a function (default spring-damper; moving-average in a world)"
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
@@ -189,43 +183,37 @@ class Parser(argparse.ArgumentParser):
     def add_condition(
         self, what: str = "condition to certify (default: that of the coupling)", to: _Group | None = None
     ) -> None:
-        """Add --condition."""
         help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
-        """Add --no-limiter; `limiter` is None (the default behaviour) or False."""
+        """Add --no-limiter, which sets `limiter` to False instead of None."""
         help_ = f"{what}, without the limiter and its guarantee"
         (to or self).add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
 
     def add_rigid(self) -> None:
-        """Add --rigid, a rigid wall in place of the environment."""
         wall = "a rigid wall in place of the environment; one channel, the scenario's first"
         self.add_argument("--rigid", action="store_true", help=wall)
         replaced = "without --rigid, whose wall replaces the environment and the reference"
         self.only(replaced, lambda args: not args.rigid, "environment", "lam")
 
     def add_human(self, more: str = "") -> None:
-        """Add --human; `more` names what a .py may hold besides a list of hands."""
+        """Add --human; `more` says what a .py file may contain besides a list of hands."""
         who = f"other humans: one [[human]] per device in a .toml, or a list of hands{more or ' in a .py'}"
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
-        """Add --energy-budget."""
         what = "scale forces so that no passive hand receives more than W0 [J]; the budget never exceeds CAP [J]"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:
-        """Add --band."""
         band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
         (to or self).add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
 
     def add_varying_delay(self, what: str, to: _Group | None = None) -> None:
-        """Add --varying-delay."""
         (to or self).add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
 
     def add_varying_delays(self) -> None:
-        """Add --period, --varying-delay, --pattern, --loss and --playout."""
         group = self.add_argument_group("delays and periods that vary")
         periods = "periods [s]: random between MIN and MAX at every tick, or a file of recorded periods"
         group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
@@ -247,7 +235,6 @@ class Parser(argparse.ArgumentParser):
         picture: bool = False,
         seed: bool = True,
     ) -> None:
-        """Add the options for files, and --seed unless nothing is drawn at random."""
         output = self.add_argument_group("output")
         if picture:
             output.add_argument("--no-plot", action="store_true", help="write no picture")
@@ -258,31 +245,28 @@ class Parser(argparse.ArgumentParser):
             output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=drawn)
 
     def add_details(self) -> None:
-        """Add --details."""
         what = "also print what no certificate covers; of a run also its speed and position error"
         self.add_argument("--details", action="store_true", help=what)
 
     def add_json(self, to: _Group | None = None) -> None:
-        """Add --json."""
         (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return an error suffix with the closest of the known words, or ""."""
+    """Return ", did you mean ..?" with the closest of the known words, or ""."""
     bare = {name.lstrip("-"): name for name in known}
     close = difflib.get_close_matches(word.lstrip("-"), list(bare), n=1)
     return f", did you mean {bare[close[0]]}?" if close else ""
 
 
 def _translate(args: argparse.Namespace) -> None:
-    """Set `case` from --reference or --case. Raises InputError if they contradict each other."""
+    """Set `case` from --reference or --case. Raises InputError for a contradiction."""
     if args.reference and args.case and args.reference != args.case:
         raise InputError(f"--reference {args.reference} with --case {args.case}: give one of them")
     args.case = args.case or args.reference or "I"
 
 
-# ----------------------------------------------------------------------------------------------------
-# Types of options.
+# ---- types of options
 
 
 def _one(
@@ -317,7 +301,7 @@ def several(
 
 
 def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str = "") -> list[list[_Number]]:
-    """Parse numbers separated by commas, and by `within` inside a part."""
+    """Split at commas, and each part at `within`; return the numbers of each part."""
     try:
         return [[kind(word) for word in (part.split(within) if within else [part])] for part in text.split(",")]
     except ValueError:
@@ -325,7 +309,6 @@ def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str
 
 
 def pair(text: str) -> tuple[float, float]:
-    """Parse two numbers separated by a comma."""
     numbers = _parts(text, float, expected := "two numbers separated by a comma")
     if len(numbers) != 2:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
@@ -333,7 +316,6 @@ def pair(text: str) -> tuple[float, float]:
 
 
 def _band_of(text: str) -> tuple[float, float]:
-    """Parse two rising frequencies [Hz]."""
     low, high = pair(text)
     if not 0 < low < high < math.inf:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected two rising frequencies in Hz, the first above 0")
@@ -372,14 +354,14 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """Return the text if it names a condition, or a user's own condition as FILE.py:NAME."""
+    """Return the text if it is the name of a condition, or has the form FILE.py:NAME."""
     if text not in CONDITIONS and ":" not in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return text
 
 
 def own_condition(text: str) -> Condition:
-    """Return the user's own condition that FILE.py:NAME names. Raises InputError."""
+    """Load a user's own condition from FILE.py:NAME. Raises InputError."""
     from haptic_loop.design.certificate import named as checked
     from haptic_loop.design.conditions import Condition
 
@@ -401,7 +383,7 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
 
 
 def given(value: Any) -> bool:
-    """Return whether an option was given: its value is neither None nor False."""
+    """Return whether an option has a value other than None and False."""
     return value is not None and value is not False
 
 
@@ -409,7 +391,7 @@ def given(value: Any) -> bool:
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
     """Turn a ValueError or ArithmeticError into InputError, with `name` in front of its message.
 
-    Errors raised in a user's own class pass. If the message begins with an argument that `args` holds, the option's
+    Errors raised in a user's own class pass. If the message begins with the name of an argument in `args`, the option's
     name replaces it.
     """
     try:
@@ -417,7 +399,7 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
-        if place_of(error):  # raised in the user's own class
+        if place_of(error):
             raise
         text = str(error)
         argument = text.partition(" ")[0]
@@ -429,7 +411,7 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
 def per_channel(
     option: str, values: tuple[_Given, ...], channels: int, what: str = "entries", each: str = "channel"
 ) -> tuple[_Given, ...]:
-    """Return one value for each channel, or each device; a single value is repeated. Raises InputError."""
+    """Return one value for each channel (or device); a single value is repeated. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
         expected = "one" if channels == 1 else f"{channels} (one per {each}) or 1"
@@ -438,10 +420,7 @@ def per_channel(
 
 
 def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> DelayRange:
-    """Return the range of --varying-delay for every channel. Raises InputError.
-
-    `pairs` holds a single range, one range per device, or one per channel.
-    """
+    """Convert the ranges of --varying-delay: one for all, one per device, or one per channel. Raises InputError."""
     if loop.axes and len(pairs) == len(loop.axes):
         pairs = loop.per_channel(pairs)
     lo, hi = zip(*per_channel("--varying-delay", pairs, loop.channels, "ranges"), strict=True)
@@ -453,7 +432,7 @@ def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> De
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
-    """Parse `count` numbers from a part of an option; a single number is repeated. Raises InputError."""
+    """Parse `count` numbers; a single number is repeated. `option` is named in the InputError that it raises."""
     try:
         if count == 1 and "," not in text:
             return (_one(kind)(text),)
@@ -462,8 +441,7 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
         raise InputError(f"{option} {error}") from None
 
 
-# ----------------------------------------------------------------------------------------------------
-# Scenarios, loops and files from options.
+# ---- scenarios, loops and files from options
 
 
 def scenario_from(args: argparse.Namespace) -> Scenario:
@@ -480,7 +458,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device), each=each)
         for name, value in values.items()
     }
-    if args.environment is not None:  # `replace` computes E(T) of a user's own class for the new T.
+    if args.environment is not None:
         changes["environment"] = own_environment(args.environment)
     if args.known_device:
         bounds = per_channel("--known-device", args.known_device, len(scenario.device), each=each)
@@ -491,7 +469,6 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 
 
 def _known_device(text: str) -> DeviceBounds:
-    """Parse MASS,K_MAX,B_MIN,B_MAX. Raises ArgumentTypeError."""
     values = several(float)(text)
     if len(values) != 4:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected MASS,K_MAX,B_MIN,B_MAX")
@@ -527,8 +504,7 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 def place(args: argparse.Namespace) -> str:
     """Return the part of a file name that states case or scenario, and coupling and condition if options name them.
 
-    Suffixes of files are left out: `run-I-stiff` for `--coupling stiff.json`. For a file outside of the
-    working directory a digest of its folder is appended, so that files of equal names do not share results.
+    For example, it is `I-stiff` for `--coupling stiff.json`.
     """
     if args.scenario == DEFAULT:
         loop = args.case
@@ -539,18 +515,21 @@ def place(args: argparse.Namespace) -> str:
 
 
 def name_of(file: str) -> str:
-    """Return the name of a file without suffix, and a digest of its folder unless that is the working directory."""
+    """Return the name of a file without suffix, with a digest of its folder unless that is the working directory.
+
+    The digest keeps the results of files with equal names apart.
+    """
     path = Path(file)
     if path.parent.resolve() == Path.cwd():
         return path.stem
     return f"{path.stem}-{sha256(str(path.parent.resolve()).encode()).hexdigest()[:6]}"
 
 
-_LONGEST = 80  # most characters of couplings or a condition in a file name, without a digest; file systems allow 255
+_LONGEST = 80  # most characters of couplings or a condition in a file name; file systems allow 255 in all
 
 
 def _in_file_names(value: str | tuple[str, ...] | Condition) -> str:
-    """Return couplings or a condition as a part of a file name; a digest replaces the end of a long part."""
+    """Return couplings or a condition as a part of a file name, with a digest in place of a long end."""
     names = value if isinstance(value, tuple) else (value if isinstance(value, str) else value.name,)
     words = [part for name in names for part in name.split(":")]
     parts = (name_of(word) if word.endswith((".json", ".py")) else word for word in words)
@@ -567,8 +546,7 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         return scenario.before_a_rigid_wall(scenario.psi[:1] if args.psi else (0,))
 
 
-# ----------------------------------------------------------------------------------------------------
-# Delays that vary.
+# ---- delays that vary
 
 
 _DRAWN = ("constant", "random", "bursty", "adversarial")
@@ -602,7 +580,7 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
 
 
 def _periods(text: str) -> Periods:
-    """Parse --period: two numbers [s], or a file with one column of periods. Raises InputError."""
+    """Parse --period. Raises InputError."""
     with refused("--period: "):
         if "," in text and not Path(text).is_file():
             least, most = numbers("--period", text, float, 2)
@@ -634,10 +612,6 @@ def _rows(
     if not rows:
         raise InputError(f"{option} {path}: holds no numbers")
     return tuple(rows)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Running a command.
 
 
 def exit_code(holds: bool, interrupted: bool = False) -> int:

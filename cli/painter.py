@@ -7,7 +7,7 @@
     painter.save(path)                       # writes the picture
 
 The second process sends the picture back and writes no file. It ends when the first process ends, because its standard
-input is closed then. If it cannot be started, or ends without a picture, the first process draws.
+input is then closed. If it cannot start, or ends without a picture, the first process draws.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-_begun: subprocess.Popen[bytes] | None = None  # the second process that `begin` has started for the next Painter
+_begun: subprocess.Popen[bytes] | None = None  # the second process of the next Painter
 
 
 def begin() -> None:
-    """Start the second process of the next Painter, while this process still loads its own modules."""
+    """Start the second process of the next Painter."""
     global _begun
     _begun = _started()
     atexit.register(_end_begun)
 
 
 def _end_begun() -> None:
-    """End the second process if the command failed before it made its Painter."""
+    """End the second process if the command ended without a Painter."""
     if _begun:
         _end(_begun)
 
@@ -49,9 +49,8 @@ def _started() -> subprocess.Popen[bytes] | None:
     """Start a second process, unless this process has already loaded matplotlib."""
     if "matplotlib" in sys.modules or not sys.executable:
         return None
-    import subprocess  # Commands without a picture do not need it.
+    import subprocess
 
-    # The second process finds modules in the same folders as this one.
     command = [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
@@ -62,7 +61,7 @@ def _started() -> subprocess.Popen[bytes] | None:
 
 
 class Painter:
-    """Draws one picture, in a second process if `wanted` and if this process has not yet loaded matplotlib."""
+    """Draws one picture, in a second process if `wanted` and if this process has not loaded matplotlib."""
 
     def __init__(self, wanted: bool = True) -> None:
         global _begun
@@ -70,7 +69,6 @@ class Painter:
         self._asked: tuple[str, tuple[Any, ...]] | None = None
 
     def __del__(self) -> None:
-        """End the second process if the command failed before its picture."""
         if self._process and self._process.returncode is None:
             _end(self._process)
 
@@ -104,10 +102,9 @@ class Painter:
 
 
 def _serve() -> None:
-    """Read what `ask` sends from standard input, and write its picture to standard output, in the second process.
+    """Be the second process: read the request of `ask` from standard input, write its picture to standard output.
 
-    A thread reads while matplotlib is loaded, so that `ask` does not wait. It ends this process if the first process
-    ended without a request.
+    A thread reads while matplotlib is loaded, so that `ask` does not wait.
     """
     import pickle
 
@@ -115,7 +112,7 @@ def _serve() -> None:
 
     def read() -> None:
         request.extend(sys.stdin.buffer.read())
-        if not request:
+        if not request:  # The first process has ended.
             os._exit(1)
 
     reader = Thread(target=read)
@@ -134,7 +131,7 @@ def _serve() -> None:
 
 
 def skip_docstrings() -> None:
-    """Make matplotlib load in half of its time, without the docstrings and signatures that it composes for classes."""
+    """Make matplotlib load in half the time, by not composing docstrings and signatures of its classes."""
     from matplotlib import artist
 
     artist.kwdoc = lambda artist: ""

@@ -30,11 +30,10 @@ if TYPE_CHECKING:  # loaded only by commands that need them
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 
-# ----------------------------------------------------------------------------------------------------
-# The terminal and progress bars. Rich is imported where it prints, because --help does not need it.
+# ---- the terminal and progress bars; rich is imported in functions, because --help does not need it
 
 
-_SHORT_NAME = 24  # longest name of a row, in characters, that is never broken
+_SHORT_NAME = 24  # [characters] the first column is not broken if all its names are this short
 
 
 def console(args: argparse.Namespace) -> Screen:
@@ -44,11 +43,11 @@ def console(args: argparse.Namespace) -> Screen:
     return Screen(stderr=args.json == "-", highlight=False)
 
 
-_Progress = Callable[[str, int, int], None]  # (task, steps done, steps in all)
+_Progress = Callable[[str, int, int], None]  # (task, steps done, number of steps)
 
 
 class Move(Protocol):
-    """A function that moves a progress bar to `done` of `total`, and may name the task."""
+    """A function that moves a progress bar to `done` of `total`; `what` names the task."""
 
     def __call__(self, done: int, total: int, what: str = ...) -> None: ...
 
@@ -58,10 +57,7 @@ _SILENCE = 2.0  # [s] after which a command that prints nothing says what it doe
 
 @contextmanager
 def progress(description: str) -> Iterator[Move]:
-    """Show a progress bar on standard error; yields the function that moves it.
-
-    If standard error is no terminal, one line says after two seconds what the command waits for.
-    """
+    """Show a progress bar on standard error, or without a terminal one line after _SILENCE; yields a Move."""
     from rich.console import Console
 
     terminal = Console(stderr=True)
@@ -88,23 +84,19 @@ def progress(description: str) -> Iterator[Move]:
 
 @contextmanager
 def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Progress]:
-    """Show the progress bar of a design; yields the function that a design calls as its `progress`.
-
-    If the design of this `kind` (by default the spring-damper) fails for `loop`, the error names alternatives.
-    """
+    """Show the progress bar of a design, and yield its `progress`; if it fails for `loop`, suggest alternatives."""
     with progress("designing the coupling") as move:
         try:
             yield lambda what, done, total: move(done, total, what)
         except DesignFailed as error:
-            from haptic_loop.design.api import instead  # only after a failure
+            from haptic_loop.design.api import instead
 
             if loop is None or not (others := instead(loop, kind or "spring-damper", condition, move)):
                 raise
             raise type(error)(error.problem, error.results, f"{error.advice}; {others}") from error
 
 
-# ----------------------------------------------------------------------------------------------------
-# Reports: files, tables, lines below them, and JSON.
+# ---- reports: files, tables, lines below them, and JSON
 
 
 def publish(
@@ -119,7 +111,7 @@ def publish(
 ) -> None:
     """Save the report as report.json in the folder, print verdict, tables and lines, and write the file of --json.
 
-    `files` are the files written before, which the report names. `details` are printed with --details.
+    The report lists `files`, which exist already. `details` are printed with --details.
     """
     outcome = plain(report)
     if folder:
@@ -138,7 +130,6 @@ def publish(
 def show(
     args: argparse.Namespace, tables: Iterable[Table], lines: Iterable[str] = (), details: Iterable[str] = ()
 ) -> None:
-    """Print tables and lines, and `details` with --details."""
     screen = console(args)
     for table in tables:
         screen.print(table)
@@ -152,10 +143,9 @@ def announce(args: argparse.Namespace, verdict: str) -> None:
 
 
 def remove_earlier(folder: Path, *files: str) -> None:
-    """Remove the report and these files of an earlier run, which must not stand beside new results.
+    """Remove the report and these files of an earlier run, before the first new file is written.
 
-    A command removes them before it writes its first file, because Ctrl-C may come between two files. Raises InputError
-    if a file cannot be removed, and keeps all files if the command has read one of them.
+    Raises InputError if a file cannot be removed, and keeps all files if the command has read one of them.
     """
     remove(*(folder / file for file in ("report.json", *files)))
 
@@ -163,10 +153,7 @@ def remove_earlier(folder: Path, *files: str) -> None:
 def pictures(
     args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str], content: bool = True
 ) -> list[Path]:
-    """Draw the pictures of a report: `drawn` maps file names to functions of sim.plots.
-
-    With --no-plot matplotlib is not loaded.
-    """
+    """Draw the pictures of a report: `drawn` maps file names to functions of sim.plots."""
     remove_earlier(folder, *drawn)
     if args.no_plot or not content:
         return []
@@ -176,8 +163,7 @@ def pictures(
     return [getattr(plots, name)(report, folder / file) for file, name in drawn.items()]
 
 
-# ----------------------------------------------------------------------------------------------------
-# Tables.
+# ---- tables
 
 
 Rows = Iterable[tuple[str, str | None]]
@@ -198,8 +184,8 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
 def shortened(rows: Rows, less: Sequence[str], others: int = 0) -> tuple[list[tuple[str, str | None]], list[str]]:
     """Return the rows of a table, and a line that names those left out, if any.
 
-    While there are more than _MOST_ROWS rows, with `others` of further tables, rows named in `less` are left out, the
-    least important first. A row without a name belongs to the row before it.
+    While there are more than _MOST_ROWS rows, counting `others` of further tables, rows named in `less` are left out,
+    in this order. A row without a name belongs to the row before it.
     """
     kept, out = [row for row in rows if row[1] is not None], []
     names = list(accumulate((name for name, _ in kept), lambda before, name: name or before))
@@ -211,11 +197,11 @@ def shortened(rows: Rows, less: Sequence[str], others: int = 0) -> tuple[list[tu
     return kept, [f"Rows left out, whose figures --json has: {'; '.join(out)}."] if out else []
 
 
-_MOST_ROWS = 15  # number of rows above which `shortened` leaves rows out
+_MOST_ROWS = 15  # number of rows that `shortened` allows
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
-    """Return a table of figures, aligned to the right except in the columns `left`."""
+    """Return a table of figures; columns are aligned to the right, except those in `left`."""
     from rich.table import Table
 
     table, rows = Table(title=title), list(rows)
@@ -231,7 +217,7 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
     """Return a table of records; `cells` maps column heads to functions of a record, or to format strings with `r`.
 
-    If two columns have the same head, one key of `cells` has a blank at its end.
+    A blank at the end of a key is not shown; it makes equal heads possible.
     """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
     return grid(title, [head.strip() for head in cells], rows, left)
@@ -246,13 +232,13 @@ def figure(
 ) -> Any:
     """Return a dataclass field that the table shows under `name`; the format may use the value and the report `r`.
 
-    None is shown as `absent`, or not at all. `json` is as in `off_table` of design/files.py.
+    None is shown as `absent`, or not at all. `json` is as in `design.files.off_table`.
     """
     return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent})
 
 
 def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:
-    """Return a dataclass field that the table shows as the rows that `rows` makes of its value."""
+    """Return a dataclass field that the table shows as the rows `rows(value)`."""
     return field(metadata={"rows": rows, "json": json})
 
 
@@ -273,12 +259,11 @@ def rows_of(report: Any) -> Rows:
             yield from one.metadata["rows"](value)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Phrases that several reports share.
+# ---- phrases that several reports share
 
 
 def certified(need: Requirement, proof: bool = True) -> str:
-    """Return the words for whether a condition holds; with `proof`, also for whether exact arithmetic proves it."""
+    """Say whether a condition holds and, with `proof`, whether exact arithmetic proves it."""
     if not need.certified:
         return "[red]not certified[/]"
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
@@ -290,23 +275,22 @@ def short(condition: str) -> str:
 
 
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
-    """Yield a row per condition: its required damping, whether it holds, and with `proof` whether it is proved."""
+    """Yield a row for each condition: its required damping, and `certified`."""
     for name, need in requirements.items():
         yield f"damping, {name}", f"{need.words(digits)}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """Return the row of the contacts' names in the order of the channels; the text is None for a single contact."""
+    """Return the row of the contacts' names; its text is None for a single contact."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:
-    """Return a figure in this format, or `absent` for None."""
     return absent if value is None else form.format(value)
 
 
 def transparency_error(figures: Transparency) -> str:
-    """Return the mismatch M relative to the reference, in decibels, as a text."""
+    """Describe the mismatch M relative to the reference, in decibels."""
     shown = (f"{db:z.2f} dB" if math.isfinite(db) else "zero" for db in (figures.mismatch_db, figures.rms_mismatch_db))
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
@@ -315,7 +299,7 @@ _MUCH = 2.0  # ratio of required to available damping in nearby environments, ab
 
 
 def robustness_rows(there: Robustness | None) -> Rows:
-    """Yield rows on the damping required if the environment's model is wrong, and on how to design for such errors."""
+    """Yield rows on the damping that is required if the environment's model is wrong."""
     if there:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst environment within {there.percent:g} %"
@@ -324,12 +308,11 @@ def robustness_rows(there: Robustness | None) -> Rows:
 
 
 def verdict(word: str | None) -> str:
-    """Return "stable" or "unstable" with its colour, or "not decided"."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
 
 
 def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
-    """Return the row on uneven periods and latencies of a run or of a validation."""
+    """Return the row on uneven periods and latencies."""
     if part is None:
         return "ticks", None
     period, words = part.period_s, []
@@ -343,7 +326,6 @@ def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
 
 
 def delay_rows(part: VaryingDelays) -> Rows:
-    """Yield the rows on varying delays of a run or a validation."""
     span, met, proof = part.span, part.met, part.certified.switching
     ranges = ", ".join(f"{lo} to {hi}" for lo, hi in zip(span.lo, span.hi, strict=True))
     played = ", played out at the largest" if span.playout else ""

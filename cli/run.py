@@ -122,7 +122,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
-    """Return the name of the simulated environment, and the scenario with it. Raises InputError."""
+    """Return the name of the environment at --vertex, and the scenario with it. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
         why = f"allowed are 0 to {len(members) - 1}" if scenario.ranges else "but the scenario has no ranges ([ranges])"
@@ -130,12 +130,10 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
     return members[args.vertex].name, scenario.replace(environment=members[args.vertex].network, ranges=None)
 
 
-# ----------------------------------------------------------------------------------------------------
-# The run and its figures.
+# ---- the run and its figures
 
 
 def _require_papers(args: argparse.Namespace, scenario: Scenario) -> None:
-    """Raise InputError if the loop is not one of the paper's."""
     from haptic_loop.sim.report import is_papers
 
     if not is_papers(scenario, args.case):
@@ -143,7 +141,6 @@ def _require_papers(args: argparse.Namespace, scenario: Scenario) -> None:
 
 
 def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:
-    """Run the loop with the options' settings. Raises InputError for impossible settings."""
     from haptic_loop.sim.api import run_scenario
     from haptic_loop.sim.passivity_layer import EnergyNet, claim
 
@@ -155,14 +152,13 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
-    """Return the paper's figures beside those of this run."""
     from haptic_loop.sim.report import beside_the_paper
 
     return beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | None:
-    """Return the damping needed in environments near the model; None if no guarantee depends on the model."""
+    """Return the required damping in environments near the model; None if no guarantee depends on the model."""
     from haptic_loop.design.robustness import robustness_nearby
 
     guarantee = assessment.guarantee
@@ -183,7 +179,7 @@ def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
 
 
 def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tuple[Any, ...]:
-    """Return the arguments of plots.draw_run."""
+    """Return the arguments of `sim.plots.draw_run`."""
     stability, apart = report.stability, report.ideal_force.error_percent
     ideal = None if apart is None else (report.ideal_force.ideal, apart)
     grows = stability.exact_verdict == "unstable" and run.exact is not None and not report.switched
@@ -195,10 +191,7 @@ def _shown(args: argparse.Namespace, run: ScenarioRun, report: RunReport) -> tup
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
-    """Return (channel, place [m], name) of each wall from a contact to ground, and a mask (N,) of ticks in contact.
-
-    Without walls the mask is None.
-    """
+    """Return (channel, place [m], name) of each wall from a contact to ground, and a mask (N,) of ticks in contact."""
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None
@@ -214,7 +207,6 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
 
 
 def _title(what: str, report: RunReport) -> str:
-    """Return the title of the picture."""
     stability, kind = report.stability, report.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     guarantee = report.assessment.guarantee
@@ -227,8 +219,7 @@ def _title(what: str, report: RunReport) -> str:
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
-# ----------------------------------------------------------------------------------------------------
-# The report as tables.
+# ---- the report as tables
 
 
 #: rows that are left out of long tables, the least important first
@@ -248,7 +239,7 @@ _LESS = (
 
 
 def _tables(scenario: Scenario, report: RunReport) -> tuple[list[Any], list[str]]:
-    """Return the tables, and a line that names the rows left out of the first table, if any."""
+    """Return the tables, and lines on the rows that are left out of the first table."""
     title = f"{scenario.title(report.case)}: coupling {report.kind}"
     rows, left_out = render.shortened([render.channel_row(scenario.environment.contacts), *_rows(report)], _LESS)
     shown = [render.facts(title, rows)]
@@ -261,7 +252,6 @@ def _tables(scenario: Scenario, report: RunReport) -> tuple[list[Any], list[str]
 
 
 def _rows(report: RunReport) -> render.Rows:
-    """Yield the rows of the report's first table."""
     stability, run, assessment = report.stability, report.run, report.assessment
     felt = assessment.transparency
     ratio = felt and finite(felt.dc_ratio)
@@ -300,7 +290,7 @@ def _rows(report: RunReport) -> render.Rows:
 
 
 def _details(report: RunReport) -> list[str]:
-    """Return the lines of --details: speed and accuracy of the simulation, and the limits of certificates."""
+    """Return the lines of --details."""
     size = render.optional(report.error.position_max_m, "{:.1e} m at most")
     error = render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
     return [f"speed: {_speed(report.run)}", f"position error: {error}", CAVEATS]
@@ -312,7 +302,6 @@ def _speed(run: Ran) -> str:
 
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
-    """Return a table of the integrators and substeps tried on this scene; a star marks those of this run."""
     cells: dict[str, Any] = {
         "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),

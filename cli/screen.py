@@ -14,13 +14,13 @@ from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import nobody_reads, printable
 
 _CUT = "…"  # rich's mark for a cut word
-_WIDEST = 400  # characters of the widest table
+_WIDEST = 400  # [characters] largest width of a table
 _STEP = 2  # characters by which the width grows
-_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # an opening bracket that begins no tag of reports
+_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # "[" that does not begin a tag of rich
 
 
 def _in_unit(shown: Any) -> Any:
-    """Return a text or table in metres or radians, whichever this command uses."""
+    """Return a text or table in the unit of this command, metres or radians."""
     if isinstance(shown, Table):
         shown.title = shown.title and in_unit(str(shown.title))
         for column in shown.columns:
@@ -33,7 +33,7 @@ class Screen(Console):
     """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print as rich does, but widen the console until no table loses a character, at most to _WIDEST."""
+        """Print as rich does, but widen the console up to _WIDEST, so that no table loses a character."""
         own, objects = self._width, tuple(map(_in_unit, objects))
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
@@ -51,8 +51,8 @@ class Screen(Console):
                 how |= {"markup": False}
         return super().render_str(text, **how)
 
-    def on_broken_pipe(self) -> None:  # rich would exit with 1, which means that a claim does not hold
-        """Continue without output after the reader of the output has left (`| head -1`); keep the exit code."""
+    def on_broken_pipe(self) -> None:
+        """Continue without output after its reader has left (`| head -1`). rich would change the exit code to 1."""
         self.quiet = True
         nobody_reads()
 

@@ -39,12 +39,11 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_constant_dela
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] virtual time that a rehearsal may take beyond the requested seconds
 _SHOWN_US = 100_000  # [us] virtual time between two updates of a rehearsal's progress bar
-#: counters that the status line shows unless they are 0
+#: counters in the status line, unless they are 0
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")
 
 
 def add_link_options(parser: options.Parser) -> None:
-    """Add options for the device, its link, and the measurement of its delay."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: ports of several boards, one board per device; or "
@@ -59,7 +58,7 @@ def add_link_options(parser: options.Parser) -> None:
     add("--fault", action="append", default=[], metavar="FAULT", help=fault)
     clamp = f"with --port {FORCE_DIMENSION}: a mechanical clamp holds the axes that no channel drives (default: ask)"
     add("--clamped", action="store_true", help=clamp)
-    # Tests use --pace to drive an emulator behind a pseudo-terminal in slow motion.
+    # With --pace, tests drive an emulator behind a pseudo-terminal in slow motion.
     add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
     baud = "baud rate of a UART, checked against T, or none (default 921600; none for a pseudo-terminal or --rehearse)"
@@ -79,13 +78,11 @@ def add_link_options(parser: options.Parser) -> None:
 
 
 def add_output_options(parser: options.Parser, picture: bool = False) -> None:
-    """Add the options for files, and --seed of a rehearsal."""
     parser.add_output(picture=picture)
     parser.only("with --rehearse: a session with a device uses no random numbers", lambda args: args.rehearse, "seed")
 
 
 def add_safety_options(parser: options.Parser) -> None:
-    """Add limits of force and speed, and the switch that the user has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 1.3, for first sessions); of a rotary device, at the radius of the hand"
     add("--force-cap", type=number(0.05, 12.0), default=1.3, metavar="NEWTON", help=cap)
@@ -120,7 +117,7 @@ def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """Return the safety limits for `session_for`; set args.deadman to its default. Raises InputError."""
+    """Return the safety limits for `session_for`, and set args.deadman. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
@@ -147,7 +144,7 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Return a function that tells whether a file was touched since its last call; False if there is no such file."""
+    """Return a function that says whether a file was touched since its last call; False without the file."""
     last = _mtime(path)
 
     def touched_again() -> bool:
@@ -159,14 +156,10 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Return a function that tells whether the user touched the file of --deadman since its last call.
-
-    For --deadman key it always returns False, because the driver reads the keys itself. The result is None without a
-    deadman, and if the device has its own switch.
-    """
+    """Return `touched` for the file of --deadman; None without a dead-man switch on this machine."""
     if named in (None, "device"):
         return None
-    return touched(named) if named != "key" else lambda: False
+    return touched(named) if named != "key" else lambda: False  # The driver reads the keys.
 
 
 def _mtime(path: str) -> int | None:
@@ -188,7 +181,7 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
 def _baud(args: argparse.Namespace) -> int | None:
     """Return the baud rate of the UART in the link, or None without a UART.
 
-    A pseudo-terminal has no UART. /dev/ttyACM0 may be native USB or a USB chip before a UART; a UART is assumed.
+    A pseudo-terminal has no UART. /dev/ttyACM0 may have one, so a UART is assumed.
     """
     if args.baud is None:
         pseudo = not args.port or all(os.path.realpath(path).startswith("/dev/pts/") for path in _ports(args))
@@ -201,7 +194,7 @@ def _baud_or_none(text: str) -> int:
 
 
 def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ...]:
-    """Return the ticks (m,) by which forces act later than the link's delay; () with one port. Raises InputError."""
+    """Return the ticks (m,) by which forces act later than the link's delay; () for one port. Raises InputError."""
     count, devices = len(_ports(args)), len(scenario.device)
     if count < 2:
         return ()
@@ -215,11 +208,7 @@ def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ..
 
 
 def _ports(args: argparse.Namespace) -> list[str]:
-    """Return the paths of the serial ports in --port; none for a device that the host clocks.
-
-    Raises:
-        InputError: A path is empty.
-    """
+    """Return the paths of the serial ports in --port, none if `host_clocked`. Raises InputError for an empty path."""
     port: str = args.port or ""
     paths = [] if host_clocked(args) else port.split(",")
     if port and "" in paths:
@@ -228,13 +217,13 @@ def _ports(args: argparse.Namespace) -> list[str]:
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Return whether --port names a device without a clock, whose ticks the host times."""
+    """Return whether --port names a device without a clock, so that the host times its ticks."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
 @dataclass(frozen=True)
 class _Held:
-    """Signals that came during the session, and the number of bytes that the ports did not accept."""
+    """Signals that arrived during the session, and the number of bytes that the ports did not accept."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -280,7 +269,7 @@ def hold_session(
                 _show(session)
 
         def planned(ages: Ages) -> Sequence[Armable]:
-            _clear()  # A plan prints lines, which would mix with the status line.
+            _clear()
             for path, own in zip(_ports(args), device.ages if isinstance(device, Boards) else (), strict=False):
                 at = {p: round(float(np.percentile(own, p))) for p in (50, 99)}
                 console(args).print(f"{path}: answers are {at[50]} us old, {at[99]} us at the 99th percentile")
@@ -294,7 +283,6 @@ def hold_session(
 
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
-    """Open the device behind the port; the stack closes it."""
     if host_clocked(args):
         adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
         if not adapter.guarded:
@@ -314,12 +302,11 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
 
 
 def _wait_for_any(ports: Sequence[SerialPort], seconds: float) -> None:
-    """Wait until a port has something to read, at most for `seconds`."""
     select.select(ports, [], [], seconds)
 
 
 def _ask_for_clamp(axes: str) -> None:
-    """Ask whether a mechanical clamp holds these axes. Raises InputError for "no", and if nobody can answer."""
+    """Ask whether a mechanical clamp holds these axes. Raises InputError for "no", and without a terminal."""
     library = "the library's regulation (drd) locks x, y and z of a device only together"
     if sys.stdin.isatty():
         answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold the undriven axes? [y/n] ")
@@ -370,7 +357,7 @@ def _show(session: Session) -> None:
     elif drive and drive.x:
         words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")
-    elif session.info and session.link.last:  # The user checks signs and sizes before arming.
+    elif session.info and session.link.last:
         words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)]
     words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
     words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]

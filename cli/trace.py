@@ -48,7 +48,6 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(growths: list[Growth]) -> str:
-    """Say whether an oscillation grows in any part of the trace."""
     rates = [one for one in growths if one.trend]
     if not rates:
         return "No growth rate can be given."

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from haptic_loop.design.assessment import Assessment, RangesResult
     from haptic_loop.sim.adversary import Worst
 
-_HUMANS, _IN_A_WORLD = 1000, 100  # default numbers of hands
+_HUMANS, _IN_A_WORLD = 1000, 100  # default of --humans
 _ENVIRONMENTS = ("nominal", "ranges")
 #: rows that are left out of long tables, the least important first
 _LESS = (
@@ -126,7 +126,7 @@ def _parser() -> options.Parser:
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
-    """Return the scenario of the options. Raises InputError for friction, missing ranges, or an impossible duration."""
+    """Return the scenario of the options. Raises InputError."""
     scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
     require_linear(scenario, "sim.validate", walls=True)
     if args.environments == "ranges" and scenario.ranges is None:
@@ -138,10 +138,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
-    """Return the nominal environment, vertices, the worst point and random points of ranges.
-
-    Without `--environments ranges` the result is empty, and every loop has the nominal environment.
-    """
+    """Return the nominal environment, vertices, worst point and random points of ranges; () for the nominal one."""
     if args.environments == "nominal":
         return ()
     assert ranges is not None
@@ -150,8 +147,6 @@ def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tupl
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:
-    """Return the loop, the humans and the engines of the validation. Raises InputError."""
-    # A user's own population need not have `links`.
     if args.links and not isinstance(scenario.population, Population):
         raise InputError(
             f"--links {args.links} with --human {args.human}: a population of your own draws its own masses"
@@ -163,7 +158,7 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
 
 
 def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
-    """Return the findings on all humans, and the computing time [s]."""
+    """Return the findings on all humans, and the wall time [s]."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         findings = validate(question, args.shards, move)
@@ -172,10 +167,10 @@ def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings,
 
 @dataclass(frozen=True)
 class _Searched:
-    """Results of the adversary; a result is None without --adversary, or if Ctrl-C ended its search."""
+    """Results of --adversary; None if a search did not run, or did not end."""
 
     worst: Worst | None = None  # the worst lossless human
-    drawn: Worst | None = None  # the worst human that a user's own population can draw; None for a Population
+    drawn: Worst | None = None  # the worst human of a user's own population
     ratio: float = 0.0  # required over available damping of the attacked loop
     interrupted: bool = False
 
@@ -240,8 +235,7 @@ def _save(
     return files
 
 
-# ----------------------------------------------------------------------------------------------------
-# The report and its parts.
+# ---- the report and its parts
 
 
 _NOTHING = "no batch of humans was finished"
@@ -312,13 +306,13 @@ class _Report:
 
     @property
     def certified_words(self) -> str:
-        """Whether a guarantee covers the simulated loops, in words; the verdict says why there is none."""
+        """Whether a guarantee covers the simulated loops, in words."""
         stated = self.assessment.guarantee_words
         return "yes" if self.certified else f"no: the guarantee is for {stated}" if stated else "no"
 
     @property
     def holds_words(self) -> str:
-        """Whether all tests hold, in words; without a certificate only disagreements or a user's condition can fail."""
+        """Whether all tests hold, in words."""
         if not self.holds:
             return "[red]no[/]"
         return "[green]yes[/]" if self.certified else "nothing is certified that the tests could contradict"
@@ -327,10 +321,7 @@ class _Report:
 def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
-    """Return how many hands make the loop grow while delays vary, and while periods or latencies vary.
-
-    A part is None if the scenario has no such variation.
-    """
+    """Return how many hands make the loop grow while delays vary, and while ticks vary; None without variation."""
     from haptic_loop.sim.switching import DelaysCovered
 
     scenario, switching, timing = question.scenario, None, None
@@ -344,7 +335,7 @@ def _varying(
 
 
 class _Tests(NamedTuple):
-    """Tests of the claims, with the field names of the report."""
+    """Tests of the claims, with field names as in the report."""
 
     own_humans: _Own
     energy_audit: verdicts.EnergyAudit | None
@@ -363,7 +354,7 @@ def _tested(
     searched: _Searched,
     certified: bool,
 ) -> _Tests:
-    """Return all tests but that of the growth with random humans."""
+    """Return all tests but that of the growth with random humans at constant delays."""
     mode = worst_mode(assemble(question.scenario, chosen.coupling))
     own = _Own(args.human or question.scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
@@ -383,7 +374,6 @@ def _reported(
     wall: float,
     searched: _Searched,
 ) -> _Report:
-    """Return the report; `holds` says whether all claims hold."""
     scenario, any_done = question.scenario, bool(findings.index.size)
     guarantee = assessment.guarantee
     certified = guarantee is not None

@@ -18,7 +18,7 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """Return the coupling that --coupling names; if it names a kind, design one by --condition and --no-limiter."""
+    """Return the coupling of --coupling, --condition and --no-limiter, designed or read from a file."""
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
         return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
 
@@ -30,7 +30,7 @@ def assessment_of(
     environment: Environment | None = None,
     energy_budget: float | None = None,
 ) -> Assessment:
-    """Assess the coupling in the scenario's loop; `environment` is the member of the ranges that is simulated."""
+    """Assess the coupling in the scenario's loop; `environment` replaces the scenario's in the run."""
     ranges = scenario.loop(args.case).ranges
     with render.progress("searching the ranges" if ranges else "assessing the coupling") as move:
         return assessed(
@@ -46,8 +46,7 @@ def assessment_of(
         )
 
 
-# ----------------------------------------------------------------------------------------------------
-# The verdict.
+# ---- the verdict
 
 
 #: environments of a guarantee -> the touched objects in words
@@ -62,9 +61,7 @@ _OBJECTS = {
 def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     """Return the verdict in a few sentences: hands and objects of the guarantee, felt stiffness, restrictions.
 
-    Args:
-        assessment: The assessment of exactly the loop that the command runs or judges.
-        nearby: The required damping in environments within ten percent, or None.
+    `nearby` is the required damping in environments within ten percent, or None.
     """
     guarantee, encoder = assessment.guarantee, assessment.encoder
     if guarantee is None:
@@ -94,7 +91,7 @@ _NOTHING_DB = -1.0  # [dB] rms mismatch above which a coupling to an object with
 
 
 def _useless(assessment: Assessment) -> str:
-    """Return a sentence on the contacts at which the coupling renders next to nothing, or ""."""
+    """Name the contacts at which the coupling renders next to nothing, or return ""."""
     contacts, felt = assessment.loop.environment.contacts, assessment.transparency
     soft = [K < SOFT_END for K in assessment.gains.get("K", ())]
     where = ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
@@ -106,7 +103,7 @@ def _useless(assessment: Assessment) -> str:
 
 
 def lost(assessment: Assessment, nearby: Robustness | None) -> str:
-    """Return a sentence on the change within ten percent that ends the guarantee, or ""."""
+    """Name the change of the environment within ten percent that ends the guarantee, or return ""."""
     guarantee = assessment.guarantee
     if nearby is None or nearby.certified or guarantee is None or guarantee.any_environment:
         return ""
@@ -114,7 +111,7 @@ def lost(assessment: Assessment, nearby: Robustness | None) -> str:
 
 
 def _who(guarantee: Guarantee) -> str:
-    """Return the hands and objects of a guarantee: 'every passive hand with this object'."""
+    """Return the hands and objects of a guarantee, such as "every passive hand with this object"."""
     place = _OBJECTS.get(guarantee.environments, guarantee.environments)
     if guarantee.environments == RANGES:
         place = f"{guarantee.vertices} of the ranges (only searched between vertices)"
@@ -129,7 +126,7 @@ def _percent(ratio: float) -> str:
 
 
 def _missing(assessment: Assessment) -> str:
-    """Return what follows "Not certified": the failed condition with its shortfall, or the ranges with a reason."""
+    """Return the words after "Not certified": the failed condition with its shortfall, or the ranges' failure."""
     if not assessment.decisive.certified:
         return f"by {_sentence(f'{assessment.condition}: {assessment.decisive.shortfall}')}"
     reason = assessment.ranges and assessment.ranges.reason
@@ -140,12 +137,11 @@ def _sentence(words: str) -> str:
     return words if words.endswith(".") else f"{words}."
 
 
-# ----------------------------------------------------------------------------------------------------
-# The rows.
+# ---- the rows
 
 
 def rows(assessment: Assessment) -> render.Rows:
-    """Yield the rows of an assessment: conditions, ranges, guarantee, force limits, held torques."""
+    """Yield the rows of an assessment."""
     yield from render.certificate_rows(assessment.requirements, 5)
     yield from range_rows(assessment.ranges) if assessment.ranges else ()
     yield "guarantee", assessment.guarantee_words or f"none ({assessment.reason})"
@@ -154,7 +150,7 @@ def rows(assessment: Assessment) -> render.Rows:
 
 
 def gain_rows(assessment: Assessment) -> render.Rows:
-    """Yield the rows of a spring-damper's gains, or of the static stiffness."""
+    """Yield the rows of a coupling's gains and static stiffness, if it has them."""
     gains = assessment.gains
     if "K" in gains:
         K, B = (listed(gains[name], 5) for name in ("K", "B"))

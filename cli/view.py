@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change of the loop: its time, and the verdicts on the changed loop."""
+    """A change of the loop, with the verdicts on the changed loop."""
 
     t_s: float
     event: str
@@ -113,7 +113,7 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Film:
-    """A film: its file, its number of pictures and their number per second."""
+    """A film with `fps` pictures per second."""
 
     file: str
     pictures: int
@@ -122,7 +122,7 @@ class _Film:
 
 @dataclass(frozen=True)
 class _Clock:
-    """How often the loop fell behind the window's clock, and by how much in total."""
+    """How often, and by how much in all, the loop fell behind the window's clock."""
 
     overruns: int
     lost_s: float
@@ -130,7 +130,7 @@ class _Clock:
 
 @dataclass(frozen=True)
 class _Ended:
-    """The film or the clock of a session, and whether the keyboard ended it."""
+    """The end of a session."""
 
     interrupted: bool
     video: _Film | None = off_table("if given", None)
@@ -149,7 +149,6 @@ class _Report:
     ended: _Ended = off_table("inlined")
 
     def lines(self) -> Iterator[str]:
-        """Yield one line per event, then the end, the held torques, and the clock or the film."""
         yield from (event.line() for event in self.events)
         yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
         if torques := self.events[0].assessment.held_torques:
@@ -191,7 +190,7 @@ def _parser() -> options.Parser:
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
-    """Return the first coupling's name, and the script without an event that names it. Raises InputError."""
+    """Return the first coupling's name, and the script after it. Raises InputError."""
     label = _label(args)
     usual = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else _SCRIPT if usual else None
@@ -205,7 +204,7 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
 
 
 def _label(args: argparse.Namespace) -> str:
-    """Return the name of the first coupling in the window. Raises InputError."""
+    """Return the window's name of the coupling in --coupling. Raises InputError."""
     name = args.coupling
     if args.case == "none":
         if name not in (None, "none"):
@@ -221,12 +220,12 @@ def _label(args: argparse.Namespace) -> str:
 
 
 def _names() -> list[str]:
-    """Return the names of couplings in other commands and in the window."""
+    """Return the allowed names of couplings: those of other commands, and those of the window."""
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """Film the session in simulated time, so that the film is reproducible; Ctrl-C ends it early."""
+    """Film the session in simulated time, so that the film is reproducible."""
     from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)

@@ -65,7 +65,7 @@ class _Report:
 
 
 def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, start: float) -> _Report:
-    """Return the parts of a report that need no run."""
+    """Return the report without figures of a run."""
     with render.progress("assessing the coupling"):
         assessment = assessed(
             scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
@@ -89,7 +89,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """Return W0 [J], with which a world's account begins: that of --energy-budget, or START_J. Raises InputError."""
+    """Return W0 [J] of a world's energy account: that of --energy-budget, or START_J. Raises InputError."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget
@@ -136,8 +136,7 @@ def _energy(joules: float) -> str:
     return f"{1e3 * joules:.3g} mJ"
 
 
-# ----------------------------------------------------------------------------------------------------
-# sim.run
+# ---- sim.run
 
 _SHELL = "the energy account bounds the forces, and no limiter runs"
 _WHOLE = "the report has no further lines"
@@ -209,8 +208,7 @@ def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Ite
     yield "scene", report.scene.settings
 
 
-# ----------------------------------------------------------------------------------------------------
-# sim.validate
+# ---- sim.validate
 
 
 def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
@@ -256,15 +254,11 @@ def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[st
     yield "created by contacts", f"at most {_energy(max(each.figures.created_J for each in hands))}"
 
 
-# ----------------------------------------------------------------------------------------------------
-# design and design.audit
+# ---- design and design.audit
 
 
 def design(args: argparse.Namespace, scenario: Scenario, out: Path, further: Mapping[str, Any]) -> int:
-    """Design a coupling for a world and store it. Return 0 if runs with it have a guarantee, 1 if not.
-
-    `further` are the options of the design by argument name.
-    """
+    """Design a coupling for a world and store it. Return 0 if runs with it have a guarantee, 1 if not."""
     _refuse(args, "there is no network whose parameters could vary", ranges=None)
     _refuse(args, "delays are constant", varying_delay=None)
     _refuse(args, _SHELL, limiter=None)

@@ -29,7 +29,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
+_FINEST = 1e-5  # [m] least amplitude of an oscillation: the resolution of a desk device's encoders
 _PRESS = 3.0  # [N] steady force of a hand; 0 in maps of environments, because a soft environment would yield
 
 
@@ -47,7 +47,7 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--case none is the loop without coupling, so there is nothing to map: {instead}")
     if args.case == "II" and of_coupling:
         raise InputError("--case II is only with --coupling: certificates of a map's spring-dampers need no reference")
-    chosen = chosen_by(args, scenario) if args.coupling else None  # one coupling for the whole map
+    chosen = chosen_by(args, scenario) if args.coupling else None
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
         assessment = assessment_of(args, scenario, chosen)
@@ -128,7 +128,7 @@ def _mark(text: str) -> tuple[float, float]:
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
-    """Return the sweep over couplings of a loop, or over environments of one coupling. Raises InputError."""
+    """Return a sweep over couplings of a loop, or over environments of one coupling. Raises InputError."""
     devices, loop = scenario.axis_devices, scenario.loop("I")
     if loop.axes:
         raise InputError(
@@ -152,12 +152,11 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep, of_coupling: bool) -> P
     return Plan(args.points, _PRESS if of_coupling else 0.0, args.duration, threshold)
 
 
-# ----------------------------------------------------------------------------------------------------
-# The map in a few lines on the terminal.
+# ---- the map in a few lines on the terminal
 
 
 def _verdict(report: MapReport) -> str:
-    """Return the share of the map that each condition certifies, and the share that is stable with random hands."""
+    """State the share of the map that each condition certifies, and the share that is stable with random hands."""
     shares = ", ".join(f"{_share(report.ratios[name].certified_cells, report)} ({name})" for name in report.conditions)
     crowd = report.population
     return (
@@ -187,7 +186,7 @@ def _share(count: int, report: MapReport) -> str:
 
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
-    """Yield the rows of the fixed coupling in the environment of the scenario."""
+    """Yield the rows of a fixed coupling in the scenario's environment."""
     requirements, guarantee = fixed.assessment.requirements, fixed.assessment.guarantee_words
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})"
@@ -216,7 +215,6 @@ def _effects(effects: Shown) -> str:
 
 
 def _marked(report: MapReport) -> Iterator[str]:
-    """Yield a line for every point of --mark."""
     for mark in report.marks or ():
         stiffest = mark.stiffest_K_at_this_B
         ends = ", ".join(f"{name} {_limit(K)}" for name, K in stiffest.items())
@@ -230,7 +228,6 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """Return the largest required and the least available damping as a text."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
@@ -268,7 +265,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
 
 
 def _about(conditions: Sequence[str]) -> str:
-    """Return a remark on what K and B are, and on what a certified cell guarantees."""
+    """State which springs have K and B, and for which environment a cell is certified."""
     line = "K and B belong to every contact spring; a sweep certifies each cell for its environment alone"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."

@@ -97,7 +97,7 @@ class Classic:
     credited: bool = True
 
     def net(self, simulation: Any, process: Any, nsim: int) -> _Layer:
-        """Return a fresh layer."""
+        """Return a new layer."""
         loop = simulation.loop
         law = self.kind(len(loop.delta), loop.T, loop.delta if self.credited else 0.0, nsim=nsim)
         return _Layer(law, process.applied)

@@ -5,10 +5,10 @@
     environment= function        the scene, a separate simulation, behind a certified coupling and an energy shell
     environment.world            scene and coupling solved in one step, with the same shell
 
-A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. The motion of a pair of hands grows if
-hands and devices receive, beyond what the devices' damping dissipates, more energy than the 2 mJ of the shell and,
-with environment.world, what gravity and springs of the scene released. The pair shakes if, in the last fifth of the
-run, a force changes by more than a tenth of the limit in a tick.
+A hand is a mass, thrown at the scene, on a lossless spring to a fixed place. A pair of hands grows if hands and devices
+receive, beyond what the devices' damping dissipates, more energy than the 2 mJ of the shell and, with
+environment.world, the energy that gravity and springs released. It shakes if, in the last fifth of the run, a force
+changes by more than a tenth of the limit in a tick.
 """
 
 import sys
@@ -32,7 +32,7 @@ GAINS = (1.0, 0.2)  # factors on the contact force
 
 
 class ContactForce:
-    """Moves the contacts of a scene to given positions and returns the contact forces, to be fed back."""
+    """Moves the contacts of a scene to given positions and returns the contact forces."""
 
     def __init__(self, scene):
         self.port = scene.port()
@@ -51,10 +51,7 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], a share of ticks, and how many pairs of hands grow and shake.
-
-    The share is that of ticks in which a contact force was clipped, or the shell reduced a force.
-    """
+    """Return the peak force [N], the share of ticks with a clipped or reduced force, and how many pairs grow and shake."""
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):
