@@ -51,7 +51,7 @@ class ContactForce:
 
 
 def touch(way, scenario, coupling, hands, seconds, seed=0):
-    """Return the peak force [N], the share of ticks with a clipped or reduced force, and how many pairs grow and shake."""
+    """Return peak force [N], share of ticks with a clipped or reduced force, and how many pairs grow and shake."""
     rng, T, limit = np.random.default_rng(seed), scenario.T, scenario.device[0].force_limit
     peak, limited, grown, shaking, ticks = 0.0, 0, 0, 0, round(seconds / T)
     for _ in range(hands):

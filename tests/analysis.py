@@ -1,7 +1,4 @@
-"""Check the paper's Theorem 4, (c) in docs/theory.md, for a given coupling by a feasibility problem with a margin.
-
-Numbers in parentheses are the paper's equations.
-"""
+"""Check Theorem 4 of the paper, (c) in docs/theory.md, for a coupling by an LMI. Numbers in () are paper equations."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ from haptic_loop.design.lmi import (
 
 
 def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
-    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T.
-
-    E V keeps its eigenvalues if E is scaled by `unit_environment`.
-    """
+    """Return V in units T = 1, Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T."""
     root = np.sqrt(np.asarray(delta))
     return Lti(V.A, V.B * root, root[:, None] / V.T * V.C, root[:, None] / V.T * V.D * root, 1.0)
 
@@ -49,7 +43,7 @@ def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
 
     With H = V - Theta-hat the outputs are y1 = H u and y2 = H(1)/2 u - (H - H(1))/(z - 1) u. V-hat is output strictly
     passive with level Delta iff He G2 >= G1* Delta G1 for the transfer matrices G1, G2 from u to y1, y2. The result has
-    m states fewer than (16), one per channel.
+    m fewer states than (16).
     """
     H = V - theta_hat(theta)
     R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
@@ -80,10 +74,10 @@ class Analysis:
 
 
 def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float]) -> Analysis:
-    """Judge whether V satisfies Theorem 4 with this environment.
+    """Check whether V satisfies Theorem 4 with this environment. Raises ValueError if it is not passive.
 
     The problem minimises s subject to E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
-    Delta_V + s >= 0; the margin is -s. Raises ValueError for an environment that is not passive.
+    Delta_V + s >= 0; the margin is -s.
     """
     Block.of(environment)
     delta = _dampings(delta, environment.inputs)
@@ -123,7 +117,7 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
 
 
 def solve(problem: cp.Problem, solver: str = "CLARABEL") -> float:
-    """Return the optimal value; the variables hold the optimum, whose accuracy the caller judges."""
+    """Return the optimal value; the variables then have the optimum."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem.solve(solver=solver)

@@ -1,7 +1,7 @@
 """Evaluate conditions for a transfer matrix and data of a loop, and read the requirements in a command's JSON.
 
-Functions that take the dampings delta build the loop themselves. F is the force map, G the map before the delays Theta,
-V the coupling, and lo and hi are the ends of switching delays [samples].
+F is the force map, G the map before the delays Theta, V the coupling; lo and hi are the ends of switching delays
+[samples].
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from haptic_loop.design.certificate import prove
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
-    """Return a loop. By default each contact has a spring to ground; `walls` are stiffnesses [N/m] at the first one."""
+    """Return a loop, by default with a spring at each contact; `walls` are stiffnesses [N/m] at the first contact."""
     m = len(delta)
     contacts = tuple(f"contact {i}" for i in range(m))
     springs = tuple(Spring((contact, GROUND), 1.0) for contact in contacts)
@@ -72,7 +72,7 @@ def prove_limiter(loop, coupling, beta=environments.BETA, c=None, swept=None):
 
 
 def _lagging(rho, lags):
-    """Return the condition of forces that are limited with this rho [N/m], with `lags` multipliers c per channel."""
+    """Return the condition for forces limited with rho [N/m], with `lags` multipliers c per channel."""
     return environments.LimitedForces(lags=lags, held=tuple(float(r) for r in rho))
 
 

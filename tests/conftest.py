@@ -6,16 +6,14 @@ import signal
 import sys
 import time
 
-# A shell runs `make test &` with SIGINT ignored, and child processes inherit this: tests that send it would hang.
+# A shell runs `make test &` with SIGINT ignored, which child processes inherit: tests that send SIGINT would hang.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The matrices here are small: a pool of BLAS threads costs more than it saves, most of all on a busy machine.
-# NumPy reads these variables when it is loaded; the commands that tests start inherit them.
+# For small matrices, BLAS threads cost more than they save. NumPy reads these variables when it is loaded.
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-# Hundreds of tests start commands: without bytecode each of them would compile a hundred files, and every worker would
-# rewrite the assertions of all tests, which takes eight seconds.
+# Hundreds of tests start commands: without bytecode each of them would compile a hundred files.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
@@ -29,7 +27,7 @@ settings.register_profile("no-clock", deadline=None, suppress_health_check=[Heal
 settings.load_profile("no-clock")
 
 
-#: the slowest files, in this order; they start first, so that no worker is left alone with one at the end
+#: the slowest test files; they start first, so that no worker ends long after the others
 LONGEST = (
     *("test_docs.py", "test_known_device.py", "test_identify.py", "test_hostile.py", "test_optimal.py"),
     *("test_session.py", "test_live_bridge.py", "test_combinations.py", "test_run.py", "test_spring_damper.py"),
@@ -38,8 +36,8 @@ LONGEST = (
 )
 
 
-#: `make check` sets the time at which its minute ends. Lint comes first, so the tests get at least 15 s. Tests that
-#: have not started at this time are skipped; `make test` runs them.
+#: `make check` sets the time at which its minute ends; tests that have not started then are skipped. Lint comes first,
+#: so the tests get at least 15 s.
 CHECK_UNTIL = max(float(os.environ.get("CHECK_UNTIL", "inf")), time.time() + 15)
 
 
@@ -56,7 +54,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
-    """Share designs between all tests and processes: many tests need the same ones, which take seconds each."""
+    """Share designs, which take seconds each, between all tests and processes."""
     from forked import share_designs, wait_silently
 
     folder = tmp_path_factory.getbasetemp()

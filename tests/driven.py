@@ -22,7 +22,7 @@ class Driven:
 def driven(
     process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
-    """Close the loop from plant states `start`, (2n, nsim); with `last`, keep only blocks of the last `last` ticks."""
+    """Close the loop from plant states `start`, (2n, nsim). With `last`, store only blocks of the last `last` ticks."""
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
@@ -60,10 +60,10 @@ def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int =
 
 
 def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.random.Generator, ticks: int) -> int:
-    """Return how many hands' motions grow a hundredfold between a tenth of the ticks and the end.
+    """Return how many hands' motions grow a hundredfold after the first tenth of the ticks.
 
     Each tick multiplies the state by one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average.
-    Without `mean`, every hand always takes the step after which `energy` (hands, 2) times [x^2, v^2] is largest.
+    Without `mean`, it is the step after which `energy` (hands, 2) times [x^2, v^2] is largest.
     """
     hands = len(energy)
     z = 1e-3 * rng.standard_normal((hands, steps.shape[2], 1))

@@ -1,7 +1,4 @@
-"""Run commands as a user does, but without a second of imports: a process with all imports forks for each command.
-
-python tests/forked.py FOLDER     cache designs in FOLDER; read one request and print one answer per line
-"""
+"""Run commands as a user does, but without a second of imports: a process with all imports forks for each command."""
 
 from __future__ import annotations
 
@@ -29,14 +26,14 @@ ROOT = Path(__file__).parents[1]
 
 
 def wait_silently(patch=setattr) -> None:
-    """Keep a command from saying what it waits for, which would depend on the speed of the machine."""
+    """Keep commands from printing what they wait for, which would depend on the speed of the machine."""
     from haptic_loop.cli import render
 
     patch(render, "_SILENCE", 1e6)
 
 
 def load() -> None:
-    """Import all modules, so that no fork has to; forks do not say what they wait for."""
+    """Import all modules, so that no fork has to."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -50,11 +47,7 @@ def load() -> None:
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
-    """Cache slow results that many tests and processes need, so that each is computed once.
-
-    These are designs, bounds, requirements, proofs, searches and samples of ranges, and alternatives to failed designs.
-    Only the names in the listed modules are replaced: other callers still compute.
-    """
+    """Cache slow results that many tests and processes need. Only the names in the listed modules are replaced."""
     import haptic_loop.cli.check
     import haptic_loop.cli.design
     from haptic_loop.design import api, assessment, bound, designs
@@ -76,7 +69,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 
 def draw_once(folder: Path) -> None:
-    """Draw the first picture of each command and file name only, then empty ones: drawing takes most of a second."""
+    """Draw only the first picture of each command and file name, then empty ones, because drawing is slow."""
     from matplotlib.figure import Figure
 
     from haptic_loop.sim import plots
@@ -86,7 +79,7 @@ def draw_once(folder: Path) -> None:
     def drawn(figure: Figure, path: Path, dpi: int = 130) -> Path:
         try:
             (folder / f"{Path(sys.argv[0]).name}-{Path(path).name}").touch(exist_ok=False)
-            figure.set_layout_engine("none")  # tests/sim/test_plots.py draws with the layout, which takes twice as long
+            figure.set_layout_engine("none")  # tests/sim/test_plots.py draws with the layout.
         except FileExistsError:
             figure = Figure()
         return save(figure, path, dpi)
@@ -95,7 +88,7 @@ def draw_once(folder: Path) -> None:
 
 
 def _remembering(folder: Path, make):
-    """Return `make` with a cache of its results in the folder; failures and calls without a digest are not cached."""
+    """Return `make` with a cache of its results in the folder."""
     from haptic_loop.design import budgets
     from haptic_loop.design.coupling_file import digest
 
@@ -103,11 +96,11 @@ def _remembering(folder: Path, make):
     def remembered(loop, *asked, **options):
         try:
             loop_and_asked = digest(loop), make.__name__, budgets.GROWTH, _asked(make, loop, *asked, **options)
-        except TypeError:  # an environment or a design that a test defines has no digest
+        except TypeError:  # Objects that a test defines have no digest.
             return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
         with file.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # other processes wait for the one that computes the result
+            fcntl.flock(lock, fcntl.LOCK_EX)  # Other processes wait for the result.
             if not file.exists():
                 made = make(loop, *asked, **options)
                 part = file.with_suffix(".part")
@@ -119,7 +112,7 @@ def _remembering(folder: Path, make):
 
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
-    """Return (name, text) of each argument but loop and functions, defaults included; equal calls give equal texts."""
+    """Return (name, text) of each argument but loop and functions; equal calls give equal texts."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.designs import usual_condition
     from haptic_loop.design.program import DEFAULT
@@ -138,7 +131,7 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
 
 
 def _word(x: Any) -> str:
-    """Return a text for an argument: the same for equal arguments. Raises TypeError for an object without a value."""
+    """Return equal texts for equal arguments. Raises TypeError for an object without a value."""
     from haptic_loop.design.conditions import Condition
     from haptic_loop.design.coupling_file import digest
 
@@ -146,14 +139,14 @@ def _word(x: Any) -> str:
         return digest(x.form())
     if isinstance(x, Condition):
         return f"{type(x).__qualname__}({sorted((name, _word(part)) for name, part in vars(x).items())})"
-    if " at 0x" in repr(x):  # the address of an object tells nothing about its value
+    if " at 0x" in repr(x):
         raise TypeError(f"{type(x).__name__} has no word")
     return repr(x)
 
 
 @functools.cache
 def _warm() -> subprocess.Popen[str]:
-    """Return the process that forks; it ends when this process ends."""
+    """Return the process that forks."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     words = [sys.executable, str(Path(__file__)), os.environ.get("SHARED_DESIGNS", "")]
     warm = subprocess.Popen(words, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -162,7 +155,7 @@ def _warm() -> subprocess.Popen[str]:
 
 
 def run(command: str | list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run `python -m MODULE ...` or `python FILE ...` with files as its output, for a width of 100 columns."""
+    """Run `python -m MODULE ...` or `python FILE ...`, for a width of 100 columns."""
     words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
     with tempfile.TemporaryDirectory() as place:
         files = [Path(place, name) for name in ("out", "err")]
@@ -176,7 +169,7 @@ def begin(module: str, *options: str, out: Path, err: Path) -> int:
 
 
 def _asked_for(words: list[str], folder: Path, files: list[Path], environment: dict[str, str], beside=False) -> int:
-    """Return the exit code of the command, or with `beside` the process id of the command, which runs on."""
+    """Return the exit code of the command or, with `beside`, the process id of a command that runs on."""
     request = {"words": words, "folder": str(folder), "files": [str(file) for file in files]}
     request |= {"environment": environment, "beside": beside}
     print(json.dumps(request), file=_warm().stdin, flush=True)
@@ -184,7 +177,7 @@ def _asked_for(words: list[str], folder: Path, files: list[Path], environment: d
 
 
 def _command(words: list[str]) -> None:
-    """Run the command or the file in the child; a command ends with SystemExit."""
+    """Run the command or the file in the child. A command raises SystemExit."""
     from haptic_loop.cli.main import COMMANDS, door
 
     if words[0] != "-m":
@@ -198,11 +191,10 @@ def _command(words: list[str]) -> None:
 
 
 def _child(request: dict) -> None:
-    """Run the request in the child and exit."""
     code = 99
     try:
         if request["beside"]:
-            os.setsid()  # Ctrl-C does not reach a new session
+            os.setsid()  # Ctrl-C does not reach a new session.
         os.chdir(request["folder"])
         os.environ.update(request["environment"])
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -233,7 +225,7 @@ def _serve() -> None:
     if sys.argv[1]:
         share_designs(Path(sys.argv[1]))
         draw_once(Path(sys.argv[1]))
-    gc.freeze()  # a collection in a fork would write to, and so copy, every page of what is imported
+    gc.freeze()  # Otherwise a garbage collection in a fork would copy the memory of all modules.
     for line in sys.stdin:
         request = json.loads(line)
         if (child := os.fork()) == 0:

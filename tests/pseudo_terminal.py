@@ -1,4 +1,4 @@
-"""An emulated device behind a pseudo-terminal, in real time and in a separate process, to test the serial stack."""
+"""An emulated device behind a pseudo-terminal, in real time and in a separate process."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, nobody
 from haptic_loop.sim.scenario import load
 
 _PATIENCE = 60.0  # [s] longest wait for the emulator to begin, and to end
-_LINGER_US = 50_000  # after the cable was pulled the emulator runs on, so that the device comes to rest
+_LINGER_US = 50_000  # [us] time that the emulator runs on after the cable was pulled, so that the device comes to rest
 
 
 class Terminal:
-    """A pseudo-terminal whose far end a host can open by its path."""
+    """A pseudo-terminal that a host can open by its path."""
 
     def __init__(self) -> None:
         self.master, self._slave = os.openpty()
@@ -40,43 +40,37 @@ class Terminal:
     def read(self) -> bytes:
         try:
             return os.read(self.master, 4096)
-        except OSError:  # there is nothing to read, or the other end is closed
+        except OSError:
             return b""
 
     def write(self, data: bytes) -> None:
-        with suppress(OSError):  # nobody reads: the data are lost, as on a cable
+        with suppress(OSError):  # Without a reader the data are lost, as on a cable.
             os.write(self.master, data)
 
     def unplug(self) -> None:
-        """Close both ends: a host that has the path open sees the device disappear."""
+        """Close both ends, so that the host sees the device disappear."""
         for end in (self.master, self._slave):
             os.close(end)
 
 
 class RealTimeEmulator:
-    """The emulator in real time. Its timer never catches up.
-
-    If this process was held up, the lost time is subtracted from the device's clock. Catching up would look to the host
-    like late answers.
-    """
+    """The emulator in real time. If this process is delayed, the lost time is subtracted from the device's clock."""
 
     def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float, pace: float) -> None:
         self.emulator, self.terminal = emulator, terminal
         self._up, self._down = up, down
         self._period, self._pace = 1e6 * T, pace
         self._start = time.monotonic_ns()
-        self._lost = 0.0  # [us] that this process was held up
+        self._lost = 0.0  # [us] by which this process was delayed
         self.late = 0  # ticks that began more than half a period late
         self._queue: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
         self._number = count()
         self._partial = b""
 
     def now(self) -> float:
-        """Return the device's clock [us]."""
         return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
     def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
-        """Tick until the time is over, `asked_to_stop()` is true, or the cable was pulled 50 ms ago."""
         due, unplugged_at = self._period, None
         while not asked_to_stop() and self.now() < 1e6 * seconds:
             self._wait(due)
@@ -84,8 +78,8 @@ class RealTimeEmulator:
             if now < due:
                 continue
             if not self.emulator.unplugged:
-                self._hear(self.terminal.read(), due)  # bytes that came in the meantime are on time
-            if now - due > self._period / 2:  # this process was held up; a device's timer would be on time
+                self._hear(self.terminal.read(), due)  # Bytes that arrived before this line count as on time.
+            if now - due > self._period / 2:  # This process was delayed.
                 self.late += 1
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)
@@ -98,7 +92,7 @@ class RealTimeEmulator:
                 return
 
     def _wait(self, due: float) -> None:
-        """Wait until the next tick is due or bytes come or go, and handle the bytes."""
+        """Wait until the next tick is due, or bytes arrive or are due, and handle these bytes."""
         first = min(due, self._queue[0][0]) if self._queue else due
         timeout = max(0.0, 1e-6 * (first - self.now()) / self._pace)
         if self.emulator.unplugged:
@@ -144,7 +138,7 @@ class EmulatorProcess:
         self.path = path.read_text().strip()
 
     def end(self, patience: float = 0.0) -> dict[str, str]:
-        """Return the report on the device at the end; end the process if it runs on after `patience` [s]."""
+        """Return the final report on the device; end the process if it still runs after `patience` [s]."""
 
         def ended() -> bool:
             return self._said.read_text().endswith("}\n")
@@ -166,7 +160,7 @@ def _within(seconds: float, true: Callable[[], bool]) -> bool:
 
 @contextmanager
 def emulated(*options: str) -> Iterator[str]:
-    """Yield the path of an emulator in a separate process, which is ended afterwards."""
+    """Yield the path of an emulator in a separate process."""
     emulator = EmulatorProcess(*options)
     try:
         yield emulator.path

@@ -26,10 +26,9 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **optio
 
 
 class MovesAxes:
-    """A person who moves each axis by `mm` when a session asks for it, and who repeats a wrong motion.
+    """A person who moves each axis by `mm` when a session asks for it, and lists these axes, from 1, in `axes`.
 
-    After a wrong motion the person goes back, and moves the axis again 0.8 s later. `axes` lists the axes that were
-    asked for, counted from 1.
+    After a wrong motion the person goes back, and moves the axis again 0.8 s later.
     """
 
     def __init__(self, emulator, mm=6.0):

@@ -1,9 +1,7 @@
 """Print the tests of changed files, or with `sources` the changed files of the packages, for `make check`.
 
-Changed tests come first, then test_layers.py. A file of a package is tested by the files under tests/ named like it or
-its folder, else by those that import it, else by the folder of its package. Files with few tests come first: `make
-check` ends after a minute. Changed files are those that differ from HEAD or are
-untracked or, if there are none, those of the last commit.
+Changed tests come first, then test_layers.py, then the tests of each changed file of a package (`_mirror`), the fewest
+first, because `make check` ends after a minute.
 """
 
 import re
@@ -15,13 +13,13 @@ PACKAGES = ("models", "controller", "design", "sim", "hw", "cli")
 
 
 def changed() -> list[str]:
-    """Return the paths that differ from HEAD, with untracked files, or else those of the last commit."""
+    """Return the paths that differ from HEAD or are untracked; if there are none, those of the last commit."""
     seen = _git("diff", "--name-only", "HEAD") + _git("ls-files", "--others", "--exclude-standard")
     return seen or _git("diff", "--name-only", "HEAD~1")
 
 
 def tests_of(paths: list[str]) -> list[str]:
-    """Return the test files and folders that pytest runs for changed paths, in the order of the module docstring."""
+    """Return the test files and folders for these paths, in the order of the module docstring."""
     tests = [path for path in paths if path.startswith("tests/") and "/test_" in path and Path(path).exists()]
     found = [path for path in tests if "benchmarks" not in path] + ["tests/project/test_layers.py"]
     mirrors = [_mirror(path) for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES]
@@ -29,15 +27,13 @@ def tests_of(paths: list[str]) -> list[str]:
 
 
 def sources_of(paths: list[str]) -> list[str]:
-    """Return the arguments of pyright: at least one file, since without a file it would check everything."""
+    """Return the arguments of pyright, at least one file; without a file it would check everything."""
     found = [path for path in paths if path.endswith(".py") and path.split("/")[0] in PACKAGES and Path(path).exists()]
     return found or ["cli/__init__.py"]
 
 
 def _mirror(path: str) -> set[str]:
-    """Return the tests named like the file or its folder, else those that import it (in tests/PACKAGE, if any), else
-    the folder of its package.
-    """
+    """Return the tests named like the file or a folder of it, else those that import it, else its package's folder."""
     package, *folders = Path(path).parts[:-1]
     tests, stem = sorted(Path("tests").glob("*/test_*.py")), Path(path).stem
     own = {str(test) for test in tests if test.stem[5:] in (stem, *folders)}

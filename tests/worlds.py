@@ -1,4 +1,4 @@
-"""Define for many tests: the default pair, couplings for it, formulas written out by hand, and a serial line."""
+"""Loops, couplings, transfer functions written out by hand, and a serial line, for many tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import Loop
 
-#: Figure 4 of the paper as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
+#: Figure 4 of the paper as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, with a free mass M
 FIGURE_4 = Network(
     contacts=("contact 1", "contact 2"),
     springs=(
@@ -24,7 +24,7 @@ FIGURE_4 = Network(
 
 
 def checkered(*sides):
-    """Return all combinations of one value per side as parameters; every second one runs in `make validate` only.
+    """Return all combinations of a value from each of `sides` as parameters; every second runs in `make validate` only.
 
     Like the fields of one colour on a chess board, `make test` combines each value with half of the other side's.
     """
@@ -88,7 +88,7 @@ def force_map(E, coupling, theta, psi):
 
 
 def loop_of(network, theta, psi, period: float = T) -> Loop:
-    """Return a loop for tests of a tick, which depends neither on the damping nor on the reference."""
+    """Return a loop with arbitrary damping and reference, on which a tick does not depend."""
     return Loop(period, tuple(theta), tuple(psi), (0,) * len(theta), (1.0,) * len(theta), network)
 
 
@@ -117,8 +117,8 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
 def contact_by_hand(z, T, mass=0.0, stiffness=0.0, damping=0.0, coupling=None):
     """Return F, J, H and Y (k,) at k points z: the responses of a tip that a spring-damper coupling holds.
 
-    They map a device's displacement and a wall's force at the tip to the sent force and the tip's displacement.
-    The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
+    F, J map a device's displacement and a wall's force at the tip to the sent force; H, Y map them to the tip's
+    displacement. The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
     """
     s = (1 - 1 / z) / T
     E = mass * s**2 + damping * s + stiffness

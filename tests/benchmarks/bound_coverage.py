@@ -60,7 +60,7 @@ def case(seed: int) -> Case:
 
 
 def estimated(c: Case) -> Estimate:
-    """Return the estimate from a simulated record. Raises ValueError if the record gives no estimate."""
+    """Return the estimate from a simulated record. Raises ValueError if there is none."""
     base, draw = load("omega-pair"), np.random.default_rng((c.seed, 1))
     if c.rigid:
         device = RigidDevice(mass=c.mass, damping=c.viscous)
@@ -73,7 +73,7 @@ def estimated(c: Case) -> Estimate:
     plant = _EmulatedPlant(scenario, np.full(base.channels, c.step), c.coulomb)
     signal = chirp(base.channels, base.T, 1, 1.0, (3.0, 200.0), c.seconds).signal
     late = np.vstack([np.zeros(base.channels), signal[:-1]])
-    applied = -FORCE_STEP * np.round(late / FORCE_STEP)  # the device feels -f
+    applied = -FORCE_STEP * np.round(late / FORCE_STEP)  # The device feels -f.
     x, origin = [], draw.uniform()
     for force in applied:
         x.append(c.step * np.round(plant.s[0] / c.step + origin + c.noise * draw.standard_normal()))
@@ -82,7 +82,7 @@ def estimated(c: Case) -> Estimate:
 
 
 def judged(seed: int) -> tuple[Case, Estimate | str, float]:
-    """Return the case, its estimate or the error message, and the time that it took [s]."""
+    """Return the case, its estimate or the error message, and the wall time [s]."""
     c, begin = case(seed), time.perf_counter()
     try:
         found: Estimate | str = estimated(c)
@@ -92,7 +92,6 @@ def judged(seed: int) -> tuple[Case, Estimate | str, float]:
 
 
 def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
-    """Print one line per case, then the figures of all cases."""
     excess, scaled, none, longest = [], [], 0, 0.0
     for c, found, seconds in results:
         longest = max(longest, seconds)
@@ -114,7 +113,6 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
 
 
 def main() -> None:
-    """Run --cases cases from --first on, --workers at a time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=120)
     parser.add_argument("--first", type=int, default=0)

@@ -4,9 +4,8 @@ PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long
 
 `cold` measures commands to their end, `first` to their first line, `long` commands of many seconds. Times are CPU
 seconds; those of cold and first are wall seconds, which need an idle machine. Ratios are medians of rounds in which the
-compared programs alternate. A command runs in a new process, five times or, if long, once. It alternates with the
-floor, a process that only imports NumPy and MuJoCo; goals of commands are multiples of the floor's time. `--write` puts
-the table of cold into docs/accuracy.md; use it on an idle machine.
+compared programs alternate. Commands alternate with the floor, a process that only imports NumPy and MuJoCo; their
+goals are multiples of the floor's time. `--write` puts the table of cold into docs/accuracy.md.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from haptic_loop.sim.stability import exact_growth
 ROOT = Path(__file__).parents[2]
 PAGES = {"cold": "docs/accuracy.md"}
 ROUNDS = 9
-FLOOR = "-c import numpy, mujoco"  # every command that simulates needs these imports
+FLOOR = "-c import numpy, mujoco"
 
 #: words of a command -> goal in floors; {} is a folder that all commands share
 COMMANDS = {
@@ -96,7 +95,7 @@ def engines() -> Iterator[Sequence[str]]:
 
 
 def started(words: str, folder: str) -> subprocess.Popen[bytes]:
-    """Start the command in a new process, with bytecode and matplotlib's list of fonts as a user has them."""
+    """Start the command in a new process, with bytecode and matplotlib's list of fonts, as for a user."""
     environment = os.environ | {"MPLCONFIGDIR": matplotlib.get_cachedir(), "PYTHONPATH": str(ROOT)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     arguments = ["-c", words[3:]] if words.startswith("-c ") else ["-m", *words.format(*[folder] * 2).split()]
@@ -105,7 +104,6 @@ def started(words: str, folder: str) -> subprocess.Popen[bytes]:
 
 
 def ended(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a command. Raises CalledProcessError if it failed."""
     process.communicate()
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, process.args)
@@ -138,7 +136,7 @@ def first_line(words: str, folder: str) -> float:
 
 
 def error(report: dict[str, Any]) -> str:
-    """Return the text beside the speed: errors of a simulation, or how the requirement was proved."""
+    """Return the errors of a simulation, or how the requirements were proved."""
     if "traces" in report:
         traced = report["traces"] and f", {report['traces']['witnessed']} traces by both engines"
         apart = f"growth rates {report['largest_difference_per_s']:.1e} 1/s apart"
@@ -155,7 +153,7 @@ def error(report: dict[str, Any]) -> str:
 def interleaved(
     commands: Mapping[str, float | None], spent: Callable[[str, str], float], rounds: int
 ) -> Iterator[Sequence[str]]:
-    """Yield a row for each command: the medians of its seconds and of its ratios to the floor in the same round."""
+    """Yield a row for each command: medians over rounds of its seconds and of its ratio to the floor."""
     with tempfile.TemporaryDirectory() as folder:
         for words in [*commands] if rounds > 1 else []:
             spent(words, folder)

@@ -52,7 +52,6 @@ def hostile(rng: np.random.Generator) -> Loop:
 
 
 def loops(count: int, seed: int) -> Iterator[tuple[int, Loop]]:
-    """Yield `count` loops with their seeds."""
     for number in range(seed, seed + count):
         yield number, hostile(np.random.default_rng(number))
 

@@ -2,8 +2,8 @@
 
 PYTHONPATH=. python tests/benchmarks/odd_rigs.py     (two minutes; --seed 1 draws other rigs)
 
-This file integrates the plants itself, by semi-implicit Euler in small steps, and does not use the emulator. The true
-guarantee of a rig is the viscous friction of its motor: all else is passive, or does not belong to the device.
+This file integrates the plants by semi-implicit Euler in small steps, without the emulator. The true guarantee of a rig
+is the viscous friction of its motor: all else is passive, or does not belong to the device.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
-#: bounds of an earlier fit (one mass with Coulomb friction, by output error), against the truth; it refused other rigs
+#: errors of the bounds of an earlier fit (one mass with Coulomb friction, by output error); it refused other rigs
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")
@@ -60,7 +60,7 @@ class Rig:
 
 
 def rigs(seed: int = 7) -> list[Rig]:
-    """Return sixty rigs: each imperfection on the base device and on a random one, mixtures, and hands."""
+    """Return sixty rigs: each imperfection on the default device and on a random one, mixtures, and hands."""
     one: list[dict[str, float]] = [
         {},
         {"constant": 1e-3},
@@ -161,14 +161,14 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
 
 
 def excitation(seconds: float = 2.5) -> Array:
-    """Return the excitation of hw.identify with these `--seconds` (ticks,) [N], in whole force steps."""
+    """Return the excitation of hw.identify (ticks,) [N], in whole force steps."""
     swing = Swing.of(scenario_of(), 0.5, 0.03)
     signal = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds, Swing(swing.force[:1], swing.hz)).signal[:, 0]
     return FORCE_STEP * np.round(signal / FORCE_STEP)
 
 
 def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
-    """Return the estimate from a record or the error message, and the time that it takes [s]."""
+    """Return the estimate from a record or the error message, and the wall time [s]."""
     begin = time.perf_counter()
     found: Estimate | str
     try:
@@ -179,7 +179,6 @@ def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
 
 
 def main() -> None:
-    """Print the estimate of each rig, and how close the bounds are to the truth."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--workers", type=int, default=2)

@@ -1,16 +1,12 @@
-"""Design optimal couplings for the loops n* and o* of benchmarks/loops.
-
-For each loop, print the mismatch of the optimal coupling, the CPU time of its design, and a lower bound on the mismatch
-of any linear coupling.
+"""Design optimal couplings for the loops n* and o* of benchmarks/loops, and bound the mismatch of any linear coupling.
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
-`before` is the rms mismatch [dB] of an older version's optimal coupling, or the reason why there was none (nine loops).
-`to beat` is the goal for the rms mismatch and the rendered stiffness g. The bound is computed for loops of at most
---bound devices. Seconds are CPU seconds. `need` is the required over the available damping. `at 10 %` is the largest
-such ratio when one spring, all springs or one mass of the environment change by +10 % or -10 %. `gain` is the
-high-frequency gain (design/transparency.py), and `limited` the mismatch of the coupling that also covers limited
-forces.
+`before` is the rms mismatch [dB] of an older version's optimal coupling, or the reason why there was none. `to beat` is
+the goal for the rms mismatch and the rendered stiffness g. Seconds are CPU seconds. `need` is the required over the
+available damping; `at 10 %` is the largest such ratio when one spring, all springs or one mass of the environment
+change by +10 % or -10 %. `gain` is the high-frequency gain (design/transparency.py), and `limited` the mismatch of the
+coupling that also covers limited forces.
 """
 
 from __future__ import annotations
@@ -31,12 +27,10 @@ from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.scenario import load
 
 T = TypeVar("T")
-# After 600 s of clock time no larger basis is tried, so that one loop cannot block the run. Without a limit (None) the
-# result would not depend on the load.
-PATIENT = Options(seconds=600)
+PATIENT = Options(seconds=600)  # no larger basis is tried after this time, so that one loop cannot block the run
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
-#: by loop: rms mismatch [dB] of an older version (or why there was none), mismatch [dB] and stiffness to beat
+#: loop -> `before`, `to beat`
 BEFORE = {
     "n0": ("-29.50", "-33.69, .996"),
     "n1": ("-11.19", "-13.13, .88"),
@@ -86,7 +80,6 @@ def _row(path: Path, most: int, limited: int) -> None:
 
 
 def _timed(work: Callable[[], T]) -> tuple[T, float]:
-    """Return the result of `work`, and its CPU seconds."""
     started = time.process_time()
     return work(), time.process_time() - started
 

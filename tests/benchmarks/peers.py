@@ -2,14 +2,13 @@
 
 PYTHONPATH=. python tests/benchmarks/peers.py [--duration 15] [--rounds 3]     (pip install drake control)
 
-Every tool gets the default scenario with the published coupling of case I: same process, force limits, outside forces
-and plant. The tools take turns in every round, and the median of a tool's CPU times counts. Growth is measured on the
-tool's trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1". A
-tool that is not installed is listed as not measured.
+Every tool simulates the default scenario with the published coupling of case I: same process, force limits, outside
+forces and plant. The tools alternate, and the median of a tool's CPU times counts. Growth is measured on the tool's
+trace, projected on the exact loop's dominant mode. `ratio` is the CPU time over that of "exponential x 1".
 
-Drake gets a MultibodyPlant of prismatic joints, springs as bushings, and the forces of a period as an applied
-generalised force, since its discrete controllers are Python systems, which cost more. python-control gets the sampled
-plant as a nonlinear discrete system, since only that can clip. scipy.signal gets the closed loop without clipping.
+Drake has a MultibodyPlant of prismatic joints, with springs as bushings; the forces of a period are an applied
+generalised force, because its discrete controllers in Python cost more. python-control has the sampled plant as a
+nonlinear discrete system, because only that can clip. scipy.signal has the closed loop without clipping.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def ours(engine: str, integrator: str | None = None, substeps: int | None = None
 
 
 def numpy_loop(simulation: Simulation, w: Array) -> States:
-    """Run the loop as one would write it in an hour, with the sampled plant."""
+    """Run the loop with the sampled plant, in the simplest way."""
     F, plant, limit = simulation.F, simulation.plant, simulation.process.force_limit
     z, s = np.zeros(F.order), np.zeros(plant.A.shape[0])
     zs, ss, fs = [], [], []
@@ -94,7 +93,7 @@ def python_control(simulation: Simulation, w: Array) -> States:
 
 
 def drake(step: str, substeps: int) -> Peer:
-    """Return a peer that uses pydrake's MultibodyPlant, with fixed Runge-Kutta steps ("RK3") or in "discrete" time."""
+    """Return pydrake's MultibodyPlant as a peer, with fixed Runge-Kutta steps ("RK3") or in "discrete" time."""
 
     def peer(simulation: Simulation, w: Array) -> States:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator

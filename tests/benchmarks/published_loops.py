@@ -1,8 +1,7 @@
 """Write benchmarks/figures.csv: PYTHONPATH=. python tests/benchmarks/published_loops.py     (a quarter of an hour)
 
-The cheap columns are computed from each loop in a second. `designed` takes up to a minute for eight devices. The
-columns of the best coupling and of the bound are kept from the file (tests/benchmarks/optimal_loops.py prints their
-figures), except that those of the loops p* are computed.
+For loops n* and o*, the columns EXPENSIVE but for `designed_rms_db` are copied from the present file;
+tests/benchmarks/optimal_loops.py prints their figures.
 """
 
 from __future__ import annotations
@@ -28,8 +27,6 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import worst_mode
 
 ROOT = Path(__file__).parents[2] / "benchmarks"
-#: Columns that are slow to compute. For loops n* and o*, all but `designed_rms_db` are copied from the present file;
-#: tests/benchmarks/optimal_loops.py prints their figures.
 EXPENSIVE = ("designed_rms_db", "best_rms_db", "best_stiffness_share", "bound_rms_db")
 
 
@@ -73,9 +70,7 @@ def best(path: Path) -> dict[str, float | None]:
         try:
             made = design_by_kind(loop, kind, condition, **switching)
         except ValueError:
-            # The design finds no coupling, or refuses this loop, for example because of its walls, or because its
-            # devices have no bounds of motor and transmission.
-            continue
+            continue  # The design finds no coupling, or refuses this loop, for example because of its walls.
         if assess(loop, made, condition=SWITCHING if switching else made.asked).holds:
             seen = transparency_of(loop, made)
             reached.append((seen.rms_mismatch_db, seen.dc_ratio))
@@ -86,12 +81,11 @@ def best(path: Path) -> dict[str, float | None]:
 
 
 def written(value: float | None) -> str:
-    """Return a figure as the table shows it: six digits, or nothing for None."""
     return "" if value is None else f"{value:.6g}"
 
 
 def table() -> list[dict[str, str]]:
-    """Return the rows of the table as it stands."""
+    """Return the rows of the present file."""
     with (ROOT / "figures.csv").open() as file:
         return list(csv.DictReader(file))
 

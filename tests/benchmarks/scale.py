@@ -44,7 +44,7 @@ def star(n: int) -> str:
 
 
 def limits(loop: Loop, design: Design) -> str:
-    """Return required over available damping for limited forces, with the design's multiplier or else the best one."""
+    """Return required over available damping for limited forces, or why there is no proof."""
     try:
         return f"{1 / prove_limiter(loop, design.coupling, c=design.c).margin:.4f}, proved"
     except NotProved as refused:
@@ -58,9 +58,8 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def devices() -> None:
-    """Measure, in the order of the columns, a run of 2 s, an audit by both conditions with exact proofs, and designs.
-
-    The designs are a clipped one, one with a limiter, its proof for limited forces, and one for any-environment.
+    """Measure, in the order of the columns: a run of 2 s, an audit by both conditions with exact proofs, a design for
+    clipped forces, one with a limiter, the proof for its limited forces, and a design for any-environment.
     """
     for n in (2, 4, 8, 16, 32):
         scenario = parse(star(n))
@@ -78,7 +77,6 @@ def devices() -> None:
 
 
 def commands() -> None:
-    """Measure the commands `design` and `sim.run`."""
     with TemporaryDirectory() as place:
         for n in (8, 16, 32):
             scenario = Path(place, f"star{n}.toml")

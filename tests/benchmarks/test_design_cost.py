@@ -40,7 +40,6 @@ def test_inner_convex_approximation(benchmark):
 @pytest.mark.parametrize("case", ["I", "II"])
 @pytest.mark.parametrize("name", ASKED)
 def test_optimal(benchmark, case, name):
-    """The measured time includes the proof."""
     loop = load().loop(case)
     design = benchmark.pedantic(lambda: optimal.design(loop, ASKED[name]), rounds=3, warmup_rounds=1)
     found, seconds = design.figures, benchmark.stats.stats.median

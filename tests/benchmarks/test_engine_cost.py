@@ -2,10 +2,8 @@
 
 make bench    (or: python -m pytest tests/benchmarks/test_engine_cost.py --benchmark-only -s)
 
-Times are CPU times. A loop's time is divided by that of the raw calls, which move the same plant with the recorded
-inputs. Raw calls make MjData once, and per tick write the controls and call mj_step; for the exponential engine they
-write the controls, call mj_forward, multiply by the matrix h phi1(h J) of its step, and write the state back. Only the
-loop has the process, its limiter, outside forces and the record.
+Times are CPU times. A loop's time is divided by that of the raw calls (`raw`), which move the same plant with the
+recorded inputs; only the loop has the process, its limiter, outside forces and the record.
 """
 
 import time
@@ -42,15 +40,11 @@ def cpu_seconds(call) -> float:
 
 
 def looped(simulation, engine, integrator=None, substeps=None):
-    """Run the scenario as sim.run does."""
     return run(simulation, make_engine(simulation, engine, integrator, substeps))
 
 
 def raw(simulation, integrator, substeps, record, view=np.asarray) -> float:
-    """Return the CPU seconds of MuJoCo's calls alone: MjData, then every tick.
-
-    Numbers are copied between arrays or, with `view` memoryview, in the least time that Python allows.
-    """
+    """Return the CPU seconds of MuJoCo's calls alone; `view` memoryview copies in the least time that Python allows."""
     model = _discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
     move = make_engine(simulation, "mujoco", EXPONENTIAL, substeps)._access.move(simulation.scenario.T / substeps)
     every = slice(None) if view is memoryview else ...
@@ -115,7 +109,7 @@ def test_speed_and_error_side_by_side(benchmark, scene):
             end="",
         )
     print()
-    # [1/s] When measured, the default scene had errors of 2e-12 and 2e-4.
+    # [1/s] When measured, these growth errors were 2e-12 and 2e-4 in the default scene.
     assert abs(errors["exponential x 1"]) <= 1e-9
     assert abs(errors[f"RK4 x {substeps}"]) <= 1e-3
 
@@ -182,7 +176,7 @@ def test_many_hands(benchmark):
             f"error {error:.1e} in {ticks} ticks",
             end="",
         )
-        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # phase errors of lightly damped modes at 83 Hz add up
+        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # RK4 makes phase errors, which add up
     print()
 
 

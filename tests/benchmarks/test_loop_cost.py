@@ -34,10 +34,7 @@ def test_exact_engine(benchmark):
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
 def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatch):
-    """Run in turns a loop with the limiter and one that clips, and compare their shortest times.
-
-    The limiter solves a box problem only in ticks whose forces it limits.
-    """
+    """The limiter solves a box problem only in ticks whose forces it limits; compare its time with that of clipping."""
     coupling, solved, solve = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), [], BoxProblem.solve
     monkeypatch.setattr(BoxProblem, "solve", lambda problem, q: [solved.append(1), solve(problem, q)][1])
     limited, clipped = (assemble(load(), coupling, lag) for lag in ((11.4167, 11.4167), None))
@@ -60,7 +57,7 @@ def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatc
 
 @pytest.mark.parametrize("devices", [1, 2, 8])
 def test_limiting_vectors(benchmark, devices):
-    """Devices of three axes have slips that a random matrix couples; each column of q is a tick with limited forces."""
+    """The solution f + M v = q, with forces f within the limits, is exact to rounding; a column of q is one tick."""
     rng, n, balls = np.random.default_rng(devices), 3 * devices, (3,) * devices
     root, skew = rng.normal(size=(n, n)), rng.normal(size=(n, n))
     M = 30 * (root @ root.T + np.eye(n) + skew - skew.T)

@@ -52,7 +52,7 @@ def test_verdicts(benchmark, held_by, coupling, request):
 
 
 def test_batched_exact_engine(benchmark, held_by):
-    """Measure CPU seconds of the whole loop: process, limits and plant of every simulation."""
+    """Measure CPU seconds of process, limits and plant; the states must be those of the matrix power."""
     simulation, ticks, short = assemble(load(), PUBLISHED["I"]), 960, 32
     plants = hold(held_by.plants(), simulation.scenario.T)
     engine = ExactEngine(plants)
@@ -117,7 +117,7 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
 
 
 def test_how_tight_the_certificate_is(benchmark):
-    """Let the adversary attack loops that are 1 to 20 % short of their required damping."""
+    """Loops that lack 5 % or more of their required damping are destabilised."""
     scenario = load()
     shortages = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
     loops = {"none": (scenario, NoCoupling()), "published": (scenario, PUBLISHED["I"])}
@@ -128,6 +128,6 @@ def test_how_tight_the_certificate_is(benchmark):
     for name, (_, coupling) in loops.items():
         frequency = this_environment(assemble(scenario, coupling).F, scenario.delta).frequency_hz
         x = np.pi * frequency * scenario.T
-        # The certificate bounds dissipation by the motion per tick, and misses a part of the dissipation of a sinusoid.
+        # The certificate counts |dx|^2/T per tick, which is less than the dissipation of a sinusoid (sim.adversary).
         print(f"\n{name}: binds at {frequency:.1f} Hz and misses {1 - (np.sin(x) / x) ** 2:.1%} of losses", end="")
     assert all(row.worst.destabilises for row in rows if row.short >= 0.05)

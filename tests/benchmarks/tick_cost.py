@@ -1,11 +1,9 @@
 """PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: measure the CPU time of a tick of the host.
 
 A whole tick is one pass of the armed bridge's loop over a pseudo-terminal. It begins when the device's STATE frame can
-be read, and ends at the next wait, after all checks and records and after writing the FORCE frame. A bare tick decodes
-a STATE, steps the controller, and encodes a FORCE. Every tick runs the whole loop. Blocks of 200 ticks alternate: in
-one the whole tick is timed, in the next an added bare tick and the writing of FORCE. Times are CPU times of this thread
-with its system calls. The emulated device runs in this thread while the host waits, and leaves the caches as cold as
-another process.
+be read, and ends at the next wait, after writing the FORCE frame. A bare tick decodes a STATE, steps the controller,
+and encodes a FORCE. Blocks of 200 ticks alternate: in one the whole tick is timed, in the next an added bare tick and
+the writing of FORCE. Times are CPU times of this thread. The emulated device runs in this thread while the host waits.
 """
 
 from __future__ import annotations
@@ -33,11 +31,11 @@ from tests.checks.faults import _lively
 from tests.pseudo_terminal import Terminal
 
 BLOCK = 200
-PATIENCE = 5.0  # [s] longest wait for bytes to pass the pseudo-terminal; a kernel thread moves them
+PATIENCE = 5.0  # [s] longest wait for bytes to pass the pseudo-terminal
 
 
 class _Bench(SerialPort):
-    """A port at whose other end a device ticks whenever the host waits."""
+    """A port whose device ticks whenever the host waits."""
 
     def __init__(self) -> None:
         self.scenario = _lively(load())
@@ -92,7 +90,7 @@ def tick_cost(ticks: int) -> dict[str, list[float]]:
     with _Bench() as port:
         session = port.session
         live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
-        live.clock = lambda: port.clock  # the emulated device's clock, since ticks take longer here than T
+        live.clock = lambda: port.clock  # the emulated device's clock, because ticks take longer here than T
         session.start(0)
         gc.collect()
         gc.freeze()

@@ -1,9 +1,9 @@
 """Attack guarantees for limited forces, budgets, walls and encoder steps, as a part of `make validate`.
 
 A loop is drawn; its devices get a little more or much less damping (or friction) than its guarantee requires. Then two
-adversaries try to take energy out of the loop, from rest. One moves the devices as it likes: waves, noise, and at every
-tick the step that takes the most, with limits so low that forces are often limited. The other draws pushed lossless
-hands, keeps those whose motion grows most, and varies them. A guarantee says that the energy balance
+adversaries try to take energy out of the loop, from rest. One moves the devices: by waves, by noise, and at every tick
+by the step that takes the most energy. The other draws pushed lossless hands, selects those whose motion grows most,
+and varies them. A guarantee says that the energy balance
 
         sum f'dx + dx' Delta dx/T + w'|dx|  >=  -given
 
@@ -34,8 +34,8 @@ from haptic_loop.sim.run import assemble, run_blocks
 from haptic_loop.sim.scenario import Scenario
 
 ENOUGH = 1.02  # times the damping or friction that a guarantee requires
-_GIVEN = 0.005  # [J] that a budget may give
-_PUSHED = 24  # motions that are simulated at once
+_GIVEN = 0.005  # [J] energy that a budget may give
+_PUSHED = 24  # number of motions that are simulated together
 _GROWN = 1.5  # a hand's motion grows if its rms speed in the last quarter exceeds this many times that in the first
 _ROUNDING = 1e-10  # rounding error of a balance, over the energy that flows
 
@@ -46,12 +46,12 @@ class _Challenge:
 
     guarantee: str
     loop: int  # the number of the draw
-    factor: float  # times what the guarantee requires
-    motions: int  # motions tried
-    took: int  # motions that took more energy than the guarantee allows
+    factor: float  # the loop's damping (or friction) over that which the guarantee requires
+    motions: int  # number of motions that were tried
+    took: int  # number of motions that took more energy than the guarantee allows
     least_J: float  # the lowest energy balance plus `given` of all motions and hands, at most 0
-    hands: int  # hands tried in each generation
-    grew: int  # hands whose motion grew, or that took more energy than the guarantee allows
+    hands: int  # number of hands that were tried in each generation
+    grew: int  # number of hands whose motion grew, or that took more energy than the guarantee allows
     limited: float  # share of ticks with limited forces or contact, largest over the three values of greed (`_moved`)
     holds: bool  # no adversary succeeded, or nothing is guaranteed (factor < 1)
 
@@ -65,9 +65,9 @@ class _Case:
     T: float
     size: float  # [m] usual step of the motions
     friction: Array | float = 0.0  # (m,) [N] Coulomb friction of the devices
-    given: float = 0.0  # [J] that the budget may give
-    start: float = 0.0  # [m] where motions begin
-    push: float = 1.0  # factor on the speeds at which hands are let go
+    given: float = 0.0  # [J] energy that the budget may give
+    start: float = 0.0  # [m] position at which motions begin
+    push: float = 1.0  # factor on the initial speeds of hands
 
     def limited(self, buffer: StepBuffer, ticks: int) -> float:
         """Return the share of the ticks in which forces were limited, or a wall was touched."""
@@ -87,7 +87,7 @@ def challenges(
     ticks: int = 700,
     names: Sequence[str] | None = None,
 ) -> Iterator[_Challenge]:
-    """Yield the findings on `loops` random loops for each guarantee, with ENOUGH and too little of what it requires.
+    """Yield the findings on `loops` random loops for each guarantee, with ENOUGH damping (or friction) and too little.
 
     Motions last `ticks`, and hands move for `seconds`.
     """
@@ -121,7 +121,7 @@ def _challenge(
 
 
 def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int) -> Array:
-    """Return waves and noise of three sizes (ticks, m, _PUSHED), which with greed end after 150 ticks."""
+    """Return steps [m] of waves and noise in three sizes (ticks, m, _PUSHED), which with greed end after 150 ticks."""
     w, phase = np.exp(rng.uniform(-5, 1.1, (1, 1, _PUSHED))), rng.uniform(0, 6, (1, m, _PUSHED))
     wave = np.sin(w * np.arange(ticks)[:, None, None] + phase) + 0.3 * rng.normal(size=(ticks, m, _PUSHED))
     until = ticks if greed == 0 else 150
@@ -170,7 +170,7 @@ def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> 
 
 
 def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float) -> tuple[Array, Array]:
-    """Return each hand's rms speed of the last quarter over that of the first, and its lowest balance plus `given`."""
+    """Return each hand's ratio of rms speeds in the last and first quarter, and its lowest balance plus `given`."""
     hands, ticks = len(mass), round(seconds / case.T)
     links = np.stack([mass, np.zeros_like(mass), stiff], axis=-1)
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in case.delta)
@@ -207,7 +207,7 @@ _PARTS = 6  # parts of a tick; friction acts anew in each
 
 
 class _Rubbing:
-    """An engine with Coulomb friction, which in each part of a tick stops a device or, if too weak, brakes it."""
+    """An engine with Coulomb friction, which in each part of a tick stops a device or, if it is too weak, slows it."""
 
     def __init__(self, plants: HeldPlant, friction: Array) -> None:
         self._A, self._B, self._most = plants.A, plants.B[..., -len(friction) :], friction.T[..., None]
@@ -233,7 +233,7 @@ class _Rubbing:
 
 
 def _pair(rng: np.random.Generator, stiffest: float = 9000.0) -> tuple[Loop, SpringDamper]:
-    """Return a loop of two devices, a mass and delays of up to three samples, and a coupling; delta is not set yet."""
+    """Return a loop of two devices, a mass and delays of up to three samples, and a coupling; delta is arbitrary."""
     K, B = np.exp(rng.uniform(np.log(500), np.log(stiffest), 2)), rng.uniform(0, 2, 2)
     one, two, ground = rng.uniform(100, 1500, 3).tolist()
     springs = Spring(("a", "m"), one, 0.5), Spring(("m", "b"), two, 0.5), Spring(("m", GROUND), ground / 2, 0.1)
@@ -255,7 +255,7 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
 def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
     """Return a case of any-environment: a limiter with rho = 0, and walls with dampers that make and break contact.
 
-    Of eight loops it is the one whose environment needs the largest share of what any-environment requires.
+    Of eight loops it has the environment that needs the largest share of the damping that any-environment requires.
     """
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:
@@ -301,15 +301,14 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _friction(rng: np.random.Generator, factor: float) -> _Case:
-    """Return a case of encoder steps of 10 um: the factor applies to friction; damping is that for ideal encoders.
-
-    Hands are let go at a millimetre a second or less, where encoder steps matter."""
+    """Return a case of encoder steps of 10 um: the factor applies to friction; damping is that for ideal encoders."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop).required)
     process = Process(loop.law(coupling), np.full(2, np.inf), np.full(2, step))
     pays = factor * encoder_friction(F, [step] * 2)
     damping = needed * (1 + 1e-9)
+    # Encoder steps matter at speeds of a millimetre a second or less.
     return _Case(lambda nsim, ticks: process, damping, loop.T, step / 4, pays, start=step / 2, push=0.001)
 
 

@@ -1,4 +1,4 @@
-"""Check for `make validate` that memory stays flat over an hour of a session (virtual time), and over 100,000 hands."""
+"""Check that memory stays flat over an hour of a session (virtual time), and over 100,000 hands: `make validate`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
 
 
 def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
-    """Judge random hands on the default loop by eigenvalues. Return whether all are stable, and how many are not."""
+    """Validate random hands by eigenvalues; return whether all are stable, and the number of unstable ones in words."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
     found = validate(question, progress=lambda done, total: mark(done / total))
@@ -65,8 +65,8 @@ def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
 
 _Work = Callable[[_Mark], tuple[bool, str]]
 
-#: work, and by how much its peak memory may rise after a tenth of it [MiB]: a session keeps no ticks; a crowd keeps 150
-#: bytes per hand, twice while its batches are joined
+#: (name, work, allowed rise of peak memory after a tenth of the work [MiB]); a crowd stores 150 bytes per hand, twice
+#: while its batches are joined
 _LONG: tuple[tuple[str, _Work, float], ...] = (
     ("an hour of a session", _long_session, 8.0),
     ("100,000 hands", _many_hands, 32.0),
@@ -74,8 +74,8 @@ _LONG: tuple[tuple[str, _Work, float], ...] = (
 
 
 def endurance(_seed: int) -> Iterator[_Endured]:
-    """Yield for each long work, in a separate process, whether memory stays flat; the seed has no effect."""
-    context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all earlier checks
+    """Yield for each work, in a separate process, whether memory stays flat; the seed has no effect."""
+    context = multiprocessing.get_context("spawn")  # A fork would begin with the memory of all earlier checks.
     for what, work, allowed in _LONG:
         here, there = context.Pipe(duplex=False)
         worker = context.Process(target=_alone, args=(work, allowed, there), daemon=True)
@@ -91,13 +91,11 @@ def endurance(_seed: int) -> Iterator[_Endured]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Do the work in this separate process, which ends when its parent ends."""
     _as_worker()
     there.send(_endure(work, allowed))
 
 
 def _endure(work: _Work, allowed: float) -> _Endured:
-    """Do the work, and measure this process's peak memory after a tenth and at the end [MiB]."""
     peaks: list[float] = []
 
     def mark(share: float) -> None:

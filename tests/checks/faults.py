@@ -30,11 +30,11 @@ _LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
-_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick; sessions that ended before _WHEN have zero force then
+_AT_ONCE = 2 * _T_MS  # an e-stop acts at the next tick; a session that ended before _WHEN has zero force at _WHEN
 _STOP = 8 * _T_MS  # the frame that shows the fault, the STOP, 5 ticks of ramp
 _WATCHDOG = 12 * _T_MS  # theta, 4 ticks with a held force, 5 of ramp, one to notice
 _TESTED = 2 * (12.0 + 120.0)  # the final test of two motors
-_DEAD = 300.0  # the fault shows only after a force has changed by more than 1 N
+_DEAD = 300.0  # the fault is found only after a force has changed by more than 1 N
 _SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, checked every millisecond, then a STOP
 
 _Call = Callable[[Session, int], Said]
@@ -42,19 +42,19 @@ _Call = Callable[[Session, int], Said]
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, the stage it must end in, and words that must be in the cause."""
+    """A fault, and how its session must end."""
 
     name: str
     stage: Stage
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from _WHEN to zero force; None: not measured
-    action: _Call | None = None  # what a person or a faulty controller does
+    action: _Call | None = None  # the action of a person or of a faulty controller
     acts: float = _WHEN  # [s] from arming to the action
     host_stall: float = 0.0  # [s] that the host freezes at _WHEN
-    info: Callable[[Info], Info] | None = None  # changes what the device reports of itself
+    info: Callable[[Info], Info] | None = None  # changes the INFO of the device
     baud: int | None = None
-    continuous: tuple[float, ...] = ()  # [N] that the motors can hold for ever
+    continuous: tuple[float, ...] = ()  # [N] forces that the motors can hold for ever
     coupling: str | None = None
     designed: bool = False  # the coupling is designed for the measured delay, not beforehand
     counted: tuple[str, ...] = ()  # counters that must not be zero
@@ -427,7 +427,7 @@ class _FaultOutcome:
     cause: str
     peak_force_n: float  # of any motor
     peak_speed: float  # [m/s] of any handle
-    zero_force_ms: float | None  # from _WHEN on; None: not measured, or forces go on
+    zero_force_ms: float | None  # from _WHEN on; None: not measured, or never
     allowed_ms: float | None
     wrong: tuple[str, ...]  # empty if all went as required
 
@@ -437,14 +437,14 @@ class _FaultOutcome:
 
 
 def rehearse_faults() -> list[_FaultOutcome]:
-    """Run every case with the default scenario and lively people, in virtual time; some seconds in all."""
+    """Run every case with the default scenario and lively people."""
     scenario = _lively(load())
     made = certified_couplings(scenario, "I", None, None, 1, spare=1)
     return [_rehearse_case(case, scenario, made)[1] for case in CASES]
 
 
 def _lively(scenario: Scenario) -> Scenario:
-    """Let people move at full amplitude soon after arming, so that forces act when a fault comes."""
+    """Let people move at full amplitude soon after arming, so that forces act when a fault begins."""
     people = tuple(
         msgspec.structs.replace(h, voluntary=h.voluntary and msgspec.structs.replace(h.voluntary, ease=0.1, phase=0.8))
         for h in scenario.human
@@ -453,7 +453,7 @@ def _lively(scenario: Scenario) -> Scenario:
 
 
 def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
-    """Return the scenario without a hand at the device that has the fault, while a hand moves the other one."""
+    """Return the scenario without a hand at the faulty device."""
     faulty = 1 if any("axis2:" in fault for fault in case.faults) else 0
     hands = list(scenario.human)
     hands[faulty] = nobody(scenario).human[faulty]
@@ -463,7 +463,7 @@ def _without_hand(scenario: Scenario, case: Fault) -> Scenario:
 def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """Run one case; with `free` nobody holds the faulty device. The couplings `made` cover a delay of one tick."""
+    """Run one case; with `free` nobody holds the faulty device. `made` are couplings for a delay of one tick."""
     info = info_of(scenario)
     scenario = _without_hand(scenario, case) if free and not case.free else scenario
     cap = tuple(d.force_limit for d in scenario.device)
@@ -512,7 +512,7 @@ def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) 
 
 
 def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None, force: float) -> list[str]:
-    """Return what went wrong in a case in which the motors had at most `force` [N]."""
+    """List the requirements that a case violates; `force` [N] is its peak force."""
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:
         wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")
@@ -540,7 +540,7 @@ _MOST_SPEED = 1.0  # [m/s] that no fault may exceed at a free handle
 
 
 def table() -> int:
-    """Print fault x (peak force, peak speed held and free, time to zero, verdict) at the default cap.
+    """Print each fault's peak force, peak speeds of held and free handles, time to zero and verdict.
 
     Returns the number of faults that end in a wrong verdict, or in which a free handle exceeds 1 m/s.
     """

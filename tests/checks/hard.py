@@ -1,7 +1,6 @@
 """Numerically hard loops, each with an integrator setting that holds and, but for one loop, a setting that fails.
 
-tests/sim/test_hard.py and `make validate` measure them. The rule is `default_substeps`, which picks the substeps of an
-integrator.
+The rule is `default_substeps`, which picks the substeps of an integrator.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class _Hard:
     name: str
     scenario: Scenario
     fails: _Setting | None  # a setting that does not hold; None if all of _TRIED hold
-    how: str  # what is wrong with `fails`: "refused", "verdict", "growth" or "position"; no key of `faults` if None
+    how: str  # the fault of `fails`: "refused", "verdict", "growth" or "position"
     coupling: Coupling = PUBLISHED["I"]
     substeps: int | None = None  # RK4 substeps that hold; None: those that the rule picks
 
@@ -48,27 +47,25 @@ class _Row:
     name: str
     exact: float  # [1/s] growth of the exact loop
     fails: _Setting | None
-    fault: str | None  # what was wrong with `fails`, or None
-    off: float | None  # by how much `fails` is wrong; None also if it was refused
+    fault: str | None  # the fault of `fails`, or None
+    off: float | None  # error of `fails`; None if it has no fault or was refused
     rule: int  # RK4 substeps that the rule picks
     substeps: int  # RK4 substeps that hold
     error: float  # [1/s] growth rate with `substeps` less the exact one
-    holds: bool  # whether `fails` fails, `substeps` hold, and the rule is right
+    holds: bool  # whether `fails` fails, `substeps` hold, and the verdict of the rule's substeps is right
 
 
 @cache
 def nominal() -> Scenario:
-    """Return the default scenario for one second, of which hard loops are variants."""
+    """Return the default scenario for one second; the hard loops are variants of it."""
     return load().replace(duration=1.0)
 
 
 def devices(**changes: float) -> Scenario:
-    """Return the nominal loop with other devices."""
     return nominal().replace(device=(CompliantDevice(**changes),) * 2)
 
 
 def hands(mass: float, damping: float, stiffness: float) -> Scenario:
-    """Return the nominal loop with other hands."""
     return nominal().replace(human=(Human((Link(mass, damping, stiffness),)),) * 2)
 
 
@@ -78,7 +75,6 @@ def light(damping: float) -> Scenario:
 
 
 def cases() -> tuple[_Hard, ...]:
-    """Return all hard loops."""
     return (
         _Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
         _Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
@@ -96,7 +92,7 @@ def cases() -> tuple[_Hard, ...]:
 
 
 def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]:
-    """Return what is wrong with a setting, and by how much; empty if the setting holds."""
+    """Return fault -> error of a setting; empty if the setting holds."""
     try:
         _check_substeps(loop, integrator, substeps)
     except InputError:

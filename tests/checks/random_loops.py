@@ -26,12 +26,12 @@ from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import _NOT_EXCITED, disagree, stability_of
 
-_TOO_CLOSE = 1e-4  # share of the damping: a proof needs a margin
+_TOO_CLOSE = 1e-4  # margin below which a proof may fail, as a share of the damping
 _HANDS = Population()
 
 
 def _random_network(rng: np.random.Generator) -> Network:
-    """Return one to three contacts and up to three inner nodes, joined at random, with or without masses and ground."""
+    """Return a network of one to three contacts and up to three inner nodes, joined at random."""
     tips = [f"tip {i}" for i in range(rng.integers(1, 4))]
     names = tips + [f"node {i}" for i in range(rng.integers(0, 4))]
     everywhere, springs = names + (["ground"] if rng.random() < 0.6 else []), {}
@@ -52,7 +52,7 @@ def _delayed(rng: np.random.Generator) -> Loop:
             m = len(network.contacts)
             theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
             return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
-        except ValueError:  # A random network may have a contact without springs and masses, which a network refuses.
+        except ValueError:  # A random network may have a contact without springs and masses.
             continue
 
 
@@ -63,7 +63,7 @@ def _coupling(rng: np.random.Generator, m: int) -> Coupling:
 
 @dataclass(frozen=True)
 class _Proof:
-    """One network whose devices have 0.5 to 1.5 times the required damping."""
+    """The proof for one network; its devices have 0.5 to 1.5 times the required damping."""
 
     number: int
     required: float  # over the available damping
@@ -76,7 +76,7 @@ class _Proof:
 
 
 def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
-    """Yield, for `count` random networks, whether this-environment is proved and what the sweep requires."""
+    """Yield for `count` random networks whether this-environment is proved, and the required damping by the sweep."""
     rng = np.random.default_rng(seed)
     for number in range(count):
         loop = _delayed(rng)
@@ -99,7 +99,7 @@ class _TraceVerdict:
     number: int
     engine: str
     exact_per_s: float  # growth by the eigenvalues
-    trace_per_s: float | None  # growth in the trace, None if the trace gives no rate
+    trace_per_s: float | None  # growth in the trace; None if the trace gives no rate
     verdict: str | None
     reason: str | None
     not_excited: bool
@@ -107,7 +107,7 @@ class _TraceVerdict:
 
 
 def _scenario(rng: np.random.Generator) -> Scenario:
-    """Return a random scenario; in a third of them all delays, devices, hands and motions are alike."""
+    """Return a random scenario; with probability 1/3 all its delays, devices, hands and motions are alike."""
     loop = _delayed(rng)
     m, alike = loop.channels, rng.random() < 1 / 3
     device, human = [], []
@@ -145,7 +145,7 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
         try:
             simulation = assemble(scenario, coupling)
             trace = run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
-        except InputError:  # no number of substeps is enough
+        except InputError:  # No number of substeps is enough.
             continue
         part = stability_of(simulation, trace)
         growth, exact = part.growth_rate_per_s, part.exact_growth_rate_per_s

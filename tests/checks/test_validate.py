@@ -1,4 +1,4 @@
-"""Run every check of verdicts at full length: `make validate`, about ten minutes. `-s` shows the rows."""
+"""Run every check of verdicts at full length (`make validate`, about ten minutes). `-s` shows the rows."""
 
 import shlex
 from importlib import import_module

@@ -16,7 +16,7 @@ PAIRS, TICKS = 50, 500
 @pytest.mark.parametrize("lossless", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
-    """Hands gain at most W0 and what the scene released, at delays of 0 to 3 samples; the shell never acts."""
+    """Hands gain at most W0 and the energy that the scene released, at delays of 0 to 3 samples."""
     rng, acted, worst = np.random.default_rng(7), 0, -np.inf
     for run in range(PAIRS):
         loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))

@@ -1,7 +1,4 @@
-"""Measure how tight this-environment and known-device are: search the worst hand for loops with too little damping.
-
-`make validate` runs the search.
-"""
+"""Measure how tight this-environment and known-device are: search the worst hand for loops with too little damping."""
 
 from __future__ import annotations
 
@@ -37,12 +34,11 @@ def attempts(
 ) -> list[_Attack]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that their condition requires.
 
-    The condition is known-device if the devices have guaranteed bounds, otherwise this-environment. With a negative
-    shortage, which gives the devices more damping than required, the search must fail.
+    The condition is known-device if the devices have guaranteed bounds, otherwise this-environment.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
-        loop = scenario.loop("I")  # the reference does not matter
+        loop = scenario.loop("I")
         condition = KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT
         F, required = loop.F(coupling), np.array(condition.required(loop, coupling).required)
         for short in shortages:
@@ -53,7 +49,7 @@ def attempts(
 
 @dataclass(frozen=True)
 class Shortage:
-    """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
+    """Whether a passive human destabilises a loop whose devices lack a share of the required damping."""
 
     loop: str
     short: float
@@ -65,7 +61,7 @@ class Shortage:
 
     @property
     def holds(self) -> bool:
-        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
+        """Whether the theory holds: with the required damping no human makes the loop unstable."""
         return self.short > 0 or not self.found
 
 
@@ -77,10 +73,7 @@ def shortages(
     theta: tuple[int, int] | None = None,
     name: str = DEFAULT,
 ) -> Iterator[Shortage]:
-    """Attack the loop of a scenario with each of the named couplings at each shortage.
-
-    If an attack succeeds close to the required damping, the condition is tight.
-    """
+    """Attack the loop of a scenario with each of the named couplings at each shortage."""
     scenario = load(name).replace(theta=theta) if theta else load(name)
     for kind in couplings:
         coupling = NoCoupling() if kind == "none" else choose(scenario, "I", kind).coupling

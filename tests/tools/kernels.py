@@ -1,12 +1,11 @@
 """Run the numerical tests under every linear-algebra kernel of this processor, and print a table of the results.
 
-A kernel is a build of OpenBLAS for one kind of processor. Kernels add in different orders and round differently, and
-tests must pass with all of them. Two more settings round differently: NumPy without the instruction sets that it
-chooses at run time, and OpenBLAS with eight threads instead of one.
+A kernel is a build of OpenBLAS for one kind of processor. Kernels round differently, because they add in different
+orders. So do two more settings: NumPy without the instruction sets that it chooses at run time, and eight threads.
 
     python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
-    python tests/tools/kernels.py --one           one foreign kernel, without slow tests (for CI); the commit chooses
-                                                  the kernel, and tests/design or the other folders
+    python tests/tools/kernels.py --one           one other kernel than the native one, without slow tests (for CI); the
+                                                  commit chooses the kernel, and tests/design or the other folders
     python tests/tools/kernels.py --only HASWELL  only this setting
     python tests/tools/kernels.py --list          the settings of this processor
 
@@ -57,8 +56,7 @@ def asked(**variables: str) -> tuple[list[str], list[str], list[str]]:
 def settings() -> dict[str, dict[str, str]]:
     """Return name -> environment variables of every setting that this processor can run, the native kernel first.
 
-    OpenBLAS may have one build for several names, or none for a name; it then silently uses another build. Names
-    whose kernel is already listed are left out.
+    OpenBLAS may silently use one build for several names; only the first of these names is listed.
     """
     blas, have, dispatched = asked()
     every: dict[str, dict[str, str]] = {"native": {}}
@@ -72,24 +70,19 @@ def settings() -> dict[str, dict[str, str]]:
                 there[name], every[kernel] = kernel, {"OPENBLAS_CORETYPE": kernel}
     if dispatched:
         every["NumPy baseline"] = {"NPY_DISABLE_CPU_FEATURES": " ".join(dispatched)}
-    # idle threads sleep after 2^4 cycles; with the usual 2^26 they would take cycles from working threads
+    # Idle threads sleep after 2^4 cycles; with the usual 2^26 they would slow down working threads.
     every["8 threads"] = {"OPENBLAS_NUM_THREADS": "8", "OPENBLAS_THREAD_TIMEOUT": "4"}
     print(f"the native kernel is {' and '.join(sorted(set(blas)))}", flush=True)
     return every
 
 
 def foreign(every: dict[str, dict[str, str]]) -> str:
-    """Return a kernel other than the native one, chosen by the commit's hash; "native" if there is no other.
-
-    The hash is used because a shallow clone has only one commit to count. PRESCOTT, the kernel of processors before
-    2008, takes a fifth longer than the others and is left to the run of every setting.
-    """
+    """Return a kernel other than the native one and the slow PRESCOTT, chosen by the commit's hash, or "native"."""
     others = [name for name in every if name in NEEDS and name != "PRESCOTT"]
     return others[_commit() % len(others)] if others else "native"
 
 
 def _commit() -> int:
-    """Return the hash of the commit as a number, or 0 without a repository."""
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     return int(commit or "0", 16)
 
@@ -131,7 +124,7 @@ def counted(summary: str) -> list[int]:
 
 def main() -> int:
     for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"):
-        os.environ.pop(name, None)  # in the native setting OpenBLAS and NumPy choose, whatever the caller has set
+        os.environ.pop(name, None)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="SETTING")
     parser.add_argument("--one", action="store_true", help="one foreign kernel, without slow tests")

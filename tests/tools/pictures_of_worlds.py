@@ -16,7 +16,6 @@ SIZE = 300, 225
 
 
 def main(file: str) -> None:
-    """Draw the worlds side by side."""
     whole = Image.new("RGB", (len(AT) * SIZE[0], SIZE[1]), "white")
     for i, (name, seconds) in enumerate(AT.items()):
         loop = first_loop(Menu("I"), load(f"world-{name}"), "moving-average")

@@ -1,7 +1,7 @@
 """python tests/tools/regenerate.py: run the commands of README and docs, and write their output where pages ask for it.
 
-`--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output, except for
-measured times, with that on the pages. The exit code is 1 if they differ.
+`--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output with that on
+the pages (`same_line`). The exit code is 1 if they differ.
 
     <!-- output: certified|binds -->      lines that match this regular expression; <!-- output --> shows all lines
     ```console
@@ -13,8 +13,7 @@ measured times, with that on the pages. The exit code is 1 if they differ.
     $ python -m sim.accuracy
 
 A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
-`<!-- picture: FROM TO -->` keeps a picture that a command has drawn.
-tests/project/test_docs.py runs the same steps and compares all but slow and measured output.
+`<!-- picture: FROM TO -->` copies a picture that a command has drawn. tests/project/test_docs.py compares the rest.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def steps(text: str) -> Iterator[Step]:
 
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a documented command in a terminal of 100 columns."""
+    """Run a documented command, for a width of 100 columns."""
     here = ("examples/", "tests/")
     words = [str(ROOT / w) if w.startswith(here) else w for w in shlex.split(command, comments=True)]
     shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
@@ -80,7 +79,7 @@ def kept(output: str, pattern: str | None) -> str:
 
 
 def renewed(text: str, printed: dict[str, str]) -> str:
-    """Return the page with the output of its commands."""
+    """Return a page with the output `printed` by its commands."""
 
     def shown(block: re.Match[str]) -> str:
         return block[1] + kept(printed[block[3]], block[2]) if block[3] in printed else block[0]
@@ -91,11 +90,11 @@ def renewed(text: str, printed: dict[str, str]) -> str:
 
 
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
-#: figures that depend on the machine: seconds, speeds, costs, and the last column of a table (times, rounding)
+#: figures that depend on the machine: seconds, speeds, costs, and the last column of a table
 _TIMES = re.compile(
     r"[\d.]+(?= s\b| x real time| simulated seconds per)|(?<=raw steps )[\d.]+|(?<=clipped )[\d.]+|[^│]*│$"
 )
-_ROUNDING = 1e-6  # a smaller error may be rounding, which depends on the machine
+_ROUNDING = 1e-6  # smaller errors may be rounding, which depends on the machine
 
 
 def same_line(shown: str, line: str, measured: bool = False) -> bool:
@@ -105,7 +104,7 @@ def same_line(shown: str, line: str, measured: bool = False) -> bool:
     """
     if measured:
         shown, line = _TIMES.sub("", shown), _TIMES.sub("", line)
-    shown, line = " ".join(shown.split()), " ".join(line.split())  # a column is as wide as its widest number
+    shown, line = " ".join(shown.split()), " ".join(line.split())
     if _NUMBER.sub("#", shown) != _NUMBER.sub("#", line):
         return False
     pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(line), strict=True)
@@ -122,7 +121,6 @@ def _close(shown: str, number: str, measured: bool) -> bool:
 
 
 def check() -> int:
-    """Run the slow and the measured commands, and print the lines of pages that differ from their output."""
     found, printed = 0, {}
     with TemporaryDirectory() as place:
         for page in PAGES:
@@ -148,7 +146,6 @@ def check() -> int:
 
 
 def main() -> int:
-    """Run the commands of every page that shows output, and rewrite the pages whose output has changed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
     parser.add_argument(

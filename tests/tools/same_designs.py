@@ -2,9 +2,8 @@
 
     python tests/tools/same_designs.py
 
-Each of six couplings is designed on an idle machine, under load, and in three simultaneous processes,
-one of which is pinned to one core.
-The exit code is 1 if a file differs. Designs run through the public command, so each file is what a user stores.
+Each coupling is designed on an idle machine, under load, and in three simultaneous processes, one of which is pinned to
+one core. The exit code is 1 if a file differs.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ DESIGNS = {
 
 
 def begun(words: tuple[str, ...], out: Path, core: int | None = None) -> subprocess.Popen[bytes]:
-    """Start a design that stores its coupling in `out`, on the core `core` unless None."""
+    """Start a design that stores its coupling in `out`; `core` pins it to a core."""
     command = [sys.executable, "-m", "design", *words, "--out", str(out)]
     pinned = None if core is None else (lambda: os.sched_setaffinity(0, {core}))
     return subprocess.Popen(command, cwd=ROOT, preexec_fn=pinned, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -60,7 +59,7 @@ def files(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
     """Return the file that the design stores under each condition of the machine."""
 
     def made(*names: str, core: int | None = None) -> dict[str, bytes]:
-        """Return the files of one process per name, all at once, the last on the core `core` unless None."""
+        """Return the files of simultaneous processes, one per name; `core` pins the last one to a core."""
         outs = [folder / f"{name}.json" for name in names]
         cores = [*[None] * (len(names) - 1), core]
         begins = [begun(words, out, core) for out, core in zip(outs, cores, strict=True)]
