@@ -3,32 +3,24 @@
     EnergyBudget        scales forces before the delays, at the port of the devices
     Shell               scales forces at the port of the environment, behind a coupling certified for any environment
 
-*The guarantee of the budget.* A device of guaranteed damping Delta with its passive hand has
-sum -a'dx >= sum dx' Delta dx/T - E0, where E0 is the energy stored at the start. Here a[k] is the force that acts in
-[kT, (k+1)T), the device feels -a[k], and dx[k] = x[k+1] - x[k]. The budget leaves a share eps (`EPS`) of the damping
-unused. Let Delta be diagonal (a matrix is first turned to its principal axes), and Delta' = (1 - eps) Delta =
-diag(delta'). On vectors, ' is the transpose. The budget computes
+*The budget.* a[k] is the force that acts in [kT, (k+1)T), the device feels -a[k], and dx[k] = x[k+1] - x[k]. The budget
+leaves a share eps (`EPS`) of the guaranteed damping Delta unused. Let Delta be diagonal (a matrix is first turned to
+its principal axes), and Delta' = (1 - eps) Delta = diag(delta'). On vectors, ' is the transpose. The budget computes
 
     W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
 
-By completing a square, a tick changes W by at least -r(a) for every dx, with r(a) = sum_i T a_i^2/(4 delta'_i). Let R
-be the sum of the losses r of all forces that are sent but have not acted. If R <= W, then W remains nonnegative until
-they have acted. A packet is sent as s times the wanted force, with the largest s in [0, 1] for which R <= W. Such an s
-exists at every tick: a tick with force a lowers R by r(a), and W by at most r(a), so that s = 0 is allowed. So
-W >= 0 always. The cap only lowers W, hence sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick. Beyond the
-energy that the devices dissipate, devices and hands receive at most W0, and
-sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
+A tick with force a lowers W by at most its loss r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the sum of the losses of
+all forces that are sent but have not acted. A packet is sent as s times the wanted force, with the largest s in [0, 1]
+for which R <= W. Then W >= 0 always, and beyond the energy that the devices dissipate, devices and hands receive at
+most W0.
 
 *Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost. After that the
 device must set its force to zero. The largest loss of tick t is the largest r of these packets, channel by channel, and
 R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
 it, and a tick without a report counts with its largest loss.
 
-*Encoder steps.* Positions rounded to steps q have errors e, |e| <= q/2. Let de be the change of e in a tick, and a_-
-the force of the previous tick. By summation by parts, the sum of a de until a tick with force a[n] is at most
-q/2 (|a[n]| + sum |a - a_-|) per channel, and |a[n]| = sum (|a| - |a_-|). |dx| is at least the measured |dx| minus q. So
-a tick with the measured dx adds a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel to W.
-The largest loss of the tick is r(a) + 2 q |a|. The argument above holds with this increment and this loss.
+*Encoder steps.* Positions are rounded to steps q. A tick with the measured dx, after a tick with the force a_-, adds
+a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel to W. Its largest loss is r(a) + 2 q |a|.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
 that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
@@ -315,9 +307,8 @@ class Shell(_Net):
 
     W[k+1] = W[k] + f'(u - u_-), where u_- is u of the previous tick, and f = s f_wanted with the largest s in [0, 1]
     for which W[k+1] >= 0. V responds within the tick by its direct part D_V: u = u0 - D_V f, where u0 is u for f = 0.
-    So W[k+1] is a concave parabola in s, nonnegative at 0, and s is its upper root, or 1 if the root is larger. Then
-    sum f'(u - u_-) >= -W0 at every tick, so the environment is passive. With a coupling that is certified for any
-    environment and psi = 0 the loop is safe. A tick is a call of `free`, then of `limit`.
+    Then sum f'(u - u_-) >= -W0 at every tick. With a coupling that is certified for any environment and psi = 0 the
+    loop is safe. A tick is a call of `free`, then of `limit`.
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, nsim: int = 1) -> None:

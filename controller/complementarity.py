@@ -39,11 +39,7 @@ class _Problem(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class Complementarity(_Problem):
-    """Wall forces p: p >= 0, M p - q >= 0, p'(M p - q) = 0. There is one solution for every q if M is a P-matrix.
-
-    Raises:
-        SingularLoop: A principal minor of M is not positive.
-    """
+    """Wall forces p: p >= 0, M p - q >= 0, p'(M p - q) = 0. Raises SingularLoop unless M is a P-matrix."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "M", frozen(self.M, 2))
@@ -174,10 +170,8 @@ class BoxProblem(_Problem):
     def _pivoted(self, q: Array) -> Array:
         """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
 
-        The sign of a force is 1 at its upper limit, -1 at its lower limit, and 0 between them.
-        Changing only the first wrong sign terminates for every P-matrix M: index n changes only when all others are
-        right for its present sign, so that, by uniqueness, it has each of its three signs at most once. Between two of
-        its changes the same holds for index n - 1, and so on.
+        The sign of a force is 1 at its upper limit, -1 at its lower limit, and 0 between them. Changing only the first
+        wrong sign terminates for every P-matrix M (docs/theory.md, "Forces that are limited").
         """
         n, k = q.shape
         M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)

@@ -157,10 +157,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         _correction(self)
 
     def at(self, T: Number) -> Lti:
-        """Return E(z) in the arithmetic of T, with the correction of D that makes it provably passive.
-
-        Raises ValueError for another period.
-        """
+        """Return the provably passive E(z) in the arithmetic of T. Raises ValueError for another period."""
         if float(T) != self.T:
             raise ValueError(f"block: its numbers are for T = {self.T:g} s, the loop has {float(T):g} s")
         A, B, C, D = (numbers(part, T) for part in self._arrays())

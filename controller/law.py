@@ -17,24 +17,22 @@ from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
-# Walls are springs that push and never pull, so that contacts begin and end.
+# Walls are springs that push and never pull, so that contacts begin and end (docs/theory.md).
 #
 # Let y be the displacement across a wall of stiffness K and damping B, and d = y - gap the depth. The wall's force is
 #
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
-# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. The wall
-# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall equals a
-# spring-damper between the same nodes, except for the constant force of its gap.
+# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a). A touching wall equals a spring-damper
+# between the same nodes, except for the constant force of its gap.
 #
 # The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
-# coupling respond within the tick: y = y_free - D p, where y_free is y for p = 0, and -D is the feedthrough. This
-# algebraic loop is the linear complementarity problem
+# coupling respond within the tick: y = y_free - D p, where y_free is y for p = 0, and -D is the feedthrough. The forces
+# solve the linear complementarity problem
 #
 #         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
 #
-# whose matrix has positive principal minors, since D is positive semidefinite for a passive environment and coupling.
-# So there is exactly one solution. The code tries every set of touching walls.
+# which has exactly one solution, since D is positive semidefinite for a passive environment and coupling.
 
 
 Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)

@@ -126,10 +126,7 @@ class Lti(ReadOnly):
 
     @classmethod
     def with_rest(cls, A: Array, B: Array, R: Array, static: Array, T: Number) -> Self:
-        """Return G = static + (R - R z)(z I - A)^-1 B, for which G(1) = static and C (I - A)^-1 = R are known.
-
-        For a fixed R the matrices of the block are affine in A, B and G(1).
-        """
+        """Return G = static + (R - R z)(z I - A)^-1 B, for which G(1) = static and C (I - A)^-1 = R are known."""
         block = cls(A, B, R - R @ A, static - R @ B, T)
         block.__dict__["_rest"] = static, R
         return block
@@ -202,10 +199,7 @@ class Lti(ReadOnly):
         return G.transpose(2, 0, 1).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """Return C (z I - A)^-1 B, shape (p, m, points).
-
-        Delay lines at the outputs are not part of the core: their states are core states times powers of 1/z.
-        """
+        """Return C (z I - A)^-1 B, shape (p, m, points). Delay lines add their heads times powers of 1/z."""
         core, lines = self._lines
         p, m = self.outputs, self.inputs
         spend(_response_cost(core.size, m, points.size))
@@ -379,14 +373,10 @@ class Lti(ReadOnly):
         return np.append(eigenvalues, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:
-        """Return whether every pole lies strictly inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
     def split_at_one(self) -> tuple[Array, Lti]:
-        """Return G(1) and (G(z) - G(1))/(z - 1), which is G/(z - 1) without its pole at z = 1 and stable if G is.
-
-        Raises SingularLoop if A has the eigenvalue one.
-        """
+        """Return G(1) and (G(z) - G(1))/(z - 1), stable if G is. Raises SingularLoop if A has the eigenvalue one."""
         static, R = self._rest
         return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
@@ -448,10 +438,7 @@ class Lti(ReadOnly):
         return _with_parts(some, lambda: tuple(part[..., which, :] for part in self._rest))
 
     def feedback(self, other: Lti) -> Lti:
-        """Return (I + G H)^-1 G: this block G with H = `other` in negative feedback.
-
-        Raises SingularLoop if I + D_G D_H cannot be inverted.
-        """
+        """Return (I + G H)^-1 G with H = `other`. Raises SingularLoop if I + D_G D_H cannot be inverted."""
         T = _common_period(self, other)
         S = inverse(eye(self.outputs, T) + times(self.D, other.D))
         # y = S (C x - D_G C_H h + D_G u) is the input of the feedback block, whose state is h
@@ -582,7 +569,6 @@ def _entries(G: Complex) -> tuple[tuple[Complex, Complex], tuple[Complex, Comple
 
 
 def _matrix(*rows: Sequence[Complex]) -> Complex:
-    """Return 2 x 2 matrices over the last two axes from their entries."""
     out = np.empty((*np.broadcast_shapes(*(entry.shape for row in rows for entry in row)), 2, 2), dtype=np.complex128)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):

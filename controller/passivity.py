@@ -182,7 +182,6 @@ def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
 
 
 def _size(M: NDArray[np.inexact[Any]]) -> Array:
-    """Return the Frobenius norm of each matrix."""
     return np.linalg.norm(M, axis=(1, 2))
 
 

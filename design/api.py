@@ -106,10 +106,7 @@ def instead(
     condition: str | Condition | None = None,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> str:
-    """Return certified alternatives to a failed design in words, least rms mismatch first, or "" if there are none.
-
-    With varying delays no alternative is tried.
-    """
+    """Return certified alternatives to a failed design in words, least rms mismatch first, or "" if there are none."""
     failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for i, (other, target, options) in enumerate(_QUICK):
         if (other, target) == failed or loop.varying_delay:

@@ -390,7 +390,6 @@ def _by_its_own_block(
 def _rows(
     condition: LimitedForces | LimitedKnownDevice, loop: Loop, requirement: Requirement
 ) -> tuple[tuple[Any, ...], ...]:
-    """Return the weights c of a limiter's requirement, one row per device."""
     plain = condition.limiter if isinstance(condition, LimitedKnownDevice) else condition
     return plain.rows(loop, requirement.multiplier or ())
 
@@ -500,7 +499,6 @@ class Guarantee:
 
     @property
     def any_environment(self) -> bool:
-        """Whether the guarantee holds for every passive environment."""
         return self.environments == ANY
 
     @property
@@ -587,7 +585,6 @@ class Assessment:
 
     @property
     def decisive(self) -> Requirement:
-        """The requirement of the condition that must hold."""
         return self.requirements[self.condition]
 
     @property
@@ -599,7 +596,6 @@ class Assessment:
 
     @property
     def gains(self) -> dict[str, Any]:
-        """Order and gains of the coupling (Coupling.figures)."""
         return self.coupling.figures(self.loop.T)
 
     @property

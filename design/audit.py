@@ -299,10 +299,7 @@ class _Remedy:
 
 
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower the requirement by more than 10 %.
-
-    Return [] if the coupling is certified, or if the condition cannot be evaluated in varied loops (`not_varied`).
-    """
+    """Return single changes that certify the coupling or lower the requirement by more than 10 %."""
     resolved, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []

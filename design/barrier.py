@@ -300,10 +300,7 @@ def _solved(hessian: Array, right: Array) -> Array:
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """Return the step length that minimises the barrier function and leaves at least _KEPT of every eigenvalue of S.
-
-    So the points stay away from the boundary, where Newton's method would be slow.
-    """
+    """Return the step length that minimises the barrier function and leaves at least _KEPT of every eigenvalue of S."""
     along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
     residual, slope = program.A @ x - program.b, program.A @ step
     linear, square = 2 * t * residual @ slope + t * program.c @ step, 2 * t * slope @ slope

@@ -1,18 +1,15 @@
 """Compute a lower bound on the transparency error of all linear couplings that this-environment certifies.
 
-python -m design prints it for an optimal coupling. By weak duality every dual feasible point gives a lower bound.
+python -m design prints it for an optimal coupling. The bounded couplings may have any order. docs/theory.md has the
+derivation ("Every linear coupling is a filter"): every dual feasible point gives a lower bound.
 
-The coupling may have any order. The bound uses only one property of a certified F: P(z) = Delta + T F(z)/(z-1) is
-analytic outside the unit circle with He P >= 0 there. So S = He P = sum_k s_k z^-k is a positive matrix measure on the
-circle with s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because
-no force has arrived yet).
-Let <X, Y> be the mean of Re tr X*Y over the circle, and rho(w) the weight with which J = <M, rho M> is the mean square
-of the relative mismatch over the band, M = F - Lambda E. Any H(z) that vanishes outside the band has
-|M|^2 rho >= 2 Re tr H*M - |H|^2/rho, so that
-    J  >=  2 <H, F> - 2 <H, Lambda E> - <H, H/rho>.
-F's coefficients are differences of the s_k. Choose C_k that weigh only the zero combinations, such that
+For a certified F, S = He P of P(z) = Delta + T F(z)/(z-1) is a positive measure sum_k s_k z^-k on the circle, and
+s_0 = Delta. The delays make some combinations of the first s_k zero (row i for 1 <= k <= theta_i, because no force has
+arrived yet). Let <X, Y> be the mean of Re tr X*Y over the circle, and rho(w) the weight with which J = <M, rho M> is
+the mean square of the relative mismatch over the band, M = F - Lambda E. Let H(z) vanish outside the band, and let C_k
+weigh only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
-Then 2 <H, F> + tr C_0 Delta = <D, S> >= 0, so that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With
+Then <D, S> >= 0 means that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With
 H = rho |E| h this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded

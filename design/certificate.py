@@ -170,7 +170,6 @@ def _proof(
 
 
 def _placed(place: str, reason: str) -> str:
-    """Return the reason with the place as its beginning."""
     return f"{place}{reason.removeprefix(place)}"
 
 
@@ -184,10 +183,7 @@ def judged(
 
 
 def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
-    """Return the requirement, with `proof` = "rational" if an exact proof was found.
-
-    If exact arithmetic contradicts the sweep, the requirement becomes infinite.
-    """
+    """Return the requirement with the result of an exact proof: `proof` = "rational", or infinite if refuted."""
     if not needs.certified:
         return needs
     try:
@@ -227,7 +223,6 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
 
 
 def _coefficients(value: Any) -> Iterator[float]:
-    """Yield every float in plain data."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, dict | list | tuple):

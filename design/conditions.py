@@ -133,10 +133,7 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Dema
 
 
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
-    """Return the largest shortage of passivity of E-hat + Phi [N s/m] by a sweep, and its frequency w [rad/sample].
-
-    The shortage is positive if phi (m,) is too small.
-    """
+    """Return the largest shortage of passivity of E-hat + Phi [N s/m] by a sweep, and its frequency w [rad/sample]."""
     demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
     block = demand.free + demand.gain
 
@@ -387,7 +384,6 @@ class Condition(ABC):
         return f"only the block of {self.name} is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
-        """Return `claim` if the condition holds, otherwise the shortfall."""
         return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:
@@ -567,11 +563,9 @@ def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     return values
 
 
-# Encoder steps under Coulomb friction
-#
-# Encoder errors n with |n_j| <= q_j/2 change the force F x to F (x + n) = F x + w. Here |w_i| <= W_i = sum_j |F_ij|_1
-# q_j/2, where |F_ij|_1 is the sum of the absolute values of the impulse response. In a tick w does the work w'dx <=
-# sum_i W_i (integral of |v_i|), with the encoder's speed v_i. Coulomb friction of at least W_i there dissipates it.
+# Encoder steps under Coulomb friction (docs/theory.md): errors of at most q_j/2 change the force by |w_i| <= W_i, where
+# W_i = sum_j |F_ij|_1 q_j/2 and |F_ij|_1 is the sum of the absolute values of the impulse response. Coulomb friction of
+# at least W_i dissipates the work of w.
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends

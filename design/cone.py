@@ -206,11 +206,7 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 
 
 def _columns(shape: tuple[int, int], starts: Any, rows: Any, values: Array) -> Any:
-    """Return a sparse matrix with the attributes of a scipy.sparse.csc_matrix that Clarabel reads.
-
-    Column j has the entries values[starts[j] : starts[j + 1]], whose rows are at the same places of `rows`. The import
-    of scipy.sparse would take 0.1 s.
-    """
+    """Return the matrix as far as Clarabel reads it, without the import of scipy.sparse, which would take 0.1 s."""
     return SimpleNamespace(shape=shape, indptr=starts, indices=rows, data=values, has_canonical_format=True)
 
 
@@ -232,10 +228,7 @@ _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 
 def _stacked(problem: ConeProgram) -> ConeProgram:
-    """Return the same problem with one stack for all 1 x 1 blocks, and one for each size and set of unknowns.
-
-    An iteration takes the time of some twenty calls of NumPy for each stack.
-    """
+    """Return the problem with few stacks: one for all 1 x 1 blocks, and one for each size and set of unknowns."""
     stacks: dict[tuple[int, tuple[int, ...]], list[Inequality]] = {}
     for block in problem.blocks:
         unknowns, by = tuple(block.unknowns), block.slopes
@@ -292,11 +285,7 @@ def _moved(parts: _Parts, step: float, change: _Parts) -> _Parts:
 
 
 class _Newton:
-    """The linearised equations at (S, Z), with the residuals `missing` of the blocks and `wrong` of the costs.
-
-    Raises:
-        LinAlgError: S, Z or the equations are singular to rounding.
-    """
+    """The linearised equations at (S, Z), with residuals. Raises LinAlgError if they are singular to rounding."""
 
     def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
         self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
@@ -315,10 +304,7 @@ class _Newton:
             raise np.linalg.LinAlgError("the equations of a step are singular to rounding")
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
-        """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I; no step is longer than 1.
-
-        `left` is the second-order term dZ dS.
-        """
+        """Return (dx, dS, dZ, longest step in S, longest step in Z) towards S Z = mu I; `left` is the term dZ dS."""
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
         dx = self._scale * self._lapack.dpotrs(self._factor, self._scale * right)[0]
         blocks = zip(self._problem.blocks, self._missing, strict=True)
@@ -352,7 +338,6 @@ def _adjoint(X: Any) -> Any:
 
 
 def _product(X: Any, Y: Any) -> float:
-    """Return the inner product of Hermitian matrices."""
     return float(np.real(np.vdot(X, Y)))
 
 

@@ -63,7 +63,6 @@ class Stored(Strict, frozen=True):
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
-        """Return the stored form of a coupling in its loop."""
         stored = cls(loop, coupling.form(), certificate)
         filed(loop, coupling)
         return stored

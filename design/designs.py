@@ -67,7 +67,6 @@ _OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # for a user's own fu
 
 
 def kind_of(name: str) -> _Kind:
-    """Return the kind of that name, or _OWN for a user's own function."""
     return KINDS.get(name, _OWN)
 
 
@@ -332,6 +331,5 @@ def _with_less_damping(
 
 
 def _scaled(loop: Loop, share: float) -> dict[str, Any]:
-    """Return the fields of a loop with this share of the damping."""
     levels = loop.levels and tuple(tuple(tuple(share * v for v in row) for row in level) for level in loop.levels)
     return {"delta": tuple(share * d for d in loop.delta), "levels": levels}

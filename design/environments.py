@@ -325,10 +325,7 @@ class _Search:
 
 
 class ThisEnvironment(Multiplied):
-    """Stability for every passive hand in the loop's environment, with the loop's facts (design.facts).
-
-    The facts are walls that make and break contact and delays that switch. The members of ranges are proved one by one.
-    """
+    """Stability for every passive hand in the loop's environment, with walls and delays that switch (design.facts)."""
 
     name, covers = "this-environment", BEYOND
 
@@ -344,9 +341,8 @@ class ThisEnvironment(Multiplied):
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """Return the first values of each multiplier in a search.
 
-        For a map G, alpha (`Switching`) is half the width of a device's range of delays times the largest gain from its
-        displacement to its force. With more than MULTIPLIER_ROWS/2 channels, alpha is the best of _SHARES times this
-        value.
+        alpha (`Switching`) is half the width of a device's range of delays times the largest gain of the map G from its
+        displacement to its force. With more than MULTIPLIER_ROWS/2 channels it is the best of _SHARES times this value.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -499,9 +495,8 @@ def _half_widths(loop: Loop) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The condition limiter: forces are sent through the limiter of controller.law. With rho = 0 the limiter and a passive
-# environment together are passive. So any-environment covers limited forces without a further proof. This does not
-# hold if the environment has a delay.
+# The condition limiter: forces are sent through the limiter of controller.law. any-environment with psi = 0 covers
+# limited forces without this condition, with rho = 0 (docs/theory.md).
 
 BETA = 0.01  # default rho of a limiter under this-environment, relative to the device's least damping over T
 
@@ -677,7 +672,6 @@ class _AnyEnvironment(Multiplied):
     """Theorem 4 of the paper: stability in every passive environment, or for psi >= 1 in the loop's environment only.
 
     For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only.
-    A latency and switching delays use the block of design.facts.compose_any.
     """
 
     name, source = "any-environment", "the paper's Theorem 4"
@@ -761,7 +755,6 @@ class _AnyEnvironment(Multiplied):
         return any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, demand)
 
     def _without(self, coupling: Coupling) -> str:
-        """Return the reason why a coupling without V(z) is refused."""
         if coupling.holds_model:
             return "the coupling contains a model of the environment; Theorem 4 covers only couplings without one"
         return "Theorem 4 needs a coupling with a compliance V(z), and the loop has none"

@@ -63,7 +63,6 @@ class Matrix:
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def fractions(self) -> NDArray[np.object_]:
-        """Return a (p, m) array of Fraction."""
         return np.array([[Fraction(int(v), self.den) for v in row] for row in self.num], dtype=object).reshape(
             self.shape
         )
@@ -85,10 +84,7 @@ _FEW = 20_000
 
 
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
-    """Return the exact product X' M X, (m, m), of Python integers X (n, m) and M (n, n). FLINT computes large products.
-
-    Raises TooLong if the budget of controller.arithmetic.within is spent.
-    """
+    """Return the exact product X' M X (m, m) of integers X (n, m) and M (n, n). Raises TooLong as `spend` does."""
     (n, m) = X.shape
     products = n * m * (n + m)
     spend(products * (_LIMBS + _BIT * (_longest(X) + _longest(M))))
@@ -165,12 +161,10 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 
 # ----------------------------------------------------------------------------------------------------
-# These functions prove that a symmetric rational matrix S is positive definite. A proof takes a few matrix products.
-#
-# For any square matrix R, R'SR > 0 implies S > 0: x = R y reaches every x, because R'SR could not be definite with a
-# singular R. R is the inverse of the Cholesky factor of S in floating point, rounded to binary fractions. R'SR is then
-# nearly the identity, and an exact product shows that its diagonal dominates its rows (Gershgorin). Elimination would
-# be exact, too, but its numbers grow with every pivot.
+# These functions prove that a symmetric rational matrix S is positive definite, by a few matrix products. R'SR > 0
+# implies S > 0 for any square R. R is the inverse of the Cholesky factor of S in floating point, rounded to binary
+# fractions. R'SR is then nearly the identity, and an exact product shows that its diagonal dominates its rows
+# (Gershgorin). Elimination would be exact, too, but its numbers grow with every pivot.
 
 
 _BITS = 192  # binary places to which a matrix is rounded before the test of its definiteness
@@ -291,11 +285,11 @@ def _whitening(W: Array) -> _Integers | None:
 # ----------------------------------------------------------------------------------------------------
 # Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, and exact arithmetic tests P.
 #
-# Kalman-Yakubovich-Popov: if P > 0 and
+# By the Kalman-Yakubovich-Popov lemma (docs/theory.md, "What an exact proof is") G is strictly positive real if P > 0
+# and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
-# then A is stable (x'Px falls along x+ = Ax, by the first block) and He G > 0 on the unit circle, because
-# [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. P may be rounded, because any P that satisfies both
-# inequalities is a proof. The errors of all other rounding are bounded and subtracted.
+# P may be rounded, because any P that satisfies both inequalities is a proof. The errors of all other rounding are
+# bounded and subtracted.
 
 
 _MOST_BITS = 4000  # largest number of bits of a stored P's common denominator; the package stores a few hundred

@@ -81,7 +81,6 @@ class ExportedBlock:
 
     @property
     def dtype(self) -> type[np.floating]:
-        """The type of every number in the file."""
         return np.float32 if self.single else np.float64
 
 
@@ -176,11 +175,7 @@ def trial(block: ExportedBlock) -> _Trial:
 
 
 def single_precision_error(block: ExportedBlock) -> tuple[float, float]:
-    """Compare single with double precision over 4096 ticks of normally distributed inputs.
-
-    Returns:
-        The largest difference and the largest output, in the unit of the output.
-    """
+    """Return the largest difference of single from double precision, and the largest output, over _COMPARED ticks."""
     rng = np.random.default_rng(0)
     inputs = block.input.size * rng.standard_normal((_COMPARED, block.system.inputs))
     double, single = (_sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
@@ -227,10 +222,7 @@ def _sequential(
 
 
 def _box_matrix(limiter: Limiter) -> Array:
-    """Return M of the box problem (m, m).
-
-    For a free environment M is singular, and GROUNDED times the largest diagonal entry is added to the diagonal.
-    """
+    """Return M of the box problem (m, m); if it is singular, a small diagonal (GROUNDED) is added."""
     problem = limiter.problem
     assert isinstance(problem, BoxProblem)
     M = problem.M
@@ -827,7 +819,6 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
 
 
 def _add_limiter(words: dict[str, Any], block: ExportedBlock, limiter: Limiter) -> None:
-    """Add the limiter's tables and functions to the words of the C file."""
     name, dtype = block.name, block.dtype
     integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
     if limiter.balls:

@@ -262,10 +262,7 @@ class Collected(Generic[Block]):
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Return (block from inputs to [dx; dp; steps added to f_e; delayed inputs], numbers of the delayed inputs).
-
-        dp are the steps of the walls' forces.
-        """
+        """Return (block from inputs to [dx; steps of walls' forces; steps added to f_e; late inputs], late inputs)."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -579,10 +576,7 @@ class PeriodCost(NamedTuple):
 
 
 class KnownMotor(HandsSide):
-    """The form f'(dx + beta dv) + L of devices whose motors and transmissions have known bounds (Theorem B).
-
-    v is the speed at the beginning of a period, and L is a `PeriodCost`.
-    """
+    """The form f'(dx + beta dv) + L of Theorem B, with the speed v at a period's beginning and the `PeriodCost` L."""
 
     def __init__(self, cost: PeriodCost, beta: Any) -> None:
         self.cost, self.beta = cost, beta
@@ -675,11 +669,10 @@ class Walls(Fact):
 class Switching(Fact):
     """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
-    A force that is late by n in [lo, hi] differs by an error from the mean of the forces late by lo and by hi. With
-    h = (hi - lo)/2 the squared errors add up to at most h^2 times the squared steps df_e of the force. So their work on
-    the displacement dq that the force multiplies is at least the sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha). The last
-    term is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes of a
-    device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
+    With h = (hi - lo)/2 the errors of the force do at least the work of the sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha)
+    on the displacement dq that the force multiplies, where df_e are the steps of the sent force (docs/theory.md). The
+    last term is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes
+    of a device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:

@@ -92,7 +92,6 @@ class _FixedOrder:
         return Lti.with_rest(A, B, self.F, V1 + np.triu(V1, 1).T, 1.0)
 
     def coupling(self, p: Array) -> Lti:
-        """Return V in SI units [m/N]."""
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
@@ -223,10 +222,7 @@ _LEAST, _MOST = 0.1, 1.99  # bounds of the eigenvalues of Q and U in a step from
 
 
 def _descend(family: _FixedOrder, p: Array, norm: float) -> Iterator[Array]:
-    """Yield the couplings of successive steps from the strictly feasible coupling p, whose norm is `norm`.
-
-    The descent ends when Q or U is singular to rounding, because the coupling is then on the boundary.
-    """
+    """Yield successive couplings from the strictly feasible p with the norm `norm`, until Q or U is singular."""
     Q = np.linalg.inv(_passivity_storage(family, p))
     U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     while not _singular(Q, U):

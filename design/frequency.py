@@ -176,20 +176,17 @@ _OFFSETS = np.concatenate([-_OFFSETS, _OFFSETS])  # distances of frequencies fro
 
 @lru_cache(maxsize=64)
 def _spaced(low: float, high: float, points: int) -> Array:
-    """Return frequencies, half of them evenly spaced in w and half in log w."""
     return frozen(np.concatenate([np.linspace(low, high, points), np.geomspace(low, high, points)]), 1)
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
     """Return a bound of the rounding error in the response of y = C x + D u, x+ = A x + B u, at all z (k,).
 
-    A tick in double precision is an exact tick of a system with slightly different coefficients. Their relative errors
-    are at most (2n + 8) 2^-53 for n states and up to n + 8 inputs. The differences between G and a system `meant` with
-    the same states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
-    |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. This bound is large if big terms cancel.
-
-    The difference between the responses of G and `meant` would be less useful: it is large as soon as a sharp peak
-    moves by its own width.
+    A tick in double precision is an exact tick of a system whose coefficients have relative errors of at most
+    (2n + 8) 2^-53, for n states and up to n + 8 inputs. The differences between G and a system `meant` with the same
+    states are added. With R = (zI - A)^-1 the errors dA, dB, dC, dD change the response by at most
+    |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|. The difference between the two responses would not do instead: it is
+    large as soon as a sharp peak moves by its own width.
     """
     part = (2 * G.order + 8) * 2.0**-53
     dA, dB, dC, dD = (
@@ -311,7 +308,6 @@ def _reach(bracket: Array) -> Array:
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:
-    """Return z = exp(j w)."""
     return np.exp(1j * w)
 
 

@@ -221,10 +221,7 @@ class SampledLoop:
         return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """Return the Hermitian part of the block: upper left (k, m, m), lower left, diagonal of the lower right.
-
-        The shapes of the last two are (k, active, m) and (k, active).
-        """
+        """Return He of the block: upper left (k, m, m), lower left (k, active, m), lower right's diagonal."""
         G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu
@@ -305,10 +302,7 @@ def _slsqp(
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """Return the first channel of each device, and a matrix (m, m) of means over the axes of each device.
-
-    The matrix maps one number per channel to the mean over the channel's device, whose axes share c or alpha.
-    """
+    """Return the first channel of each device, and a matrix (m, m) of means over the axes of each device."""
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
 
@@ -460,10 +454,7 @@ _SAME = 1e-3  # Two results of a search are one local optimum if no entry of x d
 
 
 def _optimum(sampled: SampledLoop, start: SpringDamper, known: Sequence[Array]) -> tuple[Array | None, int]:
-    """Return (x of a local optimum that passes the refined sweep, number of searches).
-
-    x is None if no such optimum was found, or if it is one of the `known` optima.
-    """
+    """Return (x of a new local optimum that passes the refined sweep, or None; number of searches)."""
     x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
         x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)])

@@ -279,13 +279,10 @@ def _exact_cost(
 
 # ----------------------------------------------------------------------------------------------------
 # The required damping is s Delta, with the least s for which some beta and multipliers make the block positive. The
-# bounds of mass and transmission do not scale with s.
-#
-# L is the least value of an integral that is linear in c0 and c2. Since c0 and c2 are concave in (s, beta), so is L.
-# The other entries are affine in beta and in the multipliers, except for switching delays. Their entries are concave in
-# beta and 1/alpha after the rows of their inputs w (facts.Switching) are divided by alpha.
-# A tangent of a concave block bounds the block from above. The tangents at the binding frequencies form a linear matrix
-# inequality, whose least s bounds the required s from below.
+# bounds of mass and transmission do not scale with s. L is concave in (s, beta). The other entries are affine in beta
+# and in the multipliers, except for switching delays. Their entries are concave in beta and 1/alpha after the rows of
+# their inputs w (facts.Switching) are divided by alpha. A tangent of a concave block bounds the block from above. The
+# tangents at the binding frequencies form a linear matrix inequality, whose least s bounds the required s from below.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
 _LEAST_ETA = 1e-5  # least tried ratio; there the requirement is about 0.1 % below that of the plain condition
@@ -491,10 +488,7 @@ class _Search:
         return root * constant, root * slopes
 
     def least(self, x: Array, most: float) -> tuple[float, tuple[int, int] | None]:
-        """Return the least share below `most` at beta and multipliers of x, and where it binds.
-
-        The share is inf if there is none below `most`. The place is (environment, index of the frequency), or None.
-        """
+        """Return the least share below `most` at x, or inf, and (environment, index of the frequency) or None."""
         beta, share, binding = self.beta(x), self.sweep.floor(self.beta(x)), None
         for e, (z, parts) in enumerate(self.sampled):
             idle = self.idle(z, parts, x)
@@ -521,7 +515,6 @@ class _Search:
         return -largest_eigenvalue(-(root[:, None] * block * root))
 
     def run(self) -> _Best:
-        """Return the best of all beta and multipliers that the search tries."""
         start = [self.sweep.usual[i] / self.units[i] for i in self.searched]
         at_once = [np.concatenate([eta * self.largest(self.high), start, [self.high]]) for eta in _ETAS]
         for x in at_once:
@@ -679,7 +672,6 @@ class KnownDevice(Condition):
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """Return the facts of the environment's side that need multipliers."""
         return self.plain.facts(loop)
 
     @property
@@ -804,9 +796,8 @@ class KnownDevice(Condition):
         """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid.
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
-        beta = _DRAWN times the largest beta of each channel. The grid is coarse because a map over K and B (sim.zwidth)
-        needs thousands of couplings. Returns None for matrix levels, for a user's subclass, or if the plain condition
-        returns None, and inf if this condition does not cover the loop or has multipliers of facts.
+        beta = _DRAWN times the largest beta of each channel. Returns None for matrix levels, for a user's subclass, or
+        if the plain condition returns None, and inf if this condition does not cover the loop or has multipliers.
         """
         ours = type(self) in (KnownDevice, _KnownDeviceAny)  # The block of a user's fact may not be affine in beta.
         plain = self.plain.ratios(loop, coupling) if ours and not loop.levels else None

@@ -3,13 +3,8 @@
 The designs by Theorem 4 use this module. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be
 positive (semi)definite; their arguments are arrays or cvxpy expressions.
 
-Two transfer matrices of the paper can never satisfy the strict inequalities printed for them. The remedies are in
-design.conditions; the formulas here have T = 1:
-  E-hat = z/(z-1) Psi E has a pole at z = 1 if E has static stiffness, and A'PA - P < 0 excludes such a pole (15), (17).
-      Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so E-hat without its pole plus
-      E(1)/2 satisfies the same condition and is stable (`design.conditions.delayed_environment_demand`).
-  V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) would be 0 > 0.
-      Remedy: divide by |1 - 1/z|^2 (`design.conditions._v_hat`).
+The strict inequalities (2), (15), (17) and (18) of the paper have no solution; docs/theory.md has the remedies, which
+design.conditions applies.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """The necessary damping of devices with known motor and transmission (Theorem A), by a sweep, for design.audit.
 
 A motor with linear dynamics (mass m, damping delta) is connected to the hand by a transmission: a spring k and a damper
-b in parallel. A passive hand may have any passive response at each alias w_n = (w + 2 pi n)/T. Therefore the sampled
-responses to a held force, for all passive hands, fill a disk. The loop is stable for every passive hand under two
-conditions: no response in the disk makes the loop singular, and the loop is stable with the far end of the transmission
-held. With one channel, or channels with equal devices, every point of the disk is attained by some passive hand, and
-every point of its circle by a lossless hand. The sweep uses the device of least mass, least damping, stiffest spring
-and least damper within the bounds. Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for
-one channel. docs/theory.md has the proof.
+b in parallel. The loop is stable for every passive hand under two conditions: it is stable with the far end of the
+transmission held, and no sampled response of motor and hand to a held force makes it singular. For all passive hands
+these responses fill a disk. With one channel, or channels with equal devices, every point of its circle belongs to a
+lossless hand. The sweep uses the device of least mass, least damping, stiffest spring and least damper within the
+bounds. docs/theory.md has the proof; compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009).
 """
 
 from __future__ import annotations

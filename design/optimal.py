@@ -303,7 +303,6 @@ class _Search:
 
     @property
     def left(self) -> float:
-        """Counted work that is left for larger bases."""
         return max(budgets.GROWTH - units_since(self.spent), 0.0)
 
     @property

@@ -78,7 +78,6 @@ def _loaded(option: str, text: str, file: Path) -> ModuleType:
 
 
 def reach(folder: str) -> None:
-    """Add the folder to sys.path, so that its modules can be imported."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
 

@@ -173,7 +173,7 @@ class NotProved(ValueError):
 
 
 class DesignFailed(ValueError):
-    """No design could be verified. `problem` is the convex problem or None, `results` the attempts, `advice` a text."""
+    """No design was verified. `problem` is the convex problem or None, `results` the attempts, `advice` the message."""
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice

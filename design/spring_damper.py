@@ -50,15 +50,13 @@ from haptic_loop.design.result import Design, DesignFailed, Infeasible
 from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 
 # ----------------------------------------------------------------------------------------------------
-# The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
+# The convex set of spring-damper gains that satisfy Theorem 4, channel by channel (docs/theory.md).
 #
-# A channel has V = 1/g with g = k + b (1 - 1/z). The block of conditions.any_environment_demand is multiplied by g and
-# its conjugate. Then the part of V is k/2 + b, the part of the damping is |Theta-hat g|^2, and the row of a multiplier
-# is 2 (1 - Theta-hat g). By a Schur complement the condition is affine in (k, b), without conservatism.
-#
-# `lemma1` turns this condition into one matrix inequality, with the entries of a symmetric storage matrix as further
-# unknowns. If these are more than _MOST_STORED, the condition is imposed at sampled frequencies instead, and
-# frequencies at which the solution violates it are added. Both methods give the same gains.
+# A channel has V = 1/g with g = k + b (1 - 1/z). Times g and its conjugate, the condition is k/2 + b >= |c|^2 on the
+# circle with the c of `_Channel.rows`, which is affine in k and b. `lemma1` turns it into one matrix inequality, with
+# the entries of a symmetric storage matrix as further unknowns. If these are more than _MOST_STORED, the condition is
+# imposed at sampled frequencies instead, and frequencies at which the solution violates it are added. Both methods give
+# the same gains.
 
 
 _MOST_STORED = 180  # largest number of entries of all channels' storage matrices
@@ -154,10 +152,7 @@ class _GainSet:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A bound on the gain of a response that is affine in real variables, at sampled frequencies, with cutting planes.
-#
-# A problem over all frequencies has infinitely many constraints, of which few bind. The problem is solved at some
-# frequencies, a refined sweep checks the result, and the worst frequency is added.
+# A bound on the gain of a response that is affine in real variables, at sampled frequencies.
 
 
 def _gain_block(
@@ -180,9 +175,8 @@ def _gain_block(
 
 
 # ----------------------------------------------------------------------------------------------------
-# One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
-#
-# Let g = k + b (1 - 1/z) per channel. The norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
+# One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains (docs/theory.md). With
+# g = k + b (1 - 1/z) per channel the norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
 # L g is affine in the gains. g* g is replaced by its tangent at the previous gains, which lies below g* g. So no step
 # increases the norm at the sampled frequencies, and mu^2 enters linearly, without bisection.
 
@@ -455,10 +449,7 @@ def _stiffest_known(loop: Loop) -> Design:
 
 
 def _stiffest_device(axes: Sequence[Loop]) -> list[tuple[float, float]]:
-    """Return the K [N/m] and B [N s/m] of each axis of a device with the largest sum of K for any environment.
-
-    The share _STIFF_RESERVE of the damping stays unused. All axes have one beta.
-    """
+    """Return K [N/m] and B [N s/m] of each axis of a device with the largest sum of K for any environment."""
     from scipy.optimize import minimize_scalar  # slow to load
 
     z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))

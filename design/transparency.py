@@ -45,12 +45,10 @@ class Transparency:
 
     @property
     def mismatch_db(self) -> float:
-        """`relative_mismatch` in decibels."""
         return decibels(self.relative_mismatch)
 
     @property
     def rms_mismatch_db(self) -> float:
-        """`rms_mismatch` in decibels."""
         return decibels(self.rms_mismatch)
 
     @property

@@ -93,10 +93,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return tuple(f".{AXES[i]}" for i in self.free) if self.axes > 1 else ("",)
 
     def matrix(self: Any, field: str) -> _Matrix:
-        """Return `damping`, or with field "delta" the guaranteed damping, as a matrix over the free axes [N s/m].
-
-        Clamped axes do not move, so only the block of the free axes contributes to v' Delta v.
-        """
+        """Return `damping`, or with field "delta" the guaranteed damping, as a matrix over the free axes [N s/m]."""
         value = self.passivity_level if field == "delta" else self.damping
         return symmetric(field, value, self.axes)[np.ix_(self.free, self.free)]
 
@@ -201,7 +198,6 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
 
     @property
     def bodies(self) -> dict[str, float]:
-        """The mass [kg] of the only body, the motor, which the hand holds."""
         return {"motor": self.mass}
 
     def __post_init__(self) -> None:

@@ -160,11 +160,7 @@ class Port:
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
-        """Return this port on a device with `axes` axes. A port of one axis is repeated on each of them.
-
-        Raises:
-            ValueError: The port has several axes, but their number is not `axes`.
-        """
+        """Return this port on `axes` axes; one axis is repeated. Raises ValueError for another number of axes."""
         if self.axes == axes:
             return self
         if self.axes > 1:
@@ -368,10 +364,7 @@ _MOST_LINKS = 500  # Largest number for one hand: its eigenvalues take 5 s; thos
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
-    """A chain of masses and spring-dampers, from the handle to the equilibrium.
-
-    One link is the usual mass-damper-spring hand, and two links are a hand with a grip on an arm.
-    """
+    """A chain of masses and spring-dampers, from the handle to the equilibrium."""
 
     links: Annotated[tuple[Link, ...], msgspec.Meta(min_length=1)]
     voluntary: Voluntary | None = None
@@ -399,7 +392,6 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         return [(field, value) for field, value in named if isinstance(value, tuple)]
 
     def port(self) -> Port:
-        """Return the mechanics that the handle feels."""
         axes = max(link.axes for link in self.links)
         if axes == 1:
             return Port.chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
@@ -446,7 +438,6 @@ class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr
         return state_space(self.A, self.B, self.C, self.D, self.mass)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Return zero: a measured hand has no voluntary force."""
         return np.zeros_like(t)
 
 

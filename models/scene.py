@@ -133,10 +133,7 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """Return the linear plant of `model`, from its mass, damping, stiffness and actuation matrices, without friction.
-
-    The plant includes the humans' impedances, which MuJoCo itself does not simulate.
-    """
+    """Return the linear plant of `model`: without friction, but with the impedances that MuJoCo does not simulate."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -751,10 +748,7 @@ def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int])
 
 
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
-    """Draw the bodies (persons, 5) of the persons with this index who hold several devices, as in Crowd.
-
-    The bodies have the ranges of the links but a separate random stream, so that the links do not depend on them.
-    """
+    """Draw the bodies (persons, 5) of the persons with this index who hold several devices, as in Crowd."""
     if not persons:
         return np.zeros((0, 5))
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
@@ -803,7 +797,6 @@ class Variants:
 
     @property
     def states(self) -> int:
-        """Number of states of each plant."""
         return 2 * self.scene.model.nv + sum(z.order for _, z in self.impedances)
 
     def taken(self, sets: NDArray[np.intp]) -> Variants:

@@ -119,10 +119,7 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 digest of the names and contents of all files of a scene, without their folders.
-
-    Raises ValueError as `files_of` does.
-    """
+    """Return the SHA-256 digest of the names and contents of a scene's files. Raises ValueError as `files_of` does."""
     total = hashlib.sha256()
     for file in files_of(path):
         content = file.read_bytes()
@@ -368,10 +365,7 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
 
 
 def _principal(G: Array, contact: Contact) -> tuple[Array, Array]:
-    """Return stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag(stiffnesses) Q'.
-
-    Raises ValueError unless G is (axes, axes), symmetric and positive definite.
-    """
+    """Return stiffnesses (axes,) and Q with G = Q diag(stiffnesses) Q'. Raises ValueError unless G = G' > 0."""
     axes = len(contact.along)
     if G.shape != (axes, axes):
         raise ValueError(f"contact {contact.body!r} has {axes} directions, its spring is {G.shape[0]} x {G.shape[1]}")
@@ -592,10 +586,7 @@ class WorldPort:
         return self._within(np.where(held, push, free))
 
     def _potential(self) -> float:
-        """Return the energy [J] of gravity and of the scene's own springs, but not of G, at the present positions.
-
-        Weights that gravity compensation carries are left out.
-        """
+        """Return the energy [J] of gravity and of the scene's own springs, but not of G, at the present positions."""
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
