@@ -324,8 +324,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Re
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
     """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
 
-    The delays of all channels fall by the same number of samples, but not below 0. The changed loop has lam = 0. Delays
-    of 0 give None.
+    The delays of all channels fall by the same number of samples, but not below 0.
     """
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):

@@ -9,8 +9,7 @@ arrived yet). Let <X, Y> be the mean of Re tr X*Y over the circle, and rho(w) th
 the mean square of the relative mismatch over the band, M = F - Lambda E. Let H(z) vanish outside the band, and let C_k
 weigh only the zero combinations, such that
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k.
-Then <D, S> >= 0 means that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With
-H = rho |E| h this bound is
+Then <D, S> >= 0 means that J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/rho>. With H = rho |E| h this bound is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 where the mean is over log frequency in the band. H is piecewise linear, so that H_+ has a closed form, and D is bounded
 from below between any two frequencies (`dual_matrix`). If this lower bound of D is negative, C_0 is increased until
@@ -86,10 +85,8 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
-    T_max are replaced by even periods with less damping, as in the condition. With a latency of at least t1, the
-    condition's rows for the displacements after the latch have at most the damping Delta/(T_max - t1)
-    (design.facts.Latency). These rows alone are this-environment without a latency for devices with this damping, and
-    the bound is computed for these devices.
+    T_max are replaced by even periods with less damping. With a latency of at least t1, Delta T/(T_max - t1) is the
+    damping (docs/theory.md).
     """
     started, level = time.perf_counter(), even_level(loop)
     if loop.latency:
@@ -108,8 +105,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
 class _Dual:
     """The dual problem. Its unknowns are h (entry by entry, real parts, then imaginary parts), C_0 and the C_k.
 
-    D is in units of 1/delta. H is piecewise linear between the points of `grid`, so that its sums over the circle are
-    closed forms (`_causal`).
+    D is in units of 1/delta. H is piecewise linear between the points of `grid`, which gives closed forms (`_causal`).
     """
 
     loop: Loop
@@ -397,8 +393,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     A sum is (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E with a causal R. Row i of
     s_k is zero for 1 <= k <= theta_i. Later coefficients of F are sums of products of those of R and of Psi E. If the
     channels' psi differ, these sums lie in a subspace; v is orthogonal to it and is computed as a null space, up to
-    rounding.
-    Only the first steps of long delays are used; any subset of the sums gives a bound.
+    rounding. Only the first steps of long delays are used; any subset of the sums gives a bound.
     """
     import scipy
 

@@ -64,18 +64,13 @@ def _in_time() -> Iterator[None]:
 
 # ----------------------------------------------------------------------------------------------------
 # The certificate of a coupling is proved once and stored. `verify` repeats the proof from the file alone, without a
-# solver.
-#
-# The blocks over the rationals come from the condition (design.environments, design.known_device, or a user's code).
-# The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that each block
-# at the available damping is strictly positive real (design.exact), which implies that F, or V-hat, is stable. For
-# any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the environment is passive
-# (Environment.active is None). Other multipliers are stored.
+# solver. The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that
+# each block of the condition at the available damping is strictly positive real (design.exact), which implies that F,
+# or V-hat, is stable. For any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the
+# environment is passive (Environment.active is None). Other multipliers are stored.
 #
 # With ranges, a condition that uses the environment is proved for the nominal environment (matrix P) and for at most
 # 128 vertices (P1, P2, ..). Environments between the vertices, or environments that change with time, have no proof.
-#
-# A certificate names its base condition and the facts that it covers: latency, walls, limiter, switching, ranges.
 
 
 @dataclass(frozen=True)

@@ -66,9 +66,8 @@ from haptic_loop.design.result import Environments, Requirement, from_ratio, ref
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
     """Return the block of He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces.
 
-    In a tick the damping dissipates at least dx' Delta_D dx/T_max, and the force map supplies the energy -f'dx. With
-    F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T_max, in any arithmetic. For forces that latch later than
-    at the tick the block has up to twice the size (design.facts.Latency).
+    With F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T_max, in any arithmetic. For forces that latch later
+    than at the tick the block has up to twice the size (design.facts.Latency).
     """
     return compose(F, loop, late=False)
 
@@ -82,10 +81,9 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
 def _v_hat(H: Block) -> tuple[Array, Block]:
     """Return H(1) and H(1)/2 - (H - H(1))/(z - 1), whose Hermitian part is that of T V-hat/|1 - 1/z|^2.
 
-    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) combines the compliance V and the delays. V-hat vanishes at z = 1,
-    where it cannot be strictly positive, so it is divided by |1 - 1/z|^2. The factor (1 - 1/z) becomes 1/(1 - z), which
-    has the Hermitian part 1/2. H(1) must be symmetric. The result is linear in H, so V and Theta-hat may be passed
-    separately.
+    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) vanishes at z = 1, where it cannot be strictly positive, so it is
+    divided by |1 - 1/z|^2 (docs/theory.md). H(1) must be symmetric. The result is linear in H, so V and Theta-hat may
+    be passed separately.
     """
     H1, regular = H.over_z_minus_one()
     return H1, -regular
@@ -95,10 +93,9 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     """Return s times the block of Theorem 4 for the damping s Delta_D; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
     V-hat must be output strictly passive with the level Delta_V, where Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with
-    Delta_V = 0 where phi is 0. After the division by |1 - 1/z|^2 this is T He R >= H* Delta_V H for H = V - Theta-hat
-    and the second result R of `_v_hat`. A Schur complement gives He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second
-    block has rows only for phi > 0. Damping enters through Theta-hat and Delta_D^-1, in proportion to 1/s. Raises
-    ValueError unless 0 <= phi < Delta_D T/T_max.
+    Delta_V = 0 where phi is 0. With H = V - Theta-hat and the second result R of `_v_hat` a Schur complement gives
+    He[[T R, 0], [2 H, Delta_V^-1]] >= 0, where the second block has rows only for phi > 0. Damping enters through
+    Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError unless 0 <= phi < Delta_D T/T_max.
     """
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
@@ -170,7 +167,6 @@ def _least_multiple(free: Complex, gain: Complex) -> Array:
     """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
     If gain is singular, free must be positive on its null space, and a Schur complement covers the other directions.
-    If gain is 0, the result is 0 or inf.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if gain.shape[-1] == 2 and (own > 0).all():
@@ -443,9 +439,8 @@ def this_environment(F: Lti, loop: Loop) -> Requirement:
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """Return required over available damping of this-environment for a stable coupling, by a refined sweep.
 
-    With `thin` > 1 the sweep is not refined and uses every `thin`-th frequency of its grid. For a force filter the
-    responses of environment and filter are multiplied, because the poles of their series are defective and cost digits
-    and time.
+    With `thin` > 1 the sweep is not refined and uses every `thin`-th frequency of its grid. The responses of a force
+    filter and of the environment are multiplied, because the poles of their series are defective.
     """
     if (chain := coupling.in_series(loop.T)) is None:
         return _by_force_map(loop, coupling, thin)
@@ -610,9 +605,8 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
 
     The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
     a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). `axes` lists the number of
-    axes of each device; () means one each. Friction of a device with several axes opposes its velocity in space. It
-    must be at least |W|_2 of these axes, as the power of the errors is at most sum W_i |v_i| <= |W|_2 |v|_2. Raises
-    ValueError for a wrong number of steps or a negative step.
+    axes of each device; () means one each. Friction of a device with several axes opposes its velocity in space and
+    must be at least |W|_2 of these axes. Raises ValueError for a wrong number of steps or a negative step.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

@@ -37,8 +37,7 @@ from haptic_loop.design.arguments import shown
 class Demand(Generic[Block]):
     """The demand that free + s gain is strictly positive real; s is 1 for the available damping.
 
-    `static` holds named matrices that must be symmetric. Those named in `semidefinite` must also be positive
-    semidefinite.
+    The matrices in `static` must be symmetric; those named in `semidefinite` must also be positive semidefinite.
     """
 
     free: Block
@@ -61,8 +60,7 @@ class Demand(Generic[Block]):
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
     """Return delta T/T_max (m,) [N s/m]: proofs for a constant T with this damping hold for periods up to T_max.
 
-    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
-    the energy balance does not depend on T_k: the force map is the same at every tick.
+    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts.
     """
     T = loop.T if T is None else T
     damping = numbers(loop.delta, T)
@@ -364,8 +362,7 @@ Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 class Unknowns:
     """The numbers of one multiplier.
 
-    A search keeps each number between `least` and `most` times its unit. For a multiplier of the hands' side, this
-    bounds s times the number.
+    A search keeps each number (for the hands' side: s times the number) between `least` and `most` times its unit.
     """
 
     name: str  # name of the multiplier in files
@@ -669,10 +666,10 @@ class Walls(Fact):
 class Switching(Fact):
     """Delays that switch within [lo, hi] at every tick and on every device; the multiplier is alpha_i > 0 [N/m].
 
-    With h = (hi - lo)/2 the errors of the force do at least the work of the sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha)
-    on the displacement dq that the force multiplies, where df_e are the steps of the sent force (docs/theory.md). The
-    last term is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes
-    of a device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
+    With h = (hi - lo)/2 the work of the force's errors on the displacement dq that the force multiplies is at least the
+    sum of -alpha dq^2/2 - h^2 df_e^2/(2 alpha), with the steps df_e of the sent force (docs/theory.md). The last term
+    is the least value of 2 alpha w^2 + 2 h w df_e over the input w, so the block is affine in alpha. The axes of a
+    device share its delay, so the weight is the matrix alpha_i Delta_i / mean(diag(Delta_i)).
     """
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:

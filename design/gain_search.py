@@ -59,8 +59,7 @@ class _Around:
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
 
-    delta is that of `even_damping`. The first 2m entries are the gains; the rest are the unknowns of the condition's
-    multiplier.
+    delta is that of `even_damping`. The unknowns of the condition's multiplier follow the 2m gains.
     """
 
     #: indices of the channels with a multiplier and a second row in the block; KnownDeviceLoop: indices of all devices
@@ -183,8 +182,7 @@ class SampledLoop:
     def room(self, x: Array) -> Array:
         """Return the margin of the sampled condition at each frequency (k,): the eigenvalue of `_least`.
 
-        With delay in the environment `stability` is appended, because the loop can then be unstable although the
-        sampled condition holds.
+        With delay in the environment `stability` is appended, because the sampled condition does not imply it.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room

@@ -1,9 +1,8 @@
 """Design spring-dampers (26) of least objective or of largest stiffness, and moving averages.
 
-The gains that any-environment certifies form a convex set, described here. For this-environment and known-device,
-`design` uses the search of design.gain_search.
-
-`_GainSet` has gains in units of the usable damping d = (1 - RESERVE) delta T/T_max: k = K T/d, b = B/d.
+`_GainSet` is the convex set of gains that any-environment certifies, in units of the usable damping
+d = (1 - RESERVE) delta T/T_max: k = K T/d, b = B/d. For this-environment and known-device, `design` uses the search of
+design.gain_search.
 """
 
 from __future__ import annotations
@@ -53,10 +52,9 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, rms_mismatch
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel (docs/theory.md).
 #
 # A channel has V = 1/g with g = k + b (1 - 1/z). Times g and its conjugate, the condition is k/2 + b >= |c|^2 on the
-# circle with the c of `_Channel.rows`, which is affine in k and b. `lemma1` turns it into one matrix inequality, with
-# the entries of a symmetric storage matrix as further unknowns. If these are more than _MOST_STORED, the condition is
-# imposed at sampled frequencies instead, and frequencies at which the solution violates it are added. Both methods give
-# the same gains.
+# circle with the c of `_Channel.rows`, which is affine in k and b. `lemma1` turns it into one matrix inequality. If the
+# entries of its storage matrices are more than _MOST_STORED, the condition is imposed at sampled frequencies instead,
+# and frequencies at which the solution violates it are added. Both methods give the same gains.
 
 
 _MOST_STORED = 180  # largest number of entries of all channels' storage matrices
@@ -176,9 +174,8 @@ def _gain_block(
 
 # ----------------------------------------------------------------------------------------------------
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains (docs/theory.md). With
-# g = k + b (1 - 1/z) per channel the norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. Here
-# L g is affine in the gains. g* g is replaced by its tangent at the previous gains, which lies below g* g. So no step
-# increases the norm at the sampled frequencies, and mu^2 enters linearly, without bisection.
+# g = k + b (1 - 1/z) per channel the norm is at most mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1. A step
+# replaces g* g by its tangent at the previous gains, which lies below g* g, so that no step increases the norm.
 
 
 def step(shaping: Shaping, gains: _GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
@@ -504,8 +501,8 @@ def _stiffest_linear(loop: Loop) -> Design:
     """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum of 1/V_i(1) [N/m].
 
     With the Fourier coefficients chi_k of chi and V(1) = 2 chi_0, V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has
-    He[V/(1-z)] = chi. No linear coupling is stiffer, because V(1)/2 is the mean of He[V/(1-z)]. A small constant is
-    added, and the series is cut off where the omitted terms sum to less than half of this constant.
+    He[V/(1-z)] = chi. A small constant is added, and the series is cut off where the omitted terms sum to less than
+    half of this constant.
     """
     from scipy.optimize import minimize_scalar  # slow to load
 
@@ -549,10 +546,8 @@ _STIFF_DIGITS = 6  # digits of a gain
 def _default_starts(loop: Loop) -> list[SpringDamper]:
     """Return couplings from which a search starts, with 0.3, 1 and 8 times the stiffness d/((theta + psi + 1) T).
 
-    d is the usable damping [N s/m]. For psi = 0 the stiffness is half the largest one for any environment.
-
-    With delay in the environment, the loop of coupling and environment is stable if the coupling is stiffer than the
-    environment at every frequency. So a further start is stiffer than the environment at half the sampling rate.
+    d is the usable damping [N s/m]. With delay in the environment a further start is stiffer than the environment at
+    half the sampling rate, because the loop is stable if the coupling is stiffer than the environment everywhere.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
@@ -599,8 +594,7 @@ def _stiffest_in_frame(loop: Loop) -> Design:
     """Return the stiffest linear coupling of a loop with a latency or switching delays, for any environment.
 
     The least admissible He[V/(1-z)], chi (docs/theory.md), is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k,
-    whose series is finite. V(1)/2 is the mean of chi. A convex program or a closed form gives the multiplier that
-    minimises this mean.
+    whose series is finite. V(1)/2 is the mean of chi, and the multiplier minimises this mean.
     """
     if loop.latency and loop.varying_delay:
         line = "moving-average: no series is known for a latency together with switching delays; use a spring-damper"
