@@ -142,11 +142,8 @@ def _blas() -> ThreadpoolController:
 def compiled(name: str) -> Any:
     """Return a compiled module of SciPy, such as "scipy.linalg._flapack", without the Python code of its package.
 
-    Importing scipy.linalg takes 0.1 s, importing SLSQP 0.2 s more, and a compiled module 0.01 s.
-    A second thread waits until the first has loaded the module.
-
-    Raises:
-        ImportError: SciPy has no such module.
+    Importing scipy.linalg takes 0.1 s, importing SLSQP 0.2 s more, and a compiled module 0.01 s. A second thread waits
+    until the first has loaded the module. Raises ImportError if SciPy has no such module.
     """
     with _loading:
         if name in sys.modules:
@@ -297,9 +294,8 @@ def solve(M: Array, right: Array) -> Array:
 def _solve_exactly(M: Any, right: Any) -> Any:
     """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
-    Most of the matrices come from series of small blocks and are triangular after a permutation. The next pivot is in
-    the row with the fewest entries, and there in the column with the fewest entries (Markowitz), so that few zeros
-    become nonzero.
+    The next pivot is in the row with the fewest entries, and there in the column with the fewest entries (Markowitz),
+    so that few zeros become nonzero.
     """
     n = M.shape[0]
     rows = [{j: v for j, v in enumerate(row) if v} for row in M]

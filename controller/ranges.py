@@ -68,9 +68,8 @@ class Region:
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
     """Return the environment, then the vertices of the ranges that differ from it: all, or 128 of them.
 
-    The nominal environment may be one of the 128; then 127 differ from it.
-
-    Raises ValueError with the field's name if the ranges do not fit the network or have too many parameters.
+    The nominal environment may be one of the 128; then 127 differ from it. Raises ValueError with the field's name if
+    the ranges do not fit the network or have too many parameters.
     """
     parts = _parts(network, ranges)
     corners = dict.fromkeys(tuple(p.corners[i] for p, i in zip(parts, at, strict=True)) for at in _vertices(parts))

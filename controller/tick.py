@@ -7,11 +7,10 @@
           4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant to its state just before (k+1)T
           5  z = z+, the controller's states for the next tick
 
-With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
-Steps 2, 3 and 5 together are one linear state-space block, so that a tick is one matrix product
-[f; z+] = [C D; A B] [z; x] for any number of simulations. Touching walls and limited forces (controller.law) add a
-small complementarity problem, and actuators clip forces.
-With varying delays Theta is not part of the block. The forces then pass through a delay line (controller.delay).
+With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later. Steps 2, 3 and 5
+together are one linear state-space block, so that a tick is one matrix product [f; z+] = [C D; A B] [z; x] for any
+number of simulations. Touching walls and limited forces (controller.law) add a small complementarity problem. With
+varying delays Theta is not part of the block; the forces then pass through a delay line (controller.delay).
 """
 
 from __future__ import annotations

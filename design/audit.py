@@ -393,7 +393,6 @@ def audit(
     Args:
         loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
-        condition: The condition that must hold; None for the condition that `assess` chooses.
         seed: Seed of the environments that are drawn from inside the loop's ranges.
         force_limit: (m,) force limits [N], for the report.
         progress: Called with (points done, number of points) of the search over ranges.

@@ -87,7 +87,6 @@ class EntryInequality:
     """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
     The methods are those of MatrixInequality, but `add_newton` adds the upper triangle of the Hessian only.
-
     The unknowns are the entries of the X_n, sorted by entry and then by n, followed by the x_a. At each frequency the
     second derivative in an entry of X_n and one of X_l is a sum of products t_n t_l and t_n t_l*. Their weights from
     S^-1 do not depend on n and l. The Hessian is therefore a matrix product over the frequencies: (pairs of functions)

@@ -93,7 +93,6 @@ def prove(
 
     Args:
         loop: The loop. Its facts, such as walls or delays that switch, are part of the condition.
-        coupling: The coupling.
         condition: A name or a condition. design.environments.LimitedForces covers limited forces, too; under
             any-environment without delay in the environment the limiter has rho = 0 and needs no further proof.
         multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None to search for them.

@@ -110,7 +110,6 @@ def design_by_kind(
     """Design and verify a coupling.
 
     Args:
-        loop: The loop.
         kind: A name of KINDS, or FILE.py:NAME of a user's own function.
         condition: The condition; None for `usual_condition`. For a user's own condition the coupling is designed by the
             kind's usual condition, with a share of the damping for which the user's condition holds.

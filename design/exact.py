@@ -17,10 +17,8 @@ from haptic_loop.design import budgets
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 
 # ----------------------------------------------------------------------------------------------------
-# Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.
-#
-# A stored floating-point number stands for its shortest decimal, the one that a person wrote in the file: 0.0012 is
-# 12/10000 here, not the nearest binary fraction. A matrix is accepted only by exact computations with these numbers.
+# Matrices over the rationals: integers over one common denominator, and exact tests of definiteness. A floating-point
+# number stands for its shortest decimal, the one that a person wrote in the file: 0.0012 is 12/10000 here.
 
 
 _Integers = NDArray[np.object_]
@@ -283,10 +281,8 @@ def _whitening(W: Array) -> _Integers | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, and exact arithmetic tests P.
-#
-# By the Kalman-Yakubovich-Popov lemma (docs/theory.md, "What an exact proof is") G is strictly positive real if P > 0
-# and
+# Strict positive realness of a block G = (A, B, C, D): a Riccati equation gives P, and exact arithmetic tests P. By the
+# Kalman-Yakubovich-Popov lemma (docs/theory.md) G is strictly positive real if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
 # P may be rounded, because any P that satisfies both inequalities is a proof. The errors of all other rounding are
 # bounded and subtracted.

@@ -768,8 +768,6 @@ def compose(
     Args:
         G: The map from [x; p], displacements (m,) and wall forces, to [f_e; y], sent forces and displacements across
             the walls.
-        loop: The loop.
-        facts: The facts of the environment's side.
         values: The multipliers by name.
         late: Whether the delays Theta have to be added; False if G contains them.
         scaled: Whether `values` holds the multipliers of the hands' side times s, so that the block is affine in s and

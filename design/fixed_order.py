@@ -1,9 +1,8 @@
 """Design state-space couplings of a given order that satisfy Theorem 4 (`--coupling ccl`, Remark 5 of the paper).
 
-A descent from a spring-damper design minimises ||W1 L W2||_inf (23). Each step solves a convex problem
-whose solutions all satisfy the condition. The returned coupling satisfies Theorem 4 on a refined sweep, which is
-computed from the coupling alone. The cone complementarity algorithm of Remark 5 is not offered, because its bisection
-on mu stalls near its start.
+A descent from a spring-damper design minimises ||W1 L W2||_inf (23). Each step solves a convex problem whose solutions
+all satisfy the condition. A refined sweep then checks Theorem 4. The cone complementarity algorithm of Remark 5 is not
+offered, because its bisection on mu stalls near its start.
 """
 
 from __future__ import annotations
@@ -97,8 +96,8 @@ class _FixedOrder:
     def start(self, gains: SpringDamper) -> Array:
         """Return p of a spring-damper. Each further state is driven by the state before it, and no output reads it.
 
-        With dampers all states are reachable, and the storage of the weighted loop is well conditioned. A state that is
-        read but not driven would make the storage singular, and rounding would decide whether the first step succeeds.
+        All states are then reachable if there are dampers. A state that is read but not driven would make the storage
+        of the weighted loop singular.
         """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)

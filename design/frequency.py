@@ -268,9 +268,8 @@ def _brackets(values: Array, grid: Array, above: float) -> Array:
     return bracket[:, :, np.argsort(_reach(bracket))[-32:]]
 
 
-#: distances of trial points from the parabola's peak, as multiples of the bracket's width. These points find a smooth
-#: peak, because its distance from the parabola's peak falls with the square of the width. The points at eighths of the
-#: bracket find a kink.
+#: Distances of trial points from the parabola's peak, in widths of the bracket: they find a smooth peak, whose distance
+#: from the parabola's peak falls with the square of the width. Trial points at eighths of the bracket find a kink.
 _NEAR = np.array([[2.0**-k] for k in (4, 7, 10, 13)])
 _EIGHTHS = np.arange(1, 8)[:, None] / 8
 
@@ -330,9 +329,9 @@ def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
 def least_eigenpair(H: NDArray[np.complex128]) -> tuple[Array, NDArray[np.complex128]]:
     """Return the least eigenvalues (k,) of Hermitian matrices (k, m, m) and their unit eigenvectors (k, m).
 
-    For two rows a closed form takes a fifth of the time of eigh. For many rows one step of inverse iteration is 1.4
-    times as fast as all eigenvectors. The shift differs from the eigenvalue by 1e-13 of the largest entry. The share of
-    every other eigenvector is multiplied by at most this difference over the distance of both eigenvalues.
+    For many rows one step of inverse iteration is 1.4 times as fast as all eigenvectors. Its shift differs from the
+    eigenvalue by 1e-13 of the largest entry, so that the share of every other eigenvector is multiplied by at most this
+    difference over the distance of both eigenvalues.
     """
     m = H.shape[-1]
     if m == 2:

@@ -312,7 +312,6 @@ class Sweep:
     The block without L is independent of the share of the damping; L is added for each share.
 
     Args:
-        loop: The loop.
         maps: One map for each environment, as `form` takes them.
         form: (map, multipliers by name, hands' side) -> the demand.
         unknowns: The multipliers of the facts.

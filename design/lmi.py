@@ -132,8 +132,7 @@ def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
 def balanced(G: Lti) -> Lti:
     """Return the realisation of a stable G whose Gramians are equal and diagonal, by the square-root method.
 
-    States with a Hankel value below 1e-11 times the largest are dropped. They are unreachable or unobservable to
-    rounding, so the response does not change.
+    States with a Hankel value below 1e-11 times the largest are dropped, which changes the response by rounding only.
     """
     import scipy
 

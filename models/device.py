@@ -37,11 +37,7 @@ _Matrix = NDArray[np.float64]
 
 
 def symmetric(field: str, value: Any, axes: int) -> _Matrix:
-    """Convert a number, a list of one number per axis or a symmetric matrix to a matrix (axes, axes).
-
-    Raises:
-        ValueError: A number is not finite, the list or matrix has the wrong shape, or the matrix is not symmetric.
-    """
+    """Convert a number, a list of one per axis or a symmetric matrix to (axes, axes). Raises ValueError for others."""
     if isinstance(value, Real):
         number = float(value)
         if not np.isfinite(number):

@@ -144,8 +144,7 @@ _Which = NDArray[np.intp]
 def product_of(matrices: _Array) -> Product:
     """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
 
-    A plant splits into independent blocks, such as a device with its human. The zeros of many matrices show the blocks,
-    and only entries inside a block are multiplied.
+    Many matrices split into independent blocks, such as a device with its human; entries outside them are not used.
     """
     if matrices.ndim == 2:
         return np.ascontiguousarray(matrices).dot

@@ -498,8 +498,7 @@ class WorldPort:
     def step(self, u0: Array) -> Array:
         """Advance by one tick; return the forces (m,) [N] of contacts whose positions without force are u0 (m,) [m].
 
-        Forces are within the limits, but not finite if MuJoCo's state is not finite. Raises ValueError if MuJoCo
-        cannot step.
+        Raises ValueError if MuJoCo cannot step. The forces are not finite if MuJoCo's state is not finite.
         """
         world = self.world
         goal = world._Q.T @ u0
@@ -559,8 +558,7 @@ class WorldPort:
     def _limited(self, goal: Array, saved: Array) -> Array:
         """Repeat the step until two in a row limit the same contacts with the same forces, up to _DIRECTION_SLACK.
 
-        At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force acts instead of the
-        spring.
+        At most _MOST_REPETITIONS repetitions are made. On a limited contact the limited force acts, not the spring.
         """
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)
