@@ -58,7 +58,9 @@ def _run(command: str, words: list[str]) -> NoReturn:
         painter.begin()
     atexit.register(gc.freeze)  # This prevents a last search for garbage, which takes 0.1 s.
     from haptic_loop.cli.execute import execute  # This import loads NumPy.
+    from haptic_loop.design import forked
 
+    forked.allowed = True
     execute(lambda argv: _command(command).main(argv), words)
 
 

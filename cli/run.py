@@ -16,6 +16,7 @@ from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import write
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.result import CAVEATS, Chosen, finite
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.accuracy import MOST
@@ -54,6 +55,7 @@ def main(argv: list[str]) -> int:
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
     render.announce(args, verdicts.verdict(assessment))
+    nearby = _nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment)
     from haptic_loop.sim.run_report import run_report
 
     run = _run(args, simulated, assessment)  # each tick: sample, compute, limit, hold, advance
@@ -61,7 +63,8 @@ def main(argv: list[str]) -> int:
     drawn = bool(run.trace.t.size) and not args.no_plot
     if drawn:
         painter.ask("draw_run", *_shown(args, run, report))
-    report = replace(report, robustness=_nearby(scenario.loop(args.case).at(simulated.environment), chosen, assessment))
+    with render.progress("working out robustness"):
+        report = replace(report, robustness=nearby and nearby.result())
     if lost := verdicts.lost(assessment, report.robustness):
         render.announce(args, lost)
     if args.paper:
@@ -157,15 +160,14 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
     return beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
 
 
-def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Robustness | None:
-    """Return the required damping in environments near the model; None if no guarantee depends on the model."""
+def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Forked[Robustness | None] | None:
+    """Begin to compute the damping needed in environments near the model; None if no guarantee depends on the model."""
     from haptic_loop.design.robustness import robustness_nearby
 
     guarantee = assessment.guarantee
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
         return None
-    with render.progress("working out robustness"):
-        return robustness_nearby(loop, chosen.coupling, named(chosen.asked))
+    return Forked(robustness_nearby, loop, chosen.coupling, named(chosen.asked))
 
 
 def _save(out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:

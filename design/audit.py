@@ -24,9 +24,11 @@ from haptic_loop.controller.coupling import (
 )
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import Assessment, assess
-from haptic_loop.design.certificate import named
+from haptic_loop.design.certificate import conditions_of, named
 from haptic_loop.design.conditions import Condition
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError, off_table
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.necessary import LeftOver, left_over
@@ -190,9 +192,14 @@ def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
     return None
 
 
-def sensitivity(loop: Loop, coupling: Coupling, condition: _Condition) -> _Sensitivity:
-    """Return the errors in delta, T and delay that the certificate of this condition tolerates."""
-    resolved, needs = named(condition), requirement(loop, coupling, condition)
+def sensitivity(
+    loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None
+) -> _Sensitivity:
+    """Return the errors in delta, T and delay that the certificate of this condition tolerates.
+
+    `needs` is the requirement of the condition, if the caller has it.
+    """
+    resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
     if reason := resolved.not_varied(loop):
@@ -298,9 +305,12 @@ class _Remedy:
     requirement: Requirement
 
 
-def _remedies(loop: Loop, coupling: Coupling, condition: _Condition) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower the requirement by more than 10 %."""
-    resolved, needs = named(condition), requirement(loop, coupling, condition)
+def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None) -> list[_Remedy]:
+    """Return single changes that certify the coupling or lower the requirement by more than 10 %.
+
+    `needs` is the requirement of the condition, if the caller has it.
+    """
+    resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []
     candidates = [_fewer_samples(loop, coupling, resolved, name) for name in ("theta", "psi")]
@@ -401,29 +411,41 @@ def audit(
         ValueError: A field of the loop is wrong; the message names it.
     """
     check_loop(loop)
-    assessment = assess(
-        loop, coupling, condition=condition, ranges_seed=seed, force_limit=force_limit, progress=progress
-    )
-    constant, needs = loop.at(loop.environment).switching(None), assessment.requirements
-    own = {condition.name: condition} if condition else {}
-    conditions = {name: own.get(name) or named(name) for name in needs if name != "switching"}
-    # Changes are searched for the condition that must hold or, if it is certified, for the first that is not certified.
-    decisive = assessment.condition
-    fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
-    switching = None
+    wanted = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
+    constant = loop.at(loop.environment).switching(None)
+    conditions = {each.name: each for each in (*conditions_of(loop), wanted)}
+    searched = Forked(_searched, constant, coupling, conditions, wanted.name, helping=not loop.varying_delay)
+    assessment = assess(loop, coupling, condition=wanted, ranges_seed=seed, force_limit=force_limit, progress=progress)
+    needs, switching = assessment.requirements, None
     if loop.varying_delay:
         from haptic_loop.design.coverage import SwitchingFigures  # Audits with constant delays start without it.
 
         switching = SwitchingFigures.of(loop, coupling, needs["switching"])
         needs = {name: each.judge(constant, coupling) for name, each in conditions.items()}
+    others = {name: each for name, each in conditions.items() if each is not wanted}
+    margins = {name: _margins(constant, coupling, each, needs[name]) for name, each in others.items()}
+    margins[wanted.name], helps = searched.result()
     return Audit(
         assessment,
-        {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
+        {name: margins[name] for name in conditions},
         switching,
-        [] if switching else _helps(constant, coupling, conditions[fails]),
+        helps,
         {name: needs[name] for name in conditions},
         left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )
+
+
+def _searched(
+    loop: Loop, coupling: Coupling, conditions: dict[str, Condition], wanted: str, helping: bool
+) -> tuple[Margins, list[Help]]:
+    """Return the margins to the edge of the condition `wanted`, and changes that help (none without `helping`).
+
+    Changes are searched for the condition `wanted` or, if it is certified, for the first that is not certified.
+    """
+    needs = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
+    fails = next((name for name in conditions if needs[wanted].certified and not needs[name].certified), wanted)
+    margins = _margins(loop, coupling, conditions[wanted], needs[wanted])
+    return margins, _helps(loop, coupling, conditions[fails], needs[fails]) if helping else []
 
 
 _SWEEPS = 60  # typical number of sweeps of a search
@@ -447,15 +469,15 @@ def _in_time(
 
 
 def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Margins:
-    unknown = (None,) * loop.channels
+    unknown, subject = (None,) * loop.channels, (loop, coupling, condition)
     return Margins(
-        _in_time(loop, coupling, lambda: stiffest(loop, coupling, condition), lambda why: _Stiffest(unknown, why)),
-        _in_time(loop, coupling, lambda: sensitivity(loop, coupling, condition), lambda why: _of_delta(needs, why)),
+        _in_time(loop, coupling, lambda: stiffest(*subject), lambda why: _Stiffest(unknown, why)),
+        _in_time(loop, coupling, lambda: sensitivity(*subject, needs), lambda why: _of_delta(needs, why)),
     )
 
 
-def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
+def _helps(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> list[Help]:
     """Return changes that certify a failing condition or lower its required damping."""
-    helpful = _in_time(loop, coupling, lambda: _remedies(loop, coupling, condition), lambda why: [])
+    helpful = _in_time(loop, coupling, lambda: _remedies(loop, coupling, condition, needs), lambda why: [])
     pairs = ((remedy.change, remedy.requirement) for remedy in helpful)
     return [Help(change, condition.name, after.required, after.certified) for change, after in pairs]

@@ -494,6 +494,12 @@ def _block(demand: Demand[Lti]) -> Lti:
     return demand.gain + demand.free
 
 
+def conditions_of(loop: Loop) -> tuple[Condition, ...]:
+    """Return the conditions of the package that `requirements_of` judges."""
+    known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
+    return tuple(each for each in _NAMED.values() if each not in known_only)
+
+
 def requirements_of(
     loop: Loop,
     coupling: Coupling,
@@ -507,8 +513,7 @@ def requirements_of(
     theta are constant; design.assessment adds ranges and switching.
     """
     loop = loop.at(loop.environment).switching(None)
-    known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
-    conditions = (*(each for each in _NAMED.values() if each not in known_only), *([named(own)] if own else []))
+    conditions = (*conditions_of(loop), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
     pairs = [(each, each.judge(loop, coupling)) for each in conditions]

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from haptic_loop.design import forked
 from haptic_loop.design.files import InputError
 
 _Made = TypeVar("_Made")
@@ -52,6 +53,7 @@ _LOADED: dict[Path, ModuleType] = {}
 
 def _loaded(option: str, text: str, file: Path) -> ModuleType:
     """Import the file once, as a module with the file's name, so that worker processes find its classes."""
+    forked.allowed = False
     if file in _LOADED:
         return _LOADED[file]
     other = sys.modules.get(file.stem)

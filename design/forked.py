@@ -1,0 +1,83 @@
+"""A computation in a second process, a copy of this one, while this process computes something else.
+
+    later = Forked(robustness, loop, coupling)  # The second process begins.
+    ..                                          # This process computes at the same time.
+    value = later.result()
+
+The result does not depend on which process is faster. If there is no second process, or if it ends without a result,
+this process computes the function, and raises its errors.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+#: Whether second processes are allowed: in a command that has its process for itself, and loads no user's own code.
+#: Other code may print, write files, or have threads whose locks a copy of the process would inherit.
+allowed = False
+
+_PR_SET_PDEATHSIG = 1  # number of an operation of Linux's prctl
+
+
+class Forked(Generic[_Result]):
+    """A call of a function that neither prints nor writes files, in a second process if that is possible."""
+
+    def __init__(
+        self, function: Callable[_Arguments, _Result], *arguments: _Arguments.args, **options: _Arguments.kwargs
+    ) -> None:
+        self._call = lambda: function(*arguments, **options)
+        self._process = 0  # number of the second process, or 0 if there is none
+        if allowed and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1:
+            with suppress(OSError):  # There may be too many processes or open files.
+                self._fork()
+
+    def _fork(self) -> None:
+        self._reader, writer = os.pipe()
+        # The second process must not handle Ctrl-C or SIGTERM as a command does.
+        handled = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+        try:
+            with warnings.catch_warnings():  # From Python 3.12 on, a fork beside a thread, as of a progress bar, warns.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self._process = os.fork()
+            if not self._process:
+                self._compute(writer)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, handled)
+            os.close(writer)
+
+    def _compute(self, writer: int) -> NoReturn:  # pragma: no cover - runs in the second process
+        """Send the pickled result, without output and without this process's files, and end."""
+        code = 1
+        try:
+            import ctypes
+
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # This process ends with the first one.
+            os.dup2(writer, 3)
+            os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+            for stream in range(3):
+                os.dup2(os.open(os.devnull, os.O_RDWR), stream)
+            with open(3, "wb") as file:
+                pickle.dump(self._call(), file, pickle.HIGHEST_PROTOCOL)
+            code = 0
+        finally:
+            os._exit(code)
+
+    def result(self) -> _Result:
+        """Return the function's result, which must be called once only."""
+        if self._process:
+            with open(self._reader, "rb") as file:
+                data: Any = file.read()
+            process, self._process = self._process, 0
+            if os.waitpid(process, 0)[1] == 0:
+                return pickle.loads(data)
+        return self._call()
