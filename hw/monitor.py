@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -269,8 +268,10 @@ class LinkMonitor:
         self.last: State | None = None
         self.margin: int | None = None  # [us] margin in the last new STATE; None if that STATE has no margin
         self.missed = 0  # missed ticks that the last new STATE reports
-        self._window: deque[_Tick] = deque()
-        self._late = self._missed = self._untold = self._gaps = 0  # sums over the window, updated tick by tick
+        self._margins = deque[int | None](maxlen=_BLOCK)  # [us] margins of the last STATEs
+        #: for each STATE: 1 if its answer was late, missed ticks, ticks without a STATE before it, 1 without a margin
+        self._window = deque([(0, 0, 0, 0)] * _BLOCK)
+        self._sums = [0, 0, 0, 0]  # sums over the window, updated tick by tick
 
     def take(self, state: State, ignored: Container[int] = ()) -> int:
         """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick.
@@ -291,60 +292,37 @@ class LinkMonitor:
             self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
         self.margin = None if state.margin_us == NO_MARGIN else state.margin_us
         late = self.margin is not None and self.margin < self.needed
-        odd = late or self.margin is None or self.missed > 0 or ahead > 1
-        tick, counters = _Tick(self.margin, self.missed, ahead - 1, late, odd), self.counters
-        counters.states += 1
-        self._window.append(tick)
-        if odd:
-            counters.gaps += tick.gap
-            counters.misses += tick.missed
-            counters.late += tick.late
-            self._add(tick, 1)
-        if len(self._window) > _BLOCK and (oldest := self._window.popleft()).odd:
-            self._add(oldest, -1)
+        self._margins.append(self.margin)
+        self.counters.states += 1
+        self.counters.gaps += ahead - 1
+        self.counters.misses += self.missed
+        self.counters.late += late
+        newest, oldest = (late, self.missed, ahead - 1, self.margin is None), self._window.popleft()
+        self._window.append(newest)
+        self._sums = [total + new - old for total, new, old in zip(self._sums, newest, oldest, strict=True)]
         self.last = state
         return ahead
 
-    def _add(self, tick: _Tick, sign: int) -> None:
-        self._late += sign * tick.late
-        self._missed += sign * tick.missed
-        self._gaps += sign * tick.gap
-        self._untold += sign * (tick.margin is None)
-
     @property
     def least_margin(self) -> int | None:
-        """The least margin [us] in the window; None if no answer came."""
-        return min((tick.margin for tick in self._window if tick.margin is not None), default=None)
+        """The least of the last margins [us]; None if no answer came."""
+        return min((margin for margin in self._margins if margin is not None), default=None)
 
     def too_late(self) -> str | None:
         """Return a message if the link has become slower than the coupling was certified for, else None.
 
         Shares are relative to a full window, also before it is full. Raises SafetyStop where too few messages arrive.
         """
-        window, most = _BLOCK, _MISSED
-        late, missed = self._late / window, min(1.0, self._missed / window)
-        if missed > most + late:
-            raise SafetyStop(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
-        if self._gaps / window > most:
-            part = f"{100 * self._gaps / window:.0f} % of {window} ticks"
-            raise SafetyStop(f"no STATE in {part}: the device's forces are unknown")
-        if self._untold / window > _UNTOLD:
-            raise SafetyStop(
-                f"more than {100 * _UNTOLD:g} % of the last {window} STATEs lack a margin: their lateness is unknown"
-            )
-        if late > _LATE:
-            return f"{100 * late:.0f} % of the last {window} answers were late"
-        return None
-
-
-class _Tick(NamedTuple):
-    """The facts about the link that one new STATE reports."""
-
-    margin: int | None  # [us]
-    missed: int
-    gap: int  # ticks without a STATE before this one
-    late: bool
-    odd: bool  # whether this tick counts in any sum of the window
+        late, missed, gaps, untold = (total / _BLOCK for total in self._sums)
+        missed = min(1.0, missed)
+        if missed > _MISSED + late:
+            raise SafetyStop(f"{100 * missed:.0f} % of the last {_BLOCK} ticks had no answer in time")
+        if gaps > _MISSED:
+            raise SafetyStop(f"no STATE in {100 * gaps:.0f} % of {_BLOCK} ticks: the device's forces are unknown")
+        if untold > _UNTOLD:
+            most = f"more than {100 * _UNTOLD:g} % of the last {_BLOCK} STATEs"
+            raise SafetyStop(f"{most} lack a margin: their lateness is unknown")
+        return f"{100 * late:.0f} % of the last {_BLOCK} answers were late" if late > _LATE else None
 
 
 # The clocks of device and host are both compared with the tick number. Only the host's clock reveals a device that
