@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable
@@ -109,19 +108,17 @@ class Driver:
             session.end(Stage.LOST, str(lost), self.clock())
 
     def _call(self, session: Session) -> None:
-        answer: Any
-        understand: Callable[[Any, int], Said]
         try:
             if session.stage == Stage.CONNECTING:
-                answer, understand = self.device.info(), session.met
+                answer = self.device.info()
             elif session.stage == Stage.CONFIGURING:
                 assert session.config
-                answer, understand = self.device.configure(session.config), session.configured
+                answer = self.device.configure(session.config)
             else:
                 force, self._force = self._force, None
-                answer, understand = self.device.exchange(force), session.take
+                answer = self.device.exchange(force)
             if answer is not None:
-                self.do(understand(answer, self.clock()))
+                self.do(session.take(answer, self.clock()))
         except wire.SafetyStop as fault:
             if session.stage == Stage.FINISHED:
                 session.retract(str(fault))

@@ -198,22 +198,13 @@ class Session:
 
     # Calls with the device's answers
 
-    def met(self, info: wire.Info, now: int) -> Said:
-        """Take the device's INFO."""
-        return self._guarded(now, self._on_info, info)
-
-    def configured(self, refused: int, now: int) -> Said:
-        """Process the device's ACK: `refused` says whether the device accepts `config`."""
-        return self._guarded(now, self._on_answer, refused)
-
-    def take(self, state: wire.State, now: int) -> Said:
-        """Answer a STATE."""
-        return self._guarded(now, self._on_state, state)
-
-    def _guarded(self, now: int, understand: Callable[[Any], Said], heard: Any) -> Said:
+    def take(self, answer: wire.Info | wire.State | int, now: int) -> Said:
+        """Process the device's INFO, its STATE, or the result in its ACK. End the session if that raises an error."""
         self.now = now
         try:
-            return understand(heard)
+            if isinstance(answer, wire.Info):
+                return self._on_info(answer)
+            return self._on_state(answer) if isinstance(answer, wire.State) else self._on_ack(answer)
         except wire.SafetyStop as fault:
             return self.end(Stage.STOPPED, str(fault), now)
         except Exception as error:  # any error stops the device
@@ -254,7 +245,7 @@ class Session:
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
         return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
-    def _on_answer(self, refused: int) -> Said:
+    def _on_ack(self, refused: int) -> Said:
         assert self.config
         if refused != wire.Refused.ACCEPTED:
             known = [r.name.lower() for r in wire.Refused if r == refused]

@@ -140,8 +140,8 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
     settings = LinkSettings(measure=50, test_encoders=tested, behind=behind)
     session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), settings), 0, 0
     session.start(t)
-    session.met(info_of(scenario), t)
-    session.configured(Refused.ACCEPTED, t)
+    session.take(info_of(scenario), t)
+    session.take(Refused.ACCEPTED, t)
 
     def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0), margin=17_900):
         nonlocal t, k
@@ -153,7 +153,7 @@ def hand_driven(scenario, rungs, tested=False, behind=()):
     while session.stage == Stage.MEASURING:
         send(Phase.DISARMED)
     session.load(rungs, t)
-    session.configured(Refused.ACCEPTED, t)
+    session.take(Refused.ACCEPTED, t)
     send(Phase.DISARMED)
     session.arm(t)
     send(Phase.DISARMED)
@@ -259,7 +259,7 @@ def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
     if configuring:
-        session.met(info_of(scenario), 0)
+        session.take(info_of(scenario), 0)
     driver.turn()
     driving = State(status, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
     port.coming = encode(driving)
@@ -325,8 +325,8 @@ def test_a_measurement_without_answers_ends(scenario, misses):
     """The measurement ends whether or not the device counts missed answers."""
     session, most = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
-    session.met(info_of(scenario), 0)
-    session.configured(Refused.ACCEPTED, 0)
+    session.take(info_of(scenario), 0)
+    session.take(Refused.ACCEPTED, 0)
     for k in range(1, most + 1):
         silent = State(Phase.DISARMED, k, 0, NO_MARGIN, 0, k * misses & 0xFF, k * T_US, (0, 0), (0, 0))
         session.take(silent, k * T_US)
