@@ -14,7 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Self
+from typing import Any, Self
 
 from haptic_loop.hw.control import Armable
 from haptic_loop.hw.driver import Driver, Operator
@@ -47,7 +47,6 @@ class SerialPort:
             raise InputError(f"--port {path}: {error}") from None
         with suppress(Exception):  # some drivers lack it; on FTDI chips it sets the latency timer from 16 to 1 ms
             self._serial.set_low_latency_mode(True)
-
         self._fd = self._serial.fileno()
 
     def fileno(self) -> int:
@@ -106,9 +105,15 @@ def preflight(paths: Sequence[str]) -> str:
 
 
 def _stalls() -> str:
-    stall = 1e3 * _worst_stall()
-    busy = " (close busy programs; use a real machine, not a virtual one)" if stall > _STALL_MS else ""
-    return f"worst stall in {_STALL_SECONDS:g} s {stall:.1f} ms{busy}"
+    """Measure the largest delay of a sleep of a millisecond."""
+    worst, begun = 0.0, time.monotonic()
+    last = begun
+    while last < begun + _STALL_SECONDS:
+        time.sleep(1e-3)
+        now = time.monotonic()
+        worst, last = max(worst, 1e3 * (now - last) - 1), now
+    busy = " (close busy programs; use a real machine, not a virtual one)" if worst > _STALL_MS else ""
+    return f"worst stall in {_STALL_SECONDS:g} s {worst:.1f} ms{busy}"
 
 
 def _scheduling() -> str:
@@ -137,17 +142,6 @@ def _latency_timer(path: str) -> str:
     return f"latency timer {ms} ms" + (f" (setserial {path} low_latency)" if ms > 1 else "")
 
 
-def _worst_stall() -> float:
-    """Return the largest delay [s] of a sleep of a millisecond."""
-    worst, begun = 0.0, time.monotonic()
-    last = begun
-    while last < begun + _STALL_SECONDS:
-        time.sleep(1e-3)
-        now = time.monotonic()
-        worst, last = max(worst, now - last - 1e-3), now
-    return worst
-
-
 class Live(Driver):
     """Run a session with a device until it ends, with a person at the keyboard."""
 
@@ -164,13 +158,14 @@ class Live(Driver):
         super().__init__(session, device, self._designed, lambda: int(time.monotonic_ns() * pace) // 1000)
         self._design, self._operator = plan, operator
         self._keyboard, self._watch = keyboard, watch
-        self.signals: list[int] = []
+        self.signals: list[int] = []  # signals that came, to be handled between two exchanges
         self._watched = 0
 
     def run(self) -> Session:
         """Run the session from HELLO to its end. Stop the device before an exception is raised again."""
         session = self.session
-        with _signals(self.signals), _no_collections():
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
+        with _handled(numbers, lambda number, _: self.signals.append(number)), _no_collections():
             try:
                 session.start(self.clock())
                 while session.stage not in ENDED:
@@ -195,8 +190,7 @@ class Live(Driver):
 
     def _steer(self, now: int) -> None:
         session = self.session
-        if self._typed():
-            self._pressed()
+        self._act_on_keys()
         if said := self._operator.decide(session, now):
             self.do(said)
         if self.signals and signal.SIGUSR1 in self.signals:
@@ -213,23 +207,20 @@ class Live(Driver):
         """Return the designed couplings, and act on keys typed meanwhile. Raises SafetyStop if SIGINT came."""
         self._watch(self.session)  # show the stage now, because the design takes a while
         try:
-            with _interruptible():
+            with _handled([signal.SIGINT], signal.default_int_handler):  # No force acts during the design.
                 programs = self._design(ages)
         except KeyboardInterrupt:
             self.signals.append(signal.SIGINT)
             raise SafetyStop("SIGINT during the design") from None
-        if self._typed():
-            self._pressed()
+        self._act_on_keys()
         gc.collect()  # freeze the solver that the design has loaded
         gc.freeze()
         return programs
 
-    def _typed(self) -> bool:
-        return self._keyboard is not None and bool(select.select([self._keyboard], [], [], 0)[0])
-
-    def _pressed(self) -> None:
-        """Act on the keys typed. A lost terminal counts as SIGHUP, because the person is gone."""
-        assert self._keyboard is not None
+    def _act_on_keys(self) -> None:
+        """Act on keys typed since the last call. A lost terminal counts as SIGHUP, because the person is gone."""
+        if self._keyboard is None or not select.select([self._keyboard], [], [], 0)[0]:
+            return
         keys = b""
         with suppress(OSError):
             keys = os.read(self._keyboard, 64)
@@ -241,25 +232,14 @@ class Live(Driver):
 
 
 @contextmanager
-def _signals(received: list[int]) -> Iterator[None]:
-    """Collect SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), to be handled between two exchanges."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
-    before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
+def _handled(numbers: Sequence[int], handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Handle the signals `numbers` in this context by `handler`."""
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let SIGINT raise KeyboardInterrupt during a design, which may take long. No force acts meanwhile."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 @contextmanager

@@ -333,7 +333,7 @@ def test_keys_typed_during_design_do_not_arm(typed, stage):
     assert select.select([keyboard], [], [], 0)[0] == []
     assert session.stage == stage
     os.close(person)
-    live._pressed()  # the terminal is gone
+    live._act_on_keys()  # the terminal is gone
     assert live.signals == [signal.SIGHUP]
     os.close(keyboard)
 

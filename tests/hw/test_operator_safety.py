@@ -1,5 +1,6 @@
 """Test the deadman, limits, the incident log after a kill, the pre-flight of the machine, and rehearsals."""
 
+import itertools
 import json
 import os
 import re
@@ -305,8 +306,11 @@ def test_the_preflight_says_what_the_machine_can_do():
 
 def test_long_stalls_advise_to_close_busy_programs(monkeypatch):
     for stall, told in ((5e-4, False), (5e-3, True)):
-        monkeypatch.setattr(transport, "_worst_stall", lambda stall=stall: stall)
+        ticks = itertools.count()  # Each sleep of a millisecond lasts longer by `stall`.
+        clock = SimpleNamespace(monotonic=lambda ticks=ticks, stall=stall: next(ticks) * (1e-3 + stall), sleep=id)
+        monkeypatch.setattr(transport, "time", clock)
         assert ("close busy programs" in transport._stalls()) == told
+        assert f"2 s {1e3 * stall:.1f} ms" in transport._stalls()
 
 
 # the whole command in virtual time
