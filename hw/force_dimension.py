@@ -114,40 +114,33 @@ class ForceDimension:
 
     def configure(self, config: wire.Config) -> int:
         with self._off_after_an_error():
-            return self._configure(config)
-
-    def _configure(self, config: wire.Config) -> int:
-        self._device.configure(config)
-        (ack,) = self._decoder.feed(self._device.ack)
-        self._device.ack = b""
-        assert isinstance(ack, wire.Ack)
-        if not ack.refused:
-            for index, ID in self._ids.items():
-                self._heeded(self._sdk.setMaxForce(self._strongest(config, index), ID=ID))
-                self._heeded(self._sdk.enableForce(True, ID=ID))
-            self._write(self._device.zero)
-        return ack.refused
+            self._device.configure(config)
+            (ack,) = self._decoder.feed(self._device.ack)
+            self._device.ack = b""
+            assert isinstance(ack, wire.Ack)
+            if not ack.refused:
+                for index, ID in self._ids.items():
+                    self._heeded(self._sdk.setMaxForce(self._strongest(config, index), ID=ID))
+                    self._heeded(self._sdk.enableForce(True, ID=ID))
+                self._write(self._device.zero)
+            return ack.refused
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
         with self._off_after_an_error():
-            return self._exchange(force)
-
-    def _exchange(self, force: wire.Force | None) -> wire.State | None:
-        if force is not None:
-            self._device.receive(wire.encode(force), came := self._now())
-            self._write(self._device.applied)
-            if self._device.margin != wire.NO_MARGIN:  # a force acts only after it was written
-                self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
-        while (left := self._due - self._clock()) > 0:
-            self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
-        now = self._clock()
-        self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
-        self._check_status()
-        before = self._device.applied
-        _, out = self._device.tick(self._now(), self._counts())
-        if self._device.applied != before or force is None:
-            self._write(self._device.applied)
-        return next((m for m in self._decoder.feed(out) if isinstance(m, wire.State)), None)
+            if force is not None:
+                self._device.receive(wire.encode(force), came := self._now())
+                self._write(self._device.applied)
+                if self._device.margin != wire.NO_MARGIN:  # a force acts only after it was written
+                    self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
+            while (left := self._due - self._clock()) > 0:
+                self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
+            self._due = max(self._due, self._clock() - (1 - _SHORTEST) * self._T) + self._T
+            self._check_status()
+            before = self._device.applied
+            _, out = self._device.tick(self._now(), self._counts())
+            if self._device.applied != before or force is None:
+                self._write(self._device.applied)
+            return next((m for m in self._decoder.feed(out) if isinstance(m, wire.State)), None)
 
     def stop(self, reason: wire.Reason) -> None:
         self._device.receive(wire.encode(wire.Stop(reason)), self._now())
@@ -212,14 +205,11 @@ class ForceDimension:
                 "is in reset mode: calibrate it": armed and status.reset,
             }
             if armed and not status.force:
-                troubles[f"has switched its forces off, cause {self._cause(status.forceoffcause)}"] = 1
+                names = {cause.value: cause.name.lower() for cause in self._sdk.ForceOffCause}
+                cause = names.get(status.forceoffcause, status.forceoffcause)
+                troubles[f"has switched its forces off, cause {cause}"] = 1
             if wrong := next((words for words, there in troubles.items() if there), None):
                 raise wire.SafetyStop(f"device {index} {wrong}")
-
-    def _cause(self, number: int) -> str:
-        """Return the name of the cause for which a device has switched its forces off, or its number if it has none."""
-        known = {cause.value: cause.name.lower() for cause in self._sdk.ForceOffCause}
-        return known.get(number, str(number))
 
     def _write(self, steps: tuple[int, ...]) -> None:
         forces = {index: [0.0, 0.0, 0.0] for index in self._ids}
