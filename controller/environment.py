@@ -495,7 +495,7 @@ class Network(
         return rows
 
 
-#: mass [kg], damping [N s/m] and stiffness [N/m] as from Network.matrices, (..., nodes, nodes) each
+#: Mass [kg], damping [N s/m] and stiffness [N/m] as from Network.matrices, (..., nodes, nodes) each.
 _Matrices = tuple[Array, Array, Array]
 
 

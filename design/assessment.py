@@ -69,10 +69,6 @@ from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_r
 PluggedEnvironment = Callable[[Array], Array]
 
 
-# ----------------------------------------------------------------------------------------------------
-# The environments of ranges.
-
-
 _SAMPLES = 64  # default number of environments that are drawn at random from inside the ranges
 
 
@@ -246,10 +242,6 @@ def violated_between(where: str, place: Member, ratio: float) -> str:
     return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
 
-# ----------------------------------------------------------------------------------------------------
-# Forces at their limits.
-
-
 _OWN_PROOF = "by a separate proof for this environment"  # part of a printed line
 
 
@@ -394,10 +386,6 @@ def _rows(
     return plain.rows(loop, requirement.multiplier or ())
 
 
-# ----------------------------------------------------------------------------------------------------
-# Comparison of the energy of encoder steps with the devices' Coulomb friction.
-
-
 @dataclass(frozen=True)
 class EncoderSteps:
     """Whether the declared Coulomb friction dissipates the work that encoder steps can do."""
@@ -456,10 +444,6 @@ class EncoderSteps:
             has += " N"
         enough = f"friction of {amounts} N is enough for {widths} um, the axes have {has}"
         return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
-
-
-# ----------------------------------------------------------------------------------------------------
-# The guarantee and the assessment.
 
 
 @dataclass(frozen=True)

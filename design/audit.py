@@ -39,10 +39,6 @@ from haptic_loop.design.worst_member import Progress
 if TYPE_CHECKING:
     from haptic_loop.design.coverage import SwitchingFigures
 
-# ----------------------------------------------------------------------------------------------------
-# The damping that a condition requires for a coupling in its loop.
-
-
 LONGEST_DELAY = 100  # samples; beyond it a sweep takes seconds, and no device has enough damping
 
 _Condition = ConditionName | Condition
@@ -97,7 +93,7 @@ def check_loop(loop: Loop) -> None:
 
 _Ratio = Callable[[float], float]  # value that is varied -> required over available damping
 
-#: ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond those of any device
+#: Ends of the searches for the stiffest K [N/m], the largest T [s] and extra samples, far beyond those of any device.
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # softest K [N/m] of the search, and the ratio between successive values
 _EDGE = 1e-7  # relative accuracy of the value at which the certificate ends
@@ -288,10 +284,6 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
             share = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
         share += math.copysign(least / 2, fa)
         share = min(1 - least / 2, max(least / 2, share))
-
-
-# ----------------------------------------------------------------------------------------------------
-# Changes that help a coupling that is not certified, each tried alone.
 
 
 _FACTORS = (0.75, 0.5, 0.25, 0.1)  # factors on B and T that are tried

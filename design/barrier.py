@@ -252,10 +252,6 @@ def _solve_positive(H: Array, b: Array) -> Array:
     return _lapack("dpotrs")(factor, np.asarray_chkfinite(b), lower=True)[0]
 
 
-# ----------------------------------------------------------------------------------------------------
-# The path x(t) of the barrier method.
-
-
 def centre(program: Program, x: Array, t: float) -> Array:
     """Return an approximate minimiser of t (|A x - b|^2 + c'x) - sum log det S; the start x is strictly feasible."""
     cost = program.step_cost

@@ -46,8 +46,7 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import NotProved, Requirement, refusal, switching_guarantee
 
-#: Allowed error of figures on file: of required damping relative to the largest available damping, of the margin
-#: relative to itself. Repeated sweeps agree to 1e-9.
+#: Allowed error of figures on file, relative to the largest available damping or to the margin. Sweeps agree to 1e-9.
 _CLAIM_TOLERANCE = 1e-6
 
 
@@ -63,12 +62,9 @@ def _in_time() -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The certificate of a coupling is proved once and stored. `verify` repeats the proof from the file alone, without a
-# solver. The proof shows that static matrices are symmetric, and positive semidefinite where required. It shows that
-# each block of the condition at the available damping is strictly positive real (design.exact), which implies that F,
-# or V-hat, is stable. For any-environment with psi = 0, the multiplier Phi = 0 satisfies Lemma 4, because the
-# environment is passive (Environment.active is None). Other multipliers are stored.
-#
+# The proof shows that static matrices are symmetric, and positive semidefinite where required, and that each block of
+# the condition at the available damping is strictly positive real (design.exact). This implies that F, or V-hat, is
+# stable. For any-environment with psi = 0, Phi = 0 satisfies Lemma 4, because the environment is passive.
 # With ranges, a condition that uses the environment is proved for the nominal environment (matrix P) and for at most
 # 128 vertices (P1, P2, ..). Environments between the vertices, or environments that change with time, have no proof.
 

@@ -6,22 +6,9 @@ Poles at z = 1 are split off by `over_z_minus_one`. The same expression is evalu
 required damping), over Fractions (an exact proof), over stacks and over sampled responses (maps and designs).
 docs/theory.md derives the conditions; numbers such as (12) are equations of the paper.
 
-A condition is composed of one **hands' side** and of **facts** of the environment's side (design.facts). A `HandsSide`
-states whether periods vary, forces have a latency, or devices have known motors. A `Fact` is a wall, delays that
-switch, or the limiter. `compose` stacks their inputs and adds their forms, as design.facts describes.
-design.environments and design.known_device search for multipliers. design.certificate proves all conditions in the same
-way, and design.coupling_file stores the proofs.
-
-To add a hands' side, derive a class from `HandsSide` and state
-  `inputs`   one `Input` per scalar input. Its `moved` lists w_0, w_1, ..: the input is multiplied by w_0 + w_1 z + ..
-             in the displacement that f[k] multiplies. `moved` is (1,) for dx, (0, 1) for xa of a latency, which f[k-1]
-             multiplies, and (-beta, beta) for the speed v of a known device in f'(dx + beta dv). `follows` is 0 for a
-             speed and 1 for a displacement. `slips` says whether the limiter's slip is subtracted from the input;
-  `damping`  the part of its quadratic form that is proportional to Delta_D, a matrix over its inputs;
-  `rest`     matrices M_0, M_1 of the other part of the form, M_0 + M_1/z;
-  `unknowns` its multipliers, by name; `room`, `allowed` and `excess` state which values are allowed.
-Let `hands_side(loop)` return an instance of the class for the loops that it covers. `compose` then makes the rows and
-adds walls, limiter and switching without further code.
+A condition is composed of one **hands' side** and of **facts** of the environment's side. design.facts describes both
+and has the classes to derive new ones from. design.environments and design.known_device search for multipliers.
+design.certificate proves all conditions in the same way, and design.coupling_file stores the proofs.
 """
 
 from __future__ import annotations

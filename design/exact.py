@@ -201,7 +201,6 @@ def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
 
 
 def _nearest(num: int, den: int, shift: int) -> int:
-    """Return num/den times 2^shift, rounded to the nearest integer."""
     num, den = (num << shift, den) if shift >= 0 else (num, den << -shift)
     return (2 * num + den) // (2 * den)
 
@@ -232,7 +231,6 @@ def _definite(W: _Integers, bits: int) -> bool:
 
 
 def _longest(W: _Integers) -> int:
-    """Return the number of bits of the largest entry."""
     return max(map(int.bit_length, W.ravel().tolist()), default=0)
 
 
@@ -248,10 +246,7 @@ def _dominates(W: Array) -> bool:
 
 
 def _floats(W: _Integers) -> Array:
-    """Return W in double precision, times a power of two that brings its largest entry near one.
-
-    The error of each entry is at most 2^-53 of itself plus 2^-900 of the largest.
-    """
+    """Return W in double precision, times a power of two that brings its largest entry near one."""
     longest = _longest(W)
     shift = max(longest - 950, 0)
     return np.ldexp((W >> shift).astype(np.float64), shift - longest)
@@ -443,11 +438,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """Return (a change of coordinates, P in the new coordinates).
-
-    With `white`, white noise at the inputs makes the new states independent; without it the change is the identity.
-    Raises LinAlgError.
-    """
+    """Return (a change of coordinates, P in the new ones); the identity without `white`. Raises LinAlgError."""
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
         out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2

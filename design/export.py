@@ -430,10 +430,6 @@ def _delays(loop: Loop, with_theta: bool) -> str:
     return f"delays in samples: environment psi = {shown(loop.psi)}, transmission theta = {shown(loop.theta)} ({theta})"
 
 
-# ----------------------------------------------------------------------------------------------------
-# The C file of a block, with its test.
-
-
 _SOURCE_C = Template("""\
 /*
 $about

@@ -29,9 +29,6 @@ from haptic_loop.controller.lti import Array, Block, Lti, Sampled, as_like, cons
 from haptic_loop.design import budgets
 from haptic_loop.design.arguments import shown
 
-# ----------------------------------------------------------------------------------------------------
-# The frame: inputs, rows, and the block that they form.
-
 
 @dataclass(frozen=True, eq=False)
 class Demand(Generic[Block]):
@@ -78,7 +75,6 @@ _Weights = Sequence[Any]  # coefficients of w_0 + w_1/z + .. (in a row) or of w_
 
 
 def _product(p: _Weights, q: _Weights) -> list[Any]:
-    """Return the weights of the product of two polynomials."""
     out: list[Any] = [0] * (len(p) + len(q) - 1)
     for i, a in enumerate(p):
         for j, b in enumerate(q):
@@ -189,8 +185,6 @@ class Collected(Generic[Block]):
     def size(self) -> int:
         return len(self.places)
 
-    # -- effects of inputs
-
     def press(self, i: int, wall: int, weights: _Weights) -> None:
         """Let input i add to the steps of a wall's force."""
         self._into.append((self.channels + wall, i, weights))
@@ -198,8 +192,6 @@ class Collected(Generic[Block]):
     def force(self, i: int, channel: int, weights: _Weights) -> None:
         """Let input i add to the steps of a channel's sent force f_e, besides the environment's response."""
         self._force.append((channel, i, weights))
-
-    # -- terms of rows
 
     def sums(self, row: int, channel: int, weights: _Weights) -> None:
         """Add the weighted sent force to a row. The force sums up its steps, so the row has a pole at z = 1."""
@@ -236,8 +228,6 @@ class Collected(Generic[Block]):
         for row, amount in self._keep:
             spare[row] += amount
         return spare if self._keep else None
-
-    # -- the block
 
     def _matrix(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
         out: Any = numbers(np.zeros((self.size, self.size), dtype=int), self.T) + 0
@@ -351,10 +341,6 @@ def _of_weights(entries: Sequence[tuple[int, int, _Weights]], outputs: int, inpu
     return Lti(A, B, C, D, T)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Multipliers.
-
-
 Values = Mapping[str, Sequence[Any]]  # values of the multipliers, by name
 
 
@@ -388,10 +374,6 @@ class Unknowns:
 def longest(loop: Loop, T: Number) -> Any:
     """Return the longest period [s] in the arithmetic of T."""
     return T if loop.T_max is None else numbers(loop.T_max, T)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Hands' sides: lower bounds of the energy that passive hands and their devices dissipate under any forces.
 
 
 class HandsSide(ABC):
@@ -731,10 +713,6 @@ class Limited(Fact):
             block.steps(e, i, _less_advance(block.path[i], 1))
             for j, weight in enumerate(c, start=1):
                 block.steps(e, i, tuple(range(j, 0, -1)), -weight)
-
-
-# ----------------------------------------------------------------------------------------------------
-# The composition.
 
 
 def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:

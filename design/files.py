@@ -46,10 +46,6 @@ class InputError(ValueError):
     """A mistake in the user's input. The message is one line that names the field."""
 
 
-# ----------------------------------------------------------------------------------------------------
-# User input in messages.
-
-
 def printable(text: str) -> str:
     """Return the text with unprintable characters escaped, except line ends and tabs."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
@@ -67,10 +63,6 @@ def one_line(text: object) -> str:
     words = _QUOTED.sub(lambda match: _cut(match[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
-
-
-# ----------------------------------------------------------------------------------------------------
-# The files that a command has read, and those that its options name as output.
 
 
 def counted(path: str) -> str:

@@ -1,7 +1,4 @@
-"""Suprema, peaks and integrals over frequency, for the sweeps of all conditions.
-
-Grids are dense near poles, and peaks are refined between the points of a grid.
-"""
+"""Suprema, peaks and integrals over frequency, for the sweeps of all conditions."""
 
 from __future__ import annotations
 
@@ -15,10 +12,6 @@ from numpy.typing import NDArray
 from haptic_loop.controller.arithmetic import spend, within
 from haptic_loop.controller.lti import Array, Lti, frozen
 from haptic_loop.design import budgets
-
-# ----------------------------------------------------------------------------------------------------
-# Integrals over frequency, by Gauss's rule on intervals that are halved until the result settles.
-
 
 _ERROR = 1e-6  # allowed relative error of an integral
 _ROUNDING = 1e-20  # Smaller means count as 0: rounding causes them in squared differences of nearly equal responses.
@@ -242,7 +235,8 @@ _GAIN = 1e-13  # relative gain of a peak that a search neglects
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
     """Return frequencies (peaks,) of local maxima of `response` above `above`, 32 at most, refined between grid points.
 
-    Maxima that are lower than the highest by more than the share `near` are left out. The last ones stand out most.
+    Maxima that are lower than the highest by more than the share `near` are left out. The last ones stand out most: on
+    the grid they have the largest `_reach`.
     """
     spend(_POINT * grid.size)
     values = response(grid)

@@ -444,10 +444,6 @@ class KnownDeviceLoop(SampledLoop):
         return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
 
 
-# ----------------------------------------------------------------------------------------------------
-# The search, with frequencies added where a refined sweep finds a violation.
-
-
 _SAME = 1e-3  # Two results of a search are one local optimum if no entry of x differs by more.
 
 

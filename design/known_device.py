@@ -57,9 +57,6 @@ from haptic_loop.design.result import (
     suffices,
 )
 
-# ----------------------------------------------------------------------------------------------------
-# The least cost of a period.
-
 
 def shortest_period(loop: Loop) -> float | None:
     """Return the shortest period [s] of the loop; None if T_max declares that periods vary, without a T_min."""
@@ -641,9 +638,6 @@ def positive(H: Complex) -> NDArray[np.bool_]:
             )
     return holds
 
-
-# ----------------------------------------------------------------------------------------------------
-# The conditions.
 
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "T_min: a known device with periods up to T_max needs a shortest period; add T_min to the scenario"

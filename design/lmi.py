@@ -3,8 +3,7 @@
 The designs by Theorem 4 use this module. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be
 positive (semi)definite; their arguments are arrays or cvxpy expressions.
 
-The strict inequalities (2), (15), (17) and (18) of the paper have no solution; docs/theory.md has the remedies, which
-design.conditions applies.
+The strict inequalities (2), (15), (17) and (18) of the paper have no solution; docs/theory.md has the remedies.
 """
 
 from __future__ import annotations
@@ -97,10 +96,6 @@ class Shaping:
         return supremum(lambda w: self.gain(V, w), self.grid(V))
 
 
-# ----------------------------------------------------------------------------------------------------
-# Symmetric matrices of unknowns, as vectors.
-
-
 def packed(n: int) -> int:
     """Return the number of free entries of a symmetric matrix (n, n)."""
     return n * (n + 1) // 2
@@ -170,10 +165,6 @@ def _root(A: Array, B: Array) -> Array:
     W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
     values, basis = np.linalg.eigh((W + W.T) / 2)
     return basis * np.sqrt(np.maximum(values, 0.0))
-
-
-# ----------------------------------------------------------------------------------------------------
-# The paper's lemmas.
 
 
 _Matrix = Any  # Array or cvxpy expression, (rows, columns)

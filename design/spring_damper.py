@@ -149,10 +149,6 @@ class _GainSet:
         raise DesignFailed(None, (), line)
 
 
-# ----------------------------------------------------------------------------------------------------
-# A bound on the gain of a response that is affine in real variables, at sampled frequencies.
-
-
 def _gain_block(
     unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
 ) -> Inequality:

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.loop import DeviceBounds
 
-# ----------------------------------------------------------------------------------------------------
-# Physical quantities with their units and the range in which a value makes sense.
-
 
 def require(field: str, value: float, low: float, high: float, unit: str) -> None:
     """Raise ValueError unless low <= value <= high (nan is refused), TypeError for anything but a number."""

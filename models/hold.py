@@ -60,7 +60,7 @@ def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float])
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """Return the matrix (..., m, entries) from [s; held forces; w; f] to each position when its force latches."""
+    """Return matrices (..., m, entries) from [s; held forces; w; f] to a channel's position when its force latches."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))

@@ -26,9 +26,6 @@ _Amount = float | tuple[float | tuple[float, ...], ...]
 
 _ROUNDING = 1e-9  # negative Re Z that is attributed to rounding, relative to the mean of |Z|
 
-# ----------------------------------------------------------------------------------------------------
-# Ports: the mechanics that a handle feels.
-
 
 @dataclass(frozen=True, eq=False)
 class Impedance:
@@ -160,7 +157,7 @@ class Port:
         return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
 
     def in_space(self, axes: int) -> Self:
-        """Return this port on `axes` axes; one axis is repeated. Raises ValueError for another number of axes."""
+        """Return this port on `axes` axes, repeated on each if it has one. Raises ValueError for another number."""
         if self.axes == axes:
             return self
         if self.axes > 1:
@@ -295,10 +292,6 @@ def _freeze(record: object, name: str, values: Any) -> None:
     object.__setattr__(record, name, array)
 
 
-# ----------------------------------------------------------------------------------------------------
-# The humans of scenarios.
-
-
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A mass and the spring-damper from it to the next mass, or to the moving equilibrium.
 
@@ -406,7 +399,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         return Port.chain_in_space(np.array(rows), axes)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Return the force [N] of the equilibrium's motion on the last mass at times t (N,) [s], (N,) or (N, axes)."""
+        """Return the force [N] of the equilibrium's motion on the last mass, (N,) or (N, axes), at times t (N,) [s]."""
         if self.voluntary is None:
             return np.zeros_like(t)
         last, along = self.links[-1], self.voluntary.along

@@ -375,7 +375,7 @@ class _Amounts(NamedTuple):
     stiffness: dict[str, Any]
 
 
-#: the mechanics of every device in every set of humans; () if the devices keep the scenario's mechanics
+#: The mechanics of every device in every set of humans; () if the devices keep the scenario's mechanics.
 _Drawn = tuple[tuple[Mechanics, ...], ...]
 
 
@@ -513,7 +513,7 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
 
 
 def _add_bodies(spec: mujoco.MjSpec, joints: Sequence[str], row: Mapping[str, float]) -> None:
-    """Add the bodies of hands with these joints, each in the row (y [m]) of its device."""
+    """Add the bodies of hands with these joints; `row` has the y coordinate [m] of each joint's device."""
     import mujoco
 
     for step, name in enumerate(dict.fromkeys(map(_body, joints)), start=1):

@@ -64,10 +64,6 @@ class _Part:
     at_the_port: str  # the bound
 
 
-# ----------------------------------------------------------------------------------------------------
-# Files
-
-
 def files_of(path: Path) -> list[Path]:
     """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
@@ -598,7 +594,7 @@ class WorldPort:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """Return the sum of the positive excesses [J], an upper bound on the energy created in the last step."""
+        """Return the sum [J] of the positive `Rows.excess`, an upper bound of the energy created in the last step."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 
