@@ -38,14 +38,14 @@ from haptic_loop.cli.execute import execute
 from haptic_loop.sim import plots
 
 SECONDS = 20  # CPU seconds that a case may take
-#: characters that control a terminal
-STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")
+STEERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff]")  # characters that control a terminal
 TOGETHER = 100  # cases per process: starting a process costs more than most cases
+MOMENTS = 30  # number of moments at which Ctrl-C is sent
 
 
 def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield each case's name and what is wrong with its end. If a case ends its process, a new one runs the rest."""
-    good = {str(path.relative_to(model)): content(path) for path in model.rglob("*")}
+    good = contents(model)
     while cases:
         places = [Path(tempfile.mkdtemp(dir=folder)) for _ in cases]
         if (child := os.fork()) == 0:
@@ -64,36 +64,46 @@ def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str
         cases = cases[len(ended) + 1 :]
 
 
-def furnished(model: Path, place: Path) -> None:
+def furnished(model: Path, place: Path) -> Path:
+    """Copy the model's files and its pipe to a new folder, and return this folder."""
     shutil.copytree(model, place, symlinks=True, ignore=shutil.ignore_patterns("fifo"), copy_function=shutil.copyfile)
     os.mkfifo(place / "fifo")
+    return place
 
 
 def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str]:
     """Return what is wrong with a case that has ended: its exit code, its message, or changed files."""
     err, files = (place / "err").read_text(errors="surrogateescape"), place / "files"
+    found = contents(files)
     expected = good | (json.loads((place / "changed").read_text()) if (place / "changed").exists() else {})
-    closed = "stderr closed" in case.name or "stdall" in case.name
-    full = "--json -: full" in case.name
-    wrong = []
+    closed, wrong = "stderr closed" in case.name or "stdall" in case.name, []
     if code not in case.codes:
         wrong.append(f"code {code}, expected {case.codes}: {err[-300:]!r}")
     if any(word in err for word in ("Traceback", "Warning", "Exception ignored")):
         wrong.append(f"no answer: {err[-400:]!r}")
     one_line = err.count("\n") == 1 and not STEERS.search(err[:-1]) and len(err) <= 1200
-    if code in (2, 3) and not closed and not full and not one_line:
+    if code in (2, 3) and not (closed or one_line or "--json -: full" in case.name):
         wrong.append(f"not one line: {err[:300]!r}")
-    if code == BUT and code in case.codes and case.says and not closed and not re.search(case.says, err):
+    if code == BUT and code in case.codes and not (closed or re.search(case.says, err)):
         wrong.append(f"does not say {case.says!r}: {err[:300]!r}")
-    wrong += [f"{name} was changed" for name, digest in expected.items() if content(files / name) != digest]
-    return wrong + [f"{path.name} is left" for path in files.rglob(".*.*")]
+    wrong += [f"{name} was changed" for name, digest in expected.items() if found.get(name) != digest]
+    return wrong + left(files)
 
 
-def content(path: Path) -> str:
-    """Return a link's target, a file's hash, or whether something else is a folder."""
-    if path.is_symlink():
-        return os.readlink(path)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(path.is_dir())
+def contents(folder: Path) -> dict[str, str]:
+    """Return path -> a link's target, a file's hash, or whether the path is a folder."""
+
+    def content(path: Path) -> str:
+        if path.is_symlink():
+            return os.readlink(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(path.is_dir())
+
+    return {str(path.relative_to(folder)): content(path) for path in folder.rglob("*")}
+
+
+def left(folder: Path) -> list[str]:
+    """Return a line for each half-written file."""
+    return [f"{path.name} is left" for path in folder.rglob(".*.*")]
 
 
 def run(case: Case, place: Path) -> int:
@@ -113,11 +123,9 @@ def run(case: Case, place: Path) -> int:
         sys.setrecursionlimit(1000)
         warnings.simplefilter("default", append=True)  # show a warning again in each case
         if case.before:
-            before = {str(path.relative_to(files)): content(path) for path in files.rglob("*")}
-            put(place / "changed", "{}")
+            old = contents(files)
             case.before()
-            after = {str(path.relative_to(files)): content(path) for path in files.rglob("*")}
-            put(place / "changed", json.dumps({name: one for name, one in after.items() if before.get(name) != one}))
+            put(place / "changed", json.dumps(dict(contents(files).items() - old.items())))
         command, *words = case.words
         execute(lambda argv: put(place / "begun", "") or import_module(f"haptic_loop.cli.{command}").main(argv), words)
     except SystemExit as end:
@@ -135,17 +143,14 @@ def run(case: Case, place: Path) -> int:
     return code
 
 
-MOMENTS = 30
-
-
 def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield what is wrong with the end of a run after Ctrl-C at MOMENTS moments, and after SIGTERM at half as many."""
     words = ("run", "--duration", "2", "--out", "new")
     rng, whole, missed, code = np.random.default_rng(7), 0.0, 0, 99
-    signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # the first run measures the duration
+    ends = {0: (0, ("",)), signal.SIGINT: (130, ("", "interrupted\n")), signal.SIGTERM: (143, ("terminated\n",))}
+    signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # 0: measure the duration
     for number, sent in enumerate(signals):
-        place = folder / f"signal-{number}"
-        furnished(model, place / "files")
+        place = furnished(model, folder / f"signal-{number}" / "files").parent
         if (child := os.fork()) == 0:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             try:
@@ -160,32 +165,25 @@ def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
             os.kill(child, sent)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         whole = whole or time.perf_counter() - begin
-        err = (place / "err").read_text()
-        ends = {0: (0, ("",)), signal.SIGINT: (130, ("", "interrupted\n")), signal.SIGTERM: (143, ("terminated\n",))}
-        right, lines = ends[sent]
-        late = sent and code == 0 and (place / "files" / "new" / "report.json").exists()  # the signal came too late
+        err, (right, lines) = (place / "err").read_text(), ends[sent]
+        late = sent and code == 0 and (place / "files" / "new" / "report.json").exists()
         missed += bool(late)
         wrong = [] if late or (code == right and err in lines) else [f"code {code}, {err[-400:]!r}"]
         wrong += ["the signal came after the end for the tenth time"] if missed == 10 else []
-        wrong += [f"{path.name} is left" for path in place.rglob(".*.*")]
-        yield f"signal {sent} after {moment:.3f} of {whole:.2f} s", wrong
+        yield f"signal {sent} after {moment:.3f} of {whole:.2f} s", wrong + left(place)
 
 
 def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield the names of the cases that contain the word, and what is wrong with the end of each case."""
     found = [case for part in (hostile_words, hostile_files) for case in part.cases() if word in case.name]
-    for first in range(0, len(found), TOGETHER):
-        yield from answered(found[first : first + TOGETHER], folder, model)
-    for case in streams():  # each changes the streams or the memory of its process
-        if word in case.name:
-            yield from answered([case], folder, model)
+    groups = [found[first : first + TOGETHER] for first in range(0, len(found), TOGETHER)]
+    # The cases of `streams` change the streams or the memory of their process, so each has its own process.
+    for group in [*groups, *([case] for case in streams() if word in case.name)]:
+        yield from answered(group, folder, model)
 
 
 def warm(model: Path) -> None:
-    """Run good commands once, so that no case loads, compiles or caches what they need; draw pictures coarsely.
-
-    tests/sim/test_plots.py draws with the layout, which takes as long as the drawing.
-    """
+    """Run good commands once, so that no case loads, compiles or caches what they need; draw pictures coarsely."""
     save = plots.save
 
     def coarse(figure: Figure, path: Path, dpi: int = 20) -> Path:
@@ -195,7 +193,7 @@ def warm(model: Path) -> None:
     plots.save = coarse
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        os.chdir(shutil.copytree(model, Path(folder, "files"), symlinks=True, ignore=shutil.ignore_patterns("fifo")))
+        os.chdir(furnished(model, Path(folder, "files")))
         for command, *words in [*LEAST, ("trace", "t.npz", "--plot", "a.png")]:
             import_module(f"haptic_loop.cli.{command}").main(words)
         os.chdir(before)
@@ -210,13 +208,13 @@ def main() -> int:
     if shared := os.environ.get("SHARED_DESIGNS"):
         forked.share_designs(Path(shared))
     begin = time.perf_counter()
-    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # ten thousand small files: a disk takes longer
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=memory) as folder:
         model = Path(folder) / "model"
         model.mkdir()
         furnish(model)
         warm(model)
-        gc.freeze()  # a collection in a fork would write to, and so copy, every page of what is imported
+        gc.freeze()  # Otherwise a garbage collection in a fork would copy the memory of all modules.
         ends = signalled(Path(folder), model) if word == "--signals" else chosen(word, Path(folder), model)
         count = bad = 0
         for count, (name, wrong) in enumerate(ends, start=1):  # noqa: B007

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import resource
 import shlex
 import sys
@@ -61,6 +62,16 @@ QUICK = {  # a command's required arguments, and options that keep it short
 }
 
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
+
+
+def quick(command: str, *more: str) -> tuple[str, ...]:
+    """Return a command line with the command's QUICK words."""
+    return (command, *QUICK[command], *more)
+
+
+def entries(table: str) -> list[str]:
+    """Return the entries of a text, which are separated by bars between blanks, or by line ends."""
+    return re.split(r" \| |\n *", table)
 
 
 def furnish(folder: Path) -> None:

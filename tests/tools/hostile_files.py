@@ -2,230 +2,146 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from hostile_cases import BUT, QUICK, SHORT, TEXT, Case, npz, pairs, put, stored, toml, written
+from hostile_cases import BUT, SHORT, TEXT, Case, entries, npz, pairs, put, quick, stored, toml, written
 
+with_T, LATE = partial(TEXT.replace, "T = 1.2e-3"), TEXT.replace("T = 1.2e-3", "T = 9")
+#: name -> text of a file that is no scenario
 NO_SCENARIOS = {
-    "nested": "a = " + 900 * "[" + 900 * "]",
-    "deeply nested": "a = " + 100_000 * "[",
+    "nested": "a = " + 900 * "[" + 900 * "]", "deeply nested": "a = " + 100_000 * "[",
     "tables in tables": "a = " + 900 * "{a = " + "1" + 900 * "}",
     "a long integer": TEXT.replace("theta = [1, 2]", f"theta = [1, {5000 * '9'}]"),
-    "dotted": "a" + 100_000 * ".a" + " = 1",
-    "dotted and quoted": '"a"' + 50_000 * '."a"' + " = 1",
-    "dotted table": "[a" + 30_000 * ".a" + "]",
-    "binary": b"\xff\xfe\x00",
-    "a zero byte": TEXT.replace("omega", "om\0ega", 1),
-    "empty": "",
-    "only a comment": "# x",
-    "too long": "# " + 3_000_000 * "x",
-    "a byte order mark": "\ufeff" + TEXT,
-    "a date": TEXT.replace("T = 1.2e-3", "T = 2026-01-01"),
-    "an infinite period": TEXT.replace("T = 1.2e-3", "T = inf"),
-    "twice": TEXT + "\n[environment]\n",
-    "cut": TEXT[: len(TEXT) // 2],
-    "no devices": TEXT.replace("[[device]]", "[[devise]]"),
-    "a key that steers": TEXT + '\n["\\u001b[31m"]\nx = 1\n',
-    "a name that steers": TEXT.replace('"omega-pair"', '"\\u001b]0;x\\u0007"').replace("T = 1.2e-3", "T = 9"),
+    "dotted": "a" + 100_000 * ".a" + " = 1", "dotted and quoted": '"a"' + 50_000 * '."a"' + " = 1",
+    "dotted table": "[a" + 30_000 * ".a" + "]", "binary": b"\xff\xfe\x00", "empty": "", "only a comment": "# x",
+    "a zero byte": TEXT.replace("omega", "om\0ega", 1), "too long": "# " + 3_000_000 * "x",
+    "a byte order mark": "\ufeff" + TEXT, "a date": with_T("T = 2026-01-01"), "an infinite period": with_T("T = inf"),
+    "twice": TEXT + "\n[environment]\n", "cut": TEXT[: len(TEXT) // 2],
+    "no devices": TEXT.replace("[[device]]", "[[devise]]"), "a key that steers": TEXT + '\n["\\u001b[31m"]\nx = 1\n',
+    "a name that steers": LATE.replace('"omega-pair"', '"\\u001b]0;x\\u0007"'),
     "a name without end": TEXT.replace('"omega-pair"', f'"{1000 * "n"}"'),
-    "a huge name": TEXT.replace('"omega-pair"', f'"{1_000_000 * "n"}"').replace("T = 1.2e-3", "T = 9"),
-}
-FIELDS = [
-    ("stiffness = 800.0", "stiffness = "),
-    ("damping = 1.0 },", "damping = "),
-    ("masses = { mass = 1.0 }", "masses = { mass = "),
-    ("motor_mass = 0.06", "motor_mass = "),
-    ("handle_mass = 0.19", "handle_mass = "),
-    ("transmission_stiffness = 14500", "transmission_stiffness = "),
-    ("force_limit = 12.0", "force_limit = "),
-    ("duration = 15.0", "duration = "),
-    ("mass = 0.3", "mass = "),
-    ("stiffness = 200.0", "stiffness = "),
-    ("amplitude = 0.015", "amplitude = "),
-    ("frequency = 0.6", "frequency = "),
-    ("ease = 1.0", "ease = "),
-    ("force = 1.0", "force = "),
-    ("start = 0.1", "start = "),
-    ("theta = [1, 2]", "theta = [1, "),
-    ("psi = [0, 0]", "psi = [0, "),
-    ("channel = 1", "channel = "),
-]
+    "a huge name": LATE.replace('"omega-pair"', f'"{1_000_000 * "n"}"'),
+}  # fmt: skip
+#: parts of the scenario, each with a field whose number (the last one) is replaced by one of NUMBERS
+FIELDS = """stiffness = 800.0 | damping = 1.0 }, | masses = { mass = 1.0 } | motor_mass = 0.06 | handle_mass = 0.19
+    transmission_stiffness = 14500 | force_limit = 12.0 | duration = 15.0 | mass = 0.3 | stiffness = 200.0
+    amplitude = 0.015 | frequency = 0.6 | ease = 1.0 | force = 1.0 | start = 0.1 | theta = [1, 2] | psi = [0, 0]
+    channel = 1"""
+NUMBERS = ("1e300", "1e999", "-1.0", "nan", "-inf", '"x"', "[]", "true")
+CONTACTS, PSI = 'contacts = ["contact 1", "contact 2"]', "psi = [0, 0]"
+#: part of the scenario -> name -> what replaces it
 NO_NETWORKS = {
-    "to itself": ('["contact 1", "mass"]', '["mass", "mass"]'),
-    "one end": ('["contact 1", "mass"]', '["contact 1"]'),
-    "three ends": ('["contact 1", "mass"]', '["contact 1", "mass", "ground"]'),
-    "no name": ('["contact 1", "mass"]', '["", "mass"]'),
-    "one contact twice": ('contacts = ["contact 1", "contact 2"]', 'contacts = ["contact 1", "contact 1"]'),
-    "no contacts": ('contacts = ["contact 1", "contact 2"]', "contacts = []"),
-    "a contact that is ground": ('contacts = ["contact 1", "contact 2"]', 'contacts = ["ground", "contact 2"]'),
-    "mass of the ground": ("masses = { mass = 1.0 }", "masses = { ground = 1.0 }"),
-    "mass of nothing": ("masses = { mass = 1.0 }", "masses = { mass = 1.0, moon = 7e22 }"),
-    "no links": ("links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]", "links = []"),
-    "many links": ("links = [{", "links = [" + 200 * "{ mass = 1.0, damping = 1.0, stiffness = 1.0 }, " + "{"),
-    "a kind of device": ('kind = "compliant"', 'kind = "magic"'),
-    "delays for three": ("theta = [1, 2]", "theta = [1, 2, 3]"),
-    "a delay without end": ("theta = [1, 2]", "theta = [1, 1000000]"),
-    "lam beyond": ("psi = [0, 0]", "psi = [0, 0]\nlam = [9, 9]"),
-    "latency of two ticks": ("psi = [0, 0]", "psi = [0, 0]\nlatency = [[0.0, 0.1], [0.0, 0.1]]"),
-    "latency backwards": ("psi = [0, 0]", "psi = [0, 0]\nlatency = [[1e-3, 1e-4], [0.0, 1e-4]]"),
-    "T_max below T": ("psi = [0, 0]", "psi = [0, 0]\nT_max = 1e-4"),
-}
+    '["contact 1", "mass"]': {
+        "to itself": '["mass", "mass"]', "one end": '["contact 1"]', "three ends": '["contact 1", "mass", "ground"]',
+        "no name": '["", "mass"]',
+    },
+    CONTACTS: {
+        "one contact twice": 'contacts = ["contact 1", "contact 1"]', "no contacts": "contacts = []",
+        "a contact that is ground": 'contacts = ["ground", "contact 2"]',
+    },
+    "masses = { mass = 1.0 }": {
+        "mass of the ground": "masses = { ground = 1.0 }", "mass of nothing": "masses = { mass = 1.0, moon = 7e22 }",
+    },
+    "links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]": {"no links": "links = []"},
+    "links = [{": {"many links": "links = [" + 200 * "{ mass = 1.0, damping = 1.0, stiffness = 1.0 }, " + "{"},
+    'kind = "compliant"': {"a kind of device": 'kind = "magic"'},
+    "theta = [1, 2]": {"delays for three": "theta = [1, 2, 3]", "a delay without end": "theta = [1, 1000000]"},
+    PSI: {
+        "lam beyond": f"{PSI}\nlam = [9, 9]", "latency of two ticks": f"{PSI}\nlatency = [[0.0, 0.1], [0.0, 0.1]]",
+        "latency backwards": f"{PSI}\nlatency = [[1e-3, 1e-4], [0.0, 1e-4]]", "T_max below T": f"{PSI}\nT_max = 1e-4",
+    },
+}  # fmt: skip
+RANGES = ("[900.0, 700.0]", "[1.0, 2.0]", "[-1.0, 900.0]", "[nan, 900.0]", "[700.0, 1e300]", "[700.0]", "1.0")
+DELAYS = (("[0]", "[2]"), ("[2, 2]", "[1, 1]"), ("[0, 0]", "[1000000, 3]"), ("[-1, 0]", "[2, 3]"), ("1", "2"))
 
 
 def scenarios() -> Iterator[Case]:
     """Yield texts that are no scenario, or an impossible one."""
+
+    def case(name: str, before: Callable, command: str = "audit", codes: tuple = (BUT,), says: str = "") -> Case:
+        return Case(f"scenario: {name}", quick(command, "--scenario", "s.toml"), codes, says, before)
+
     for name, text in NO_SCENARIOS.items():
-        yield Case(f"scenario: {name}", ("run", *QUICK["run"], "--scenario", "s.toml"), before=written("s.toml", text))
-    numbers = ("1e300", "1e999", "-1.0", "nan", "-inf", '"x"', "[]", "true")
-    closing = {"theta = [1, ": "]", "psi = [0, ": "]", "masses = { mass = ": " }", "damping = ": " },"}
-    for (old, new), number in pairs(FIELDS, numbers, 3):
-        if (old, number) == ("force = 1.0", "-1.0"):
-            continue  # a negative force is allowed
-        field = old.split(" ")[0].removesuffix("es")
-        text = f"{new}{number}{closing.get(new, '')}"
-        words = ("audit", *QUICK["audit"], "--scenario", "s.toml")
-        yield Case(f"scenario: {old} -> {number}", words, says=field, before=toml(old, text))
-    for name, (old, new) in NO_NETWORKS.items():
-        codes = (0,) if name == "many links" else (BUT,)
-        words = ("audit", *QUICK["audit"], "--scenario", "s.toml")
-        yield Case(f"scenario: {name}", words, codes, before=toml(old, new))
+        yield case(name, written("s.toml", text), "run")
+    for old, number in pairs(entries(FIELDS), NUMBERS, 3):
+        if (old, number) != ("force = 1.0", "-1.0"):  # A negative force is allowed.
+            before = toml(old, re.sub(r"[\d.]+(?=\D*$)", number, old))
+            yield case(f"{old} -> {number}", before, says=old.split(" ")[0].removesuffix("es"))
+    for old, news in NO_NETWORKS.items():
+        for name, new in news.items():
+            yield case(name, toml(old, new), codes=(0,) if name == "many links" else (BUT,))
     many = "springs = [\n" + 3000 * '{ between = ["mass", "ground"], stiffness = 1.0, damping = 1.0 },\n'
-    yield Case("scenario: thousands of springs", ("audit", *QUICK["audit"], "--scenario", "s.toml"), (BUT, 1, 0),
-               before=toml("springs = [\n", many))  # fmt: skip
+    yield case("thousands of springs", toml("springs = [\n", many), codes=(BUT, 1, 0))
     chain = "".join(f'{{ between = ["n{i}", "n{i + 1}"], stiffness = 1.0, damping = 1.0 }},\n' for i in range(1500))
-    masses = ", ".join(f"n{i} = 1.0" for i in range(1501))
-
-    def long_chain() -> None:
-        text = TEXT.replace("springs = [\n", 'springs = [\n{ between = ["mass", "n0"], stiffness = 1.0 },\n' + chain)
-        put("s.toml", text.replace("{ mass = 1.0 }", f"{{ mass = 1.0, {masses} }}"))
-
+    text = TEXT.replace("springs = [\n", 'springs = [\n{ between = ["mass", "n0"], stiffness = 1.0 },\n' + chain)
+    text = text.replace("{ mass = 1.0 }", f"{{ mass = 1.0, {', '.join(f'n{i} = 1.0' for i in range(1501))} }}")
     for command in ("audit", "run"):
-        words = (command, *QUICK[command], "--scenario", "s.toml")
-        yield Case(f"scenario: a chain of 1500 masses, {command}", words, before=long_chain)
-    ranges = '\n[ranges]\nsprings = [{ between = ["contact 1", "mass"], stiffness = %s }]\n'
-    for number in ("[900.0, 700.0]", "[1.0, 2.0]", "[-1.0, 900.0]", "[nan, 900.0]", "[700.0, 1e300]", "[700.0]", "1.0"):
-        words = ("audit", *QUICK["audit"], "--scenario", "s.toml")
-        yield Case(f"scenario: ranges {number}", words, before=written("s.toml", TEXT + ranges % number))
-    varying_delay = "\n[varying_delay]\nlo = %s\nhi = %s\n"
-    for lo, hi in (("[0]", "[2]"), ("[2, 2]", "[1, 1]"), ("[0, 0]", "[1000000, 3]"), ("[-1, 0]", "[2, 3]"), ("1", "2")):
-        words = ("run", *QUICK["run"], "--scenario", "s.toml")
-        yield Case(
-            f"scenario: varying_delay {lo} {hi}", words, before=written("s.toml", TEXT + varying_delay % (lo, hi))
-        )
+        yield case(f"a chain of 1500 masses, {command}", written("s.toml", text), command)
+    for span in RANGES:
+        ranges = f'\n[ranges]\nsprings = [{{ between = ["contact 1", "mass"], stiffness = {span} }}]\n'
+        yield case(f"ranges {span}", written("s.toml", TEXT + ranges))
+    for lo, hi in DELAYS:
+        varying = f"\n[varying_delay]\nlo = {lo}\nhi = {hi}\n"
+        yield case(f"varying_delay {lo} {hi}", written("s.toml", TEXT + varying), "run")
 
 
 HUMAN = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
+HANDS = "class H:\n def port(self): {}\n def voluntary_force(self, t): return 0\nhumans = [H(), H()]"
+#: file -> name -> its text: humans in TOML and in Python, and recorded delays
 NO_PEOPLE = {
     "h.toml": {
-        "one for two": HUMAN,
-        "nothing": "",
-        "nested": "a = " + 2000 * "[",
-        "a mass of nan": 2 * HUMAN.replace("0.3", "nan"),
-        "an overflow": 2 * HUMAN.replace("200.0", "1e300"),
+        "one for two": HUMAN, "nothing": "", "nested": "a = " + 2000 * "[",
+        "a mass of nan": 2 * HUMAN.replace("0.3", "nan"), "an overflow": 2 * HUMAN.replace("200.0", "1e300"),
         "a person of nobody": 2 * HUMAN + "[[person]]\nholds = [7, 8]\n",
         "an unknown field": 2 * HUMAN.replace("mass", "mess"),
     },
     "h.py": {
-        "no humans": "x = 1",
-        "a mistake": "humans = (",
-        "an exception": "1 / 0",
-        "an exit": "raise SystemExit(0)",
-        "no hand": "humans = [1, 2]",
-        "no list": "humans = 7",
-        "no end to the text": "# " + 3_000_000 * "x",
-        "a port that fails": "class H:\n def port(self): 1 / 0\n def voluntary_force(self, t): return 0\n"
-        "humans = [H(), H()]",
-        "a port that is none": "class H:\n def port(self): return 5\n def voluntary_force(self, t): return 0\n"
-        "humans = [H(), H()]",
+        "no humans": "x = 1", "a mistake": "humans = (", "an exception": "1 / 0", "an exit": "raise SystemExit(0)",
+        "no hand": "humans = [1, 2]", "no list": "humans = 7", "no end to the text": "# " + 3_000_000 * "x",
+        "a port that fails": HANDS.format("1 / 0"), "a port that is none": HANDS.format("return 5"),
     },
     "p.txt": {
-        "empty": "",
-        "a word": "1,2\n1,x\n",
-        "three columns": "1,2,3\n",
-        "a fraction": "1.5,2\n",
-        "huge": "1,99999999999999999999\n",
-        "negative": "-7,2\n",
-        "binary": b"\xff\xff",
-        "too long": 3_000_000 * "1",
+        "empty": "", "a word": "1,2\n1,x\n", "three columns": "1,2,3\n", "a fraction": "1.5,2\n",
+        "huge": "1,99999999999999999999\n", "negative": "-7,2\n", "binary": b"\xff\xff", "too long": 3_000_000 * "1",
     },
-}
+}  # fmt: skip
 
 
 def humans_and_delays() -> Iterator[Case]:
-    """Yield bad files of humans, in TOML and as scripts, and of recorded delays."""
     for file, texts in NO_PEOPLE.items():
         option = "--pattern" if file == "p.txt" else "--human"
         for name, text in texts.items():
-            words = ("run", *QUICK["run"], option, file)
-            yield Case(f"{option} {file}: {name}", words, before=written(file, text))
+            yield Case(f"{option} {file}: {name}", quick("run", option, file), before=written(file, text))
 
 
 NO_COUPLINGS = {
-    "empty": "",
-    "blank": " \n",
-    "binary": b"\xff\xfe",
-    "nested": 100_000 * "[",
-    "half": '{"loop": {',
-    "a list": "[]",
-    "null": "null",
-    "twice": '{"loop": 1, "loop": 2}',
-    "an empty object": "{}",
+    "empty": "", "blank": " \n", "binary": b"\xff\xfe", "nested": 100_000 * "[", "half": '{"loop": {', "a list": "[]",
+    "null": "null", "twice": '{"loop": 1, "loop": 2}', "an empty object": "{}",
     "too large": '{"a": "' + 50_000_000 * "x" + '"}',
-}
-ENTRIES = [
-    ("coupling.K", [1e308, 1e308]),
-    ("coupling.K", [1e300, 300.0]),
-    ("coupling.K", [-400.0, 300.0]),
-    ("coupling.K", [0.0, 0.0]),
-    ("coupling.K", []),
-    ("coupling.K", [1.0]),
-    ("coupling.B", [1e308, 1e308]),
-    ("coupling.B", [-1.0, 0.1]),
-    ("coupling.B", "x"),
-    ("coupling.kind", "magic"),
-    ("loop.T", 0.0),
-    ("loop.T", 1e300),
-    ("loop.T", -1.0),
-    ("loop.theta", [1, -2]),
-    ("loop.theta", [1, 10**9]),
-    ("loop.theta", [1]),
-    ("loop.psi", [0, 10**6]),
-    ("loop.delta", [0.0, 0.0]),
-    ("loop.delta", [1e300, 1.0]),
-    ("loop.delta", []),
-    ("loop.environment.springs", []),
-    ("loop.environment.springs.0.stiffness", 1e300),
-    ("loop.environment.springs.0.stiffness", -1.0),
-    ("loop.environment.springs.0.between", ["a", "a"]),
-    ("loop.environment.masses.mass", 1e300),
-    ("loop.environment.contacts", []),
-    ("version", 99),
-]
-CLAIMS = [
-    ("certificate.required", [1e-9, 1e-9]),
-    ("certificate.required", []),
-    ("certificate.required", [-1.0, -1.0]),
-    ("certificate.available", [1e9, 1e9]),
-    ("certificate.margin", 1e9),
-    ("certificate.proof", "magic"),
-    ("certificate.condition", "this-environment"),
-    ("certificate.guarantee", "these ranges"),
-    ("certificate.seal", "x"),
-    ("certificate.scenario", "x"),
-    ("certificate.versions", {}),
-    ("certificate.matrices", {}),
-    ("certificate.matrices", {"P": []}),
-    ("certificate.matrices", {"P": [["1/0"]]}),
-    ("certificate.matrices", {"P": [["1"], ["1", "2"]]}),
-    ("certificate.matrices", {"P": [["9" * 4000]]}),
-    ("certificate.matrices", {"P": [["x"]]}),
-    ("certificate.matrices", {"P": [[f"1/{10**900}"] * 40] * 40}),
-    ("certificate.matrices", {"P": [["1"] * 700] * 700}),
-]
+}  # fmt: skip
+#: entry of a stored coupling -> impossible values
+ENTRIES = {
+    "coupling.K": ([1e308, 1e308], [1e300, 300.0], [-400.0, 300.0], [0.0, 0.0], [], [1.0]),
+    "coupling.B": ([1e308, 1e308], [-1.0, 0.1], "x"), "coupling.kind": ("magic",),
+    "loop.T": (0.0, 1e300, -1.0), "loop.theta": ([1, -2], [1, 10**9], [1]), "loop.psi": ([0, 10**6],),
+    "loop.delta": ([0.0, 0.0], [1e300, 1.0], []), "loop.environment.springs": ([],),
+    "loop.environment.springs.0.stiffness": (1e300, -1.0), "loop.environment.springs.0.between": (["a", "a"],),
+    "loop.environment.masses.mass": (1e300,), "loop.environment.contacts": ([],), "version": (99,),
+}  # fmt: skip
+LARGE = 40 * [40 * [f"1/{10**900}"]], 700 * [700 * ["1"]]
+MATRICES = [], [["1/0"]], [["1"], ["1", "2"]], [["9" * 4000]], [["x"]], *LARGE
+#: entry of a certificate -> false claims
+CLAIMS = {
+    "required": ([1e-9, 1e-9], [], [-1.0, -1.0]), "available": ([1e9, 1e9],), "margin": (1e9,), "proof": ("magic",),
+    "condition": ("this-environment",), "guarantee": ("these ranges",), "seal": ("x",), "scenario": ("x",),
+    "versions": ({},), "matrices": ({}, *({"P": matrix} for matrix in MATRICES)),
+}  # fmt: skip
 
 
 def couplings() -> Iterator[Case]:
@@ -235,20 +151,19 @@ def couplings() -> Iterator[Case]:
         yield Case(f"{command}: {name}", (command, *way), says=r"c\.json", before=written("c.json", text))
     twice = lambda: put("c.json", Path("c.json").read_text().replace('"K"', '"K": [1.0, 1.0], "K"', 1))  # noqa: E731
     yield Case("check: K twice", ("check", "c.json"), says="twice", before=twice)
-    for command, (path, value) in pairs(("check", "export"), ENTRIES):
+    changes = [(path, value) for path, values in ENTRIES.items() for value in values]
+    claims = [(f"certificate.{path}", value) for path, values in CLAIMS.items() for value in values]
+    for command, (path, value) in (*pairs(("check", "export"), changes), *(("check", claim) for claim in claims)):
         codes = (BUT, 1)  # 1: the file can be read, but is not proved
         yield Case(f"{command}: {path} = {str(value)[:30]}", (command, "c.json"), codes, before=stored(path, value))
-    for path, value in CLAIMS:
-        name = f"check: {path} = {str(value)[:30]}"
-        yield Case(name, ("check", "c.json"), (BUT, 1), before=stored(path, value))
 
 
-def packed(**entries: bytes) -> Callable[[], None]:
+def packed(**arrays: bytes) -> Callable[[], None]:
     """Return a function that writes t.npz with these raw entries."""
 
     def change() -> None:
         with zipfile.ZipFile("t.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in entries.items():
+            for name, content in arrays.items():
                 archive.writestr(f"{name}.npy", content)
 
     return change
@@ -259,71 +174,54 @@ def header(shape: str, kind: str = "<f8", rest: bytes = b"") -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + rest
 
 
-def flipped(content: bytes) -> bytes:
-    at = len(content) // 3
-    return content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :]
+def changed(change: Callable[[bytes], bytes]) -> Callable[[], int]:
+    """Return a function that changes the content of t.npz."""
+    return lambda: put("t.npz", change(Path("t.npz").read_bytes()))
 
 
 def bomb() -> None:
     """Write a small archive whose directory says that it unpacks to four gigabytes."""
-    with zipfile.ZipFile("t.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("t.npy", header("(3,)", rest=bytes(24)))
-    content = bytearray(Path("t.npz").read_bytes())
+    packed(t=header("(3,)", rest=bytes(24)))()
+    content = Path("t.npz").read_bytes()
     at = content.index(b"PK\x01\x02") + 24
-    content[at : at + 4] = (4_294_967_294).to_bytes(4, "little")
-    put("t.npz", bytes(content))
+    put("t.npz", content[:at] + (4_294_967_294).to_bytes(4, "little") + content[at + 4 :])
 
 
 n, t = 400, 1.2e-3 * np.arange(400)
 x = 1e-3 * np.sin(400 * t)[:, None] * [1.0, 0.5]
-uneven = t + 1e-4 * (np.arange(n) % 7)
-holed = np.where(np.arange(n)[:, None] == 9, np.nan, x)
+META = {
+    "meta is no JSON": "{", "meta is nested": 100_000 * "[", "meta is a number": 7,
+    "steady ticks": '{"run": {"steady_ticks": [[0, 1000000]]}}',
+    "steady ticks without end": '{"run": {"steady_ticks": [[0, 1e999]]}}',
+    "steady words": '{"run": {"steady_ticks": "x"}}', "encoder step": '{"run": {"encoder_step_m": [1, 2, 3]}}',
+    "encoder step nan": '{"run": {"encoder_step_m": [NaN, 1]}}',
+}  # fmt: skip
+#: name -> arrays of a trace that are replaced, or left out if None
 CHANGED = {
-    "no t": {"t": None},
-    "no meta": {"meta": None},
-    "meta is no JSON": {"meta": np.array("{")},
-    "meta is nested": {"meta": np.array(100_000 * "[")},
-    "meta is a number": {"meta": np.array(7)},
-    "steady ticks": {"meta": np.array('{"run": {"steady_ticks": [[0, 1000000]]}}')},
-    "steady ticks without end": {"meta": np.array('{"run": {"steady_ticks": [[0, 1e999]]}}')},
-    "steady words": {"meta": np.array('{"run": {"steady_ticks": "x"}}')},
-    "encoder step": {"meta": np.array('{"run": {"encoder_step_m": [1, 2, 3]}}')},
-    "encoder step nan": {"meta": np.array('{"run": {"encoder_step_m": [NaN, 1]}}')},
-    "uneven": {"t": uneven},
-    "backwards": {"t": t[::-1]},
-    "standing": {"t": 0 * t},
-    "t is not finite": {"t": np.where(t > 0.1, np.inf, t)},
-    "complex": {"x": x + 0j},
-    "words": {"x": x.astype("U8")},
-    "dates": {"t": np.arange(n).astype("M8[s]")},
-    "booleans": {"x": x > 0},
-    "huge": {"x": 1e300 * x},
+    "no t": {"t": None}, "no meta": {"meta": None}, **{name: {"meta": np.array(text)} for name, text in META.items()},
+    "uneven": {"t": t + 1e-4 * (np.arange(n) % 7)}, "backwards": {"t": t[::-1]}, "standing": {"t": 0 * t},
+    "t is not finite": {"t": np.where(t > 0.1, np.inf, t)}, "complex": {"x": x + 0j}, "words": {"x": x.astype("U8")},
+    "dates": {"t": np.arange(n).astype("M8[s]")}, "booleans": {"x": x > 0}, "huge": {"x": 1e300 * x},
     "beyond": {"x": np.full((n, 2), 1.7e308) * np.sign(x)},
-    "a hole": {"x": holed},
-    "infinite": {"x": np.where(x > 0, np.inf, x)},
-    "flat": {"x": x[:, 0]},
-    "three axes": {"x": x[None]},
-    "one shorter": {"x": x[:-1]},
+    "a hole": {"x": np.where(np.arange(n)[:, None] == 9, np.nan, x)}, "infinite": {"x": np.where(x > 0, np.inf, x)},
+    "flat": {"x": x[:, 0]}, "three axes": {"x": x[None]}, "one shorter": {"x": x[:-1]},
     "no channels": {"x": x[:, :0], "f": x[:, :0]},
     "no ticks": {"t": t[:0], **dict.fromkeys(("x", "f", "x_handle", "v_handle"), x[:0]), "w": x[:0, :0]},
-}
+}  # fmt: skip
 whole = np.zeros(3).tobytes()
+#: name -> function that writes a t.npz that is no archive of arrays
 NO_ARCHIVES = {
-    "empty": written("t.npz", b""),
-    "rubbish": written("t.npz", b"PK\x03\x04rubbish"),
-    "text": written("t.npz", "t,x,f"),
-    "one array": lambda: np.save(open("t.npz", "wb"), np.zeros(3)),  # noqa: SIM115
+    "empty": written("t.npz", b""), "rubbish": written("t.npz", b"PK\x03\x04rubbish"),
+    "text": written("t.npz", "t,x,f"), "one array": lambda: np.save(open("t.npz", "wb"), np.zeros(3)),  # noqa: SIM115
     "10^12 rows": packed(t=header("(1000000000000,)")),
     "10^12 rows, said twice": packed(t=header("(1000000000000,)"), x=header("(1000000000000, 2)")),
-    "negative": packed(t=header("(-3,)", rest=whole)),
-    "objects": packed(t=header("(3,)", "|O", whole)),
+    "negative": packed(t=header("(-3,)", rest=whole)), "objects": packed(t=header("(3,)", "|O", whole)),
     "a header that is none": packed(t=b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 70_000),
-    "another version": packed(t=b"\x93NUMPY\x09\x00" + whole),
-    "a nested shape": packed(t=header("(" * 40 + ")" * 40)),
-    "cut": lambda: put("t.npz", Path("t.npz").read_bytes()[:-200]),
-    "one bit": lambda: put("t.npz", flipped(Path("t.npz").read_bytes())),
+    "another version": packed(t=b"\x93NUMPY\x09\x00" + whole), "a nested shape": packed(t=header("(" * 40 + ")" * 40)),
+    "cut": changed(lambda old: old[:-200]),
+    "one bit": changed(lambda old: old[: (at := len(old) // 3)] + bytes([old[at] ^ 16]) + old[at + 1 :]),
     "too much to unpack": bomb,
-}
+}  # fmt: skip
 
 
 def traces() -> Iterator[Case]:
@@ -339,23 +237,12 @@ def traces() -> Iterator[Case]:
 
 
 #: names that a typesetter, a terminal or a format string would interpret
-STEERING = (
-    "$x^",
-    "$\\frac$",
-    "a_b^c$$",
-    "\U0001f600",
-    "中文",
-    "\u202e",
-    "%s{}",
-    "[red]x[/]",
-    "[/b]",
-    ":smile:",
-    "\x1b[31m",
-)
+STEERING = ("$x^", "$\\frac$", "a_b^c$$", "\U0001f600", "中文", "\u202e", "%s{}", "[red]x[/]", "[/b]", ":smile:")
+STEERING += ("\x1b[31m",)
 
 
 def names_in_pictures() -> Iterator[Case]:
-    """Yield files and a scenario with names that a typesetter would interpret; a short run has every second one."""
+    """Yield files and a scenario with names of STEERING; a short run has every second file."""
     for name in STEERING[:: 1 + SHORT]:
         file = f"t{name}.npz".replace("/", "|")
         copied = lambda file=file: shutil.copy("t.npz", file)  # noqa: E731
@@ -366,9 +253,5 @@ def names_in_pictures() -> Iterator[Case]:
 
 
 def cases() -> Iterator[Case]:
-    """Yield all cases of this file."""
-    yield from scenarios()
-    yield from humans_and_delays()
-    yield from couplings()
-    yield from traces()
-    yield from names_in_pictures()
+    for part in (scenarios, humans_and_delays, couplings, traces, names_in_pictures):
+        yield from part()

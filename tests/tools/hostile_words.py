@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 from collections.abc import Iterator
 
-from hostile_cases import BUT, QUICK, SHORT, TEXT, Case, pairs, put, written
+from hostile_cases import BUT, QUICK, SHORT, TEXT, Case, entries, pairs, quick, written
 
 NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
-
 NUMERIC = {
     "run": "theta psi lam delta T T-max latency loss varying-delay energy-budget substeps duration vertex seed",
     "validate": "humans shards generations duration seed theta",
@@ -31,207 +29,115 @@ def numeric_options() -> Iterator[Case]:
     for command, names in NUMERIC.items():
         for i, name in enumerate(names.split()):
             every = command in ("run", "bridge") and not SHORT
-            chosen = NO_NUMBERS if every else [NO_NUMBERS[(i + k) % 7] for k in (0, 3)]
-            for word in chosen:
-                words = (command, *QUICK[command], f"--{name}={word}")
+            for word in NO_NUMBERS if every else [NO_NUMBERS[(i + k) % 7] for k in (0, 3)]:
+                words = quick(command, f"--{name}={word}")
                 yield Case(f"{command} --{name}={word[:8]!r}", words, says=name.split("-")[0])
 
 
-INPUTS = (
-    ("run", "--scenario"),
-    ("run", "--human"),
-    ("run", "--pattern"),
-    ("audit", "--scenario"),
-    ("check", ""),
-    ("export", ""),
-    ("trace", ""),
-    ("replay", ""),
-    ("view", "--coupling"),
-)
+INPUTS = """run --scenario | run --human | run --pattern | audit --scenario | check | export | trace | replay
+    view --coupling"""
 NO_FILES = {
-    "missing": "nix",
-    "folder": "dir",
-    "pipe": "fifo",
-    "endless": "/dev/zero",
-    "terminal": "/dev/tty",
-    "circle": "loop",
-    "long": "n" * 300,
-    "very long": "n/" * 3000,
-    "control": "n\x1b]0;x\x07\r\n",
-    "right to left": "n\u202eabc",
-    "no UTF-8": "n\udcff",
-    "below a file": "s.toml/x",
-    "empty": "",
-}
+    "missing": "nix", "folder": "dir", "pipe": "fifo", "endless": "/dev/zero", "terminal": "/dev/tty", "circle": "loop",
+    "long": "n" * 300, "very long": "n/" * 3000, "control": "n\x1b]0;x\x07\r\n", "right to left": "n\u202eabc",
+    "no UTF-8": "n\udcff", "below a file": "s.toml/x", "empty": "",
+}  # fmt: skip
+OUTPUTS = """run --out | run --json | design --out | export --out | trace --plot | audit --json | view --video
+    bridge --out"""
+NO_OUTPUTS = ("below a file", "very long", "long", "circle", "folder", "no folder", "kernel", "zero")
 
 
 def odd_paths() -> Iterator[Case]:
     """Yield inputs that cannot be read, and outputs that cannot be written."""
-    for (command, option), (kind, path) in pairs(INPUTS, NO_FILES.items()):
-        rest = tuple(word for word in QUICK[command] if option or not word.startswith(("c.json", "t.npz")))
-        if option == "--coupling" and not path.startswith(("/", "dir", "fifo", "loop", "s.toml")):
-            path += ".json"
-        words = (command, *rest, *((f"{option}={path}",) if option else ("--", path)))
-        if option:
-            yield Case(f"{command} {option} {kind}", words, says=option.lstrip("-") if option != "--coupling" else "")
-        else:
-            yield Case(f"{command} {kind}", (command, *(w for w in words[1:] if w != "--"), "--json=r.json")
-                       if path and not path.startswith("-") else words)  # fmt: skip
-    outputs = [("run", "--out"), ("run", "--json"), ("design", "--out"), ("export", "--out"), ("trace", "--plot"),
-               ("audit", "--json"), ("view", "--video"), ("bridge", "--out")]  # fmt: skip
-    kinds = ("below a file", "very long", "long", "circle", "folder", "no folder", "kernel", "zero")
-    path = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
-    for (command, option), kind in pairs(outputs, kinds):
-        if kind == "no folder" and (command, option) in {("run", "--out"), ("bridge", "--out")}:
-            continue  # the command makes the folder
-        if kind == "folder" and option == "--out" and command in ("run", "bridge"):
+    for place, (kind, path) in pairs(entries(INPUTS), NO_FILES.items()):
+        command, _, option = place.partition(" ")
+        if not option:
+            yield Case(f"{command} {kind}", (command, path, "--json=r.json") if path else (command, "--", path))
             continue
+        says = option.lstrip("-")
+        if option == "--coupling":
+            path, says = path if path.startswith(("/", "dir", "fifo", "loop", "s.toml")) else f"{path}.json", ""
+        yield Case(f"{place} {kind}", quick(command, f"{option}={path}"), says=says)
+    files = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
+    for place, kind in pairs(entries(OUTPUTS), NO_OUTPUTS):
+        command, option = place.split()
+        if place in ("run --out", "bridge --out") and kind in ("folder", "no folder"):
+            continue  # The command uses or makes the folder.
         suffix = ".gif" if option == "--video" and kind not in ("folder", "circle") else ""
-        quick = (w for w in QUICK[command] if w not in ("--video", "v.gif"))
-        yield Case(f"{command} {option} {kind}", (command, *quick, option, path[kind] + suffix), says=option)
+        words = (command, *(() if command == "view" else QUICK[command]), option, files[kind] + suffix)
+        yield Case(f"{place} {kind}", words, says=option)
 
 
-BOTH = [
-    ("design", "--scenario", "s.toml", "--out", "s.toml"),
-    ("design", "--scenario", "to-s", "--out", "s.toml"),
-    ("design", "--scenario", "s.toml", "--out", "to-s"),
-    ("design", "--scenario", "s.toml", "--out", "./dir/../s.toml"),
-    ("design", "--scenario", "s.toml", "--json", "s.toml"),
-    ("design", "--out", "a.json", "--json", "a.json"),
-    ("design", "--out", "a.json", "--json", "./a.json"),
-    ("replay", "t.npz", "--json", "t.npz"),
-    ("trace", "t.npz", "--json", "t.npz"),
-    ("trace", "t.npz", "--plot", "t.npz"),
-    ("trace", "t.npz", "--plot", "a.png", "--json", "a.png"),
-    ("check", "c.json", "--json", "c.json"),
-    ("export", "c.json", "--json", "c.json"),
-    ("export", "c.json", "--out", "c.json"),
-    ("export", "c.json", "--out", "a.c", "--json", "a.c"),
-    ("audit", "--coupling", "c.json", "--json", "c.json"),
-    ("audit", "--K", "400", "--B", "1", "--scenario", "s.toml", "--json", "s.toml"),
-    ("run", *QUICK["run"], "--scenario", "s.toml", "--json", "s.toml"),
-    ("run", *QUICK["run"], "--human", "h.toml", "--json", "h.toml"),
-    ("run", *QUICK["run"], "--pattern", "p.txt", "--json", "p.txt"),
-    ("run", *QUICK["run"], "--coupling", "c.json", "--json", "c.json"),
-    ("validate", *QUICK["validate"], "--scenario", "s.toml", "--json", "s.toml"),
-    ("validate", *QUICK["validate"], "--coupling", "c.json", "--json", "c.json"),
-    ("zwidth", *QUICK["zwidth"], "--scenario", "s.toml", "--json", "s.toml"),
-    ("zwidth", *QUICK["zwidth"], "--coupling", "c.json", "--json", "c.json"),
-    ("compare", "--coupling", "none,c.json", "--json", "c.json"),
-    ("compare", "--scenario", "s.toml", "--json", "s.toml"),
-    ("view", "--video", "a.gif", "--json", "a.gif", "--duration", "0.2"),
-    ("bridge", "--rehearse", "--scenario", "s.toml", "--json", "s.toml"),
-    ("identify", "--rehearse", "--scenario", "s.toml", "--json", "s.toml"),
-]
+def split(line: str) -> tuple[str, ...]:
+    """Return the words of a command line; run, validate and zwidth get their QUICK words."""
+    command, *more = shlex.split(line)
+    return quick(command, *more) if command in ("run", "validate", "zwidth") else (command, *more)
+
+
+BOTH = """design --scenario s.toml --out s.toml | design --scenario to-s --out s.toml
+    design --scenario s.toml --out to-s | design --scenario s.toml --out ./dir/../s.toml
+    design --scenario s.toml --json s.toml | design --out a.json --json a.json | design --out a.json --json ./a.json
+    replay t.npz --json t.npz | trace t.npz --json t.npz | trace t.npz --plot t.npz
+    trace t.npz --plot a.png --json a.png | check c.json --json c.json | export c.json --json c.json
+    export c.json --out c.json | export c.json --out a.c --json a.c | audit --coupling c.json --json c.json
+    audit --K 400 --B 1 --scenario s.toml --json s.toml | run --scenario s.toml --json s.toml
+    run --human h.toml --json h.toml | run --pattern p.txt --json p.txt | run --coupling c.json --json c.json
+    validate --scenario s.toml --json s.toml | validate --coupling c.json --json c.json
+    zwidth --scenario s.toml --json s.toml | zwidth --coupling c.json --json c.json
+    compare --coupling none,c.json --json c.json | compare --scenario s.toml --json s.toml
+    view --video a.gif --json a.gif --duration 0.2 | bridge --rehearse --scenario s.toml --json s.toml
+    identify --rehearse --scenario s.toml --json s.toml"""
 
 
 def overwritten() -> Iterator[Case]:
     """Yield outputs that are also inputs or other outputs, under any name."""
-    for words in BOTH:
+    for words in map(split, entries(BOTH)):
         yield Case(" ".join(words), words, says="also|read")
-
-    def report_is_a_scenario() -> None:
-        put("dir/report.json", TEXT)
-
-    words = ("run", *QUICK["run"], *NONE, "--scenario", "dir/report.json", "--out", "dir")
-    yield Case("a report over its scenario", words, says="read", before=report_is_a_scenario)
-    words = ("run", *QUICK["run"], *NONE, "--out", "new", "--json", "new/trace.npz")
+    words = split("run --case none --scenario dir/report.json --out dir")
+    yield Case("a report over its scenario", words, says="read", before=written("dir/report.json", TEXT))
+    words = split("run --case none --out new --json new/trace.npz")
     yield Case("json over the trace", words, says="twice", before=lambda: os.mkdir("new"))
     hard = ("design", "--scenario", "s.toml", "--json", "hard")
     yield Case("a second name of the scenario", hard, says="also", before=lambda: os.link("s.toml", "hard"))
 
 
-NONE = ("--case", "none")
-#: options that would be ignored, and lists with empty entries; each with the words of its error line
-SILENT = [
-    (("run", *QUICK["run"], *NONE, "--coupling", "zzz"), "--coupling"),
-    (("validate", *QUICK["validate"], *NONE, "--coupling", "zzz"), "--coupling"),
-    (("audit", *NONE, "--coupling", "zzz"), "--coupling"),
-    (("audit", *NONE, *QUICK["audit"]), "--K"),
-    (("zwidth", *QUICK["zwidth"], *NONE, "--coupling", "zzz"), "--c"),
-    (("view", "--video", "v.gif", *NONE, "--coupling", "zzz"), "--coupling"),
-    (("bridge", "--rehearse", *NONE, "--coupling", "zzz"), "--c"),
-    (("design", *NONE, "--coupling", "optimal"), "--case none"),
-    (("compare", *NONE, "--coupling", "zzz"), "--coupling"),
-    (("run", *QUICK["run"], "--coupling", ""), "--coupling"),
-    (("run", *QUICK["run"], "--coupling", "x.json"), "x.json"),
-    (("run", *QUICK["run"], "--scenario", ""), "scenario"),
-    (("run", *QUICK["run"], "--human", ""), "--human"),
-    (("run", *QUICK["run"], "--json", ""), "--json"),
-    (("run", *QUICK["run"], "--out", ""), "--out"),
-    (("design", "--out", ""), "--out"),
-    (("design", "--json", ""), "--json"),
-    (("export", "c.json", "--out", ""), "--out"),
-    (("trace", "t.npz", "--plot", ""), "--plot"),
-    (("compare", "--coupling", ""), "--coupling"),
-    (("compare", "--coupling", "none,,published"), "--coupling"),
-    (("compare", "--coupling", ",none"), "--coupling"),
-    (("compare", "--coupling", "none,"), "--coupling"),
-    (("run", *QUICK["run"], "--theta", "1,"), "--theta"),
-    (("run", *QUICK["run"], "--delta", ",1"), "--delta"),
-    (("run", *QUICK["run"], "--varying-delay", "1,"), "--varying-delay"),
-    (("run", *QUICK["run"], "--loss", "0.1", "--pattern", "random"), "--varying-delay|--pattern"),
-    (("run", *QUICK["run"], "--playout"), "--playout"),
-    (("run", *QUICK["run"], "--energy-budget", "1,0.5"), "--energy-budget"),
-    (("run", *QUICK["run"], "--engine", "exact", "--integrator", "RK4"), "--integrator"),
-    (("run", *QUICK["run"], "--engine", "exact", "--substeps", "4"), "--substeps"),
-    (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
-    (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
-    (("design", "--order", "2"), "--order"),
-    (("design", "--compare"), "--compare"),
-    (("design", "--objective", "rms"), "--objective"),
-    (("design", "--band", "80,1"), "--band"),
-    (("design", "--seconds", "9"), "--seconds"),
-    (("design", "--high-gain", "2"), "--high-gain"),
-    (("design", "--coupling", "ccl", "--limiter"), "limiter"),
-    (("design", "--varying-delay", "1-2,0-3", "--coupling", "moving-average"), "varying-delay"),
-    (("design", "--coupling", "ccl", "--order", "99"), "--order"),
-    (("export", "c.json", "--without-theta"), "--without-theta"),
-    (("audit", "--K", "1,2"), "--K"),
-    (("audit",), "nothing to audit"),
-    (("audit", "--rigid", "--K", "1,2", "--B", "1"), "--K"),
-    (("zwidth", *QUICK["zwidth"], "--coupling", "c.json", "--rigid"), "--rigid"),
-    (("zwidth", *QUICK["zwidth"], "--condition", "any-environment"), "--condition"),
-    (("zwidth", "--grid", "4", "--points", "0", "--K-range", "5,1"), "--K-range"),
-    (("zwidth", "--grid", "4", "--points", "0", "--B-range", "0,inf"), "--B-range"),
-    (("bridge", "--rehearse", "--port", "x"), "--port"),
-    (("bridge", "--port", "nix", "--arm", "--no-dead-man"), "nix"),
-    (("bridge", "--port", "dir", "--arm", "--no-dead-man"), "dir"),
-    (("bridge", "--port", "fifo", "--arm", "--no-dead-man"), "fifo"),
-    (("bridge", "--port", "s.toml", "--arm", "--no-dead-man"), "s.toml"),
-    (("bridge", "--port", "x", "--arm", "--fault", "unplug"), "--fault"),
-    (("bridge", "--rehearse", "--fault", "magic"), "magic"),
-    (("bridge", "--rehearse", "--fault", "up:drop=nan"), "drop"),
-    (("bridge", "--rehearse", "--deadman", "key"), "--deadman"),
-    (("bridge", "--rehearse", "--baud", "fast"), "--baud"),
-    (("bridge", "--rehearse", "--condition", "magic"), "--condition"),
-    (("identify", "--rehearse", "--band", "80,3"), "--band"),
-    (("validate", *QUICK["validate"], "--environments", "ranges"), "--environments"),
-    (("validate", *QUICK["validate"], "--generations", "5"), "--generations"),
-    (("view", "--video", "v.xyz"), "--video"),
-    (("view", "--video", ""), "--video"),
-    (("view", "--video", "v.gif", "--script", "x"), "--script"),
-    (("view", "--video", "v.gif", "--script", "-1:quit"), "--script"),
-]
+#: command lines, each with the words of its error line if these are not its last option
+SILENT = """run --case none --coupling zzz | validate --case none --coupling zzz | audit --case none --coupling zzz
+    audit --case none --K 400,300 --B .1,.1 => --K | zwidth --case none --coupling zzz => --c
+    view --video v.gif --case none --coupling zzz | bridge --rehearse --case none --coupling zzz => --c
+    design --case none --coupling optimal => --case none | compare --case none --coupling zzz
+    run --coupling '' | run --coupling x.json => x.json | run --scenario '' => scenario | run --human ''
+    run --json '' | run --out '' | design --out '' | design --json '' | export c.json --out '' | trace t.npz --plot ''
+    compare --coupling '' | compare --coupling none,,published | compare --coupling ,none | compare --coupling none,
+    run --theta 1, | run --delta ,1 | run --varying-delay 1,
+    run --loss 0.1 --pattern random => --varying-delay|--pattern | run --playout | run --energy-budget 1,0.5
+    run --engine exact --integrator RK4 | run --engine exact --substeps 4 | run --vertex 1
+    run --error nan => --error is nan, allowed are 1e-18 to 1 | design --order 2 | design --compare
+    design --objective rms | design --band 80,1 | design --seconds 9 | design --high-gain 2
+    design --coupling ccl --limiter => limiter
+    design --varying-delay 1-2,0-3 --coupling moving-average => varying-delay
+    design --coupling ccl --order 99 | export c.json --without-theta | audit --K 1,2 | audit => nothing to audit
+    audit --rigid --K 1,2 --B 1 => --K | zwidth --coupling c.json --rigid | zwidth --condition any-environment
+    zwidth --K-range 5,1 | zwidth --B-range 0,inf | bridge --rehearse --port x
+    bridge --port nix --arm --no-dead-man => nix | bridge --port dir --arm --no-dead-man => dir
+    bridge --port fifo --arm --no-dead-man => fifo | bridge --port s.toml --arm --no-dead-man => s.toml
+    bridge --port x --arm --fault unplug | bridge --rehearse --fault magic => magic
+    bridge --rehearse --fault up:drop=nan => drop | bridge --rehearse --deadman key | bridge --rehearse --baud fast
+    bridge --rehearse --condition magic | identify --rehearse --band 80,3 | validate --environments ranges
+    validate --generations 5 | view --video v.xyz | view --video '' | view --video v.gif --script x
+    view --video v.gif --script -1:quit"""
+#: a scenario whose handles and hands weigh 1 mg
+FEATHER = TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace("[{ mass = 0.3", "[{ mass = 1e-6")
 
 
 def silence() -> Iterator[Case]:
     """Yield options that would be ignored, and lists with empty entries."""
-    for words, says in SILENT:
-        yield Case(" ".join(words), words, says=says)
+    for line, _, says in (entry.partition(" => ") for entry in entries(SILENT)):
+        words = split(line)
+        yield Case(" ".join(words), words, says=says or [word for word in words if word.startswith("--")][-1])
     if not SHORT:
-        yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)
-    yield Case("run of a feather", ("run", *QUICK["run"], "--scenario", "s.toml"), (BUT, 0), before=feather)
-
-
-def feather() -> None:
-    """Write a scenario whose handles and hands weigh 1 mg."""
-    put(
-        "s.toml",
-        TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace(
-            "links = [{ mass = 0.3", "links = [{ mass = 1e-6"
-        ),
-    )
+        accuracy = ("accuracy", "--scenario", "s.toml")
+        yield Case("accuracy of a feather", accuracy, before=written("s.toml", FEATHER))
+    yield Case("run of a feather", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", FEATHER))
 
 
 #: by command: options that are refused
@@ -283,48 +189,32 @@ _GOOD = "return Human((Link(.3, 3., 200.),)).port()"
 _DRAWS = HUMANS + "class P:\n    def draw(self, rng, n): {}\npopulation = P()\n"
 #: name -> text of a Python file of hands, most of which fail or do harm
 PEOPLE = {
-    "ends": "raise SystemExit(0)",
-    "interrupts": "raise KeyboardInterrupt",
-    "no syntax": "humans = [",
-    "a number": "humans = 5",
-    "strings": "humans = ['a', 'b']",
-    "one": HUMANS.replace("* 2", ""),
+    "ends": "raise SystemExit(0)", "interrupts": "raise KeyboardInterrupt", "no syntax": "humans = [",
+    "a number": "humans = 5", "strings": "humans = ['a', 'b']", "one": HUMANS.replace("* 2", ""),
     "a port that is none": _PORT.format("return None", "return 0 * t"),
     "a port that raises": _PORT.format("raise RuntimeError('\\x1b[2J' * 500)", "return 0 * t"),
     "a force that raises": _PORT.format(_GOOD, "raise OSError(28, 'no')"),
     "a force of another shape": _PORT.format(_GOOD, "return [[1.0]]"),
     "a force that is no number": _PORT.format(_GOOD, "return t / 0"),
     "a force of words": _PORT.format(_GOOD, "return ['x'] * len(t)"),
-    "nobody drawn": _DRAWS.format("return []"),
-    "drawing that raises": _DRAWS.format("1 / 0"),
-    "numbers drawn": _DRAWS.format("return [1] * n"),
-    "a population that is none": HUMANS + "population = 7\n",
-    "persons that are none": HUMANS + "persons = [1]\n",
-    "endless recursion": "def f(): f()\nf()\n",
-    "memory": "raise MemoryError",
-    "control characters": "print('\\x1b[31mred')\n" + HUMANS,
+    "nobody drawn": _DRAWS.format("return []"), "drawing that raises": _DRAWS.format("1 / 0"),
+    "numbers drawn": _DRAWS.format("return [1] * n"), "a population that is none": HUMANS + "population = 7\n",
+    "persons that are none": HUMANS + "persons = [1]\n", "endless recursion": "def f(): f()\nf()\n",
+    "memory": "raise MemoryError", "control characters": "print('\\x1b[31mred')\n" + HUMANS,
     "output that is closed": "import sys\nsys.stdout.close()\n" + HUMANS,
-}
+}  # fmt: skip
 
 
 def combined() -> Iterator[Case]:
     """Yield impossible options, options that exclude each other, and harmful Python files of hands."""
-    asked = [
-        (command, words.strip(), (BUT,), HUMANS)
-        for command, lines in REFUSED.items()
-        for words in re.split(r"[|\n]", lines)
-    ]
+    asked = [(command, line, (BUT,), HUMANS) for command, lines in REFUSED.items() for line in entries(lines)]
     for (name, text), command in pairs(PEOPLE.items(), ("run", "validate")):
         asked.append((command, f"--case none --human h.py:humans --seed {len(name)}", (0, 1, 2, 130), text))
-    for command, words, codes, people in asked:
-        quick = QUICK[command] if command != "audit" else ()
-        yield Case(f"{command} {words}", (command, *quick, *shlex.split(words)), codes, before=written("h.py", people))
+    for command, line, codes, people in asked:
+        words = (command, *(QUICK[command] if command != "audit" else ()), *shlex.split(line))
+        yield Case(f"{command} {line}", words, codes, before=written("h.py", people))
 
 
 def cases() -> Iterator[Case]:
-    """Yield all cases of this file."""
-    yield from numeric_options()
-    yield from odd_paths()
-    yield from overwritten()
-    yield from silence()
-    yield from combined()
+    for part in (numeric_options, odd_paths, overwritten, silence, combined):
+        yield from part()
