@@ -12,19 +12,14 @@ its principal axes), and Delta' = (1 - eps) Delta = diag(delta'). On vectors, ' 
 A tick with force a lowers W by at most its loss r(a) = sum_i T a_i^2/(4 delta'_i). Let R be the sum of the losses of
 all forces that are sent but have not acted. A packet is sent as s times the wanted force, with the largest s in [0, 1]
 for which R <= W. Then W >= 0 always, and beyond the energy that the devices dissipate, devices and hands receive at
-most W0.
+most W0. docs/energy-budget.md has the proofs, the terms for encoder steps, and conditions under which no budget acts.
 
 *Delays.* Tick t may use any packet of age lo to hi, or up to `hold` ticks older if packets are lost. After that the
-device must set its force to zero. The largest loss of tick t is the largest r of these packets, channel by channel, and
-R is the sum over future ticks. With constant delays the budget knows which force acted. Otherwise the device reports
-it, and a tick without a report counts with its largest loss.
-
-*Encoder steps.* Positions are rounded to steps q. A tick with the measured dx, after a tick with the force a_-, adds
-a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel to W. Its largest loss is r(a) + 2 q |a|.
+device must set its force to zero. Unless the budget knows which force acted (constant delays, or a report from the
+device), the tick counts with the largest loss of these packets, channel by channel.
 
 The guarantee does not cover devices whose damping is less than delta, nor hands that are not passive. It covers periods
-that vary if T is the largest period. docs/energy-budget.md has the proofs, and conditions under which the budget never
-acts. The arrays are (m, nsim): channels and simulations.
+that vary if T is the largest period. The arrays are (m, nsim): channels and simulations.
 """
 
 from __future__ import annotations

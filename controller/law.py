@@ -23,8 +23,7 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 #
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
-# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a). A touching wall equals a spring-damper
-# between the same nodes, except for the constant force of its gap.
+# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a).
 #
 # The wall forces p are further inputs of the linear block, and the displacements y are further outputs. Environment and
 # coupling respond within the tick: y = y_free - D p, where y_free is y for p = 0, and -D is the feedthrough. The forces
@@ -210,22 +209,17 @@ def _one_wall(laws: Sequence[Law]) -> Transition:
 
 
 def _last_axis(parts: Sequence[Array]) -> Array:
-    """Stack arrays of one shape along a new last axis."""
     return np.ascontiguousarray(np.moveaxis(np.array(parts), 0, -1))
 
 
 # ----------------------------------------------------------------------------------------------------
-# Let G map displacements x to forces before Theta. The limiter subtracts a slip e from x (e_- at the previous tick). A
-# stiffness rho >= 0 resists changes of e. The forces f_e that the limiter sends satisfy |f_e,i| <= L_i:
+# The limiter subtracts a slip e (e_- at the previous tick) from x, the input of the map G to the forces f_e before
+# Theta (docs/theory.md, (h)). A stiffness rho >= 0 resists changes of e. With the limits L_i
 #
-#         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
+#         f_e = G (x - e) - rho (e - e_-),      |f_e,i| <= L_i,      e_i f_e,i = L_i |e_i|.
 #
-# The limiter acts before Theta, so that delayed forces are limited, too. While no force reaches its limit, e = 0.
-# Let f_free be f_e for e = 0 at this tick (e_- and earlier slips included), and D_G the feedthrough of G. The limiter
-# solves
-#
-#         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
-#
+# While no force reaches its limit, e = 0. Let f_free be f_e for e = 0 at this tick (earlier slips included), and D_G
+# the feedthrough of G. The limiter solves f_e = f_free - (D_G + rho) e with e in the normal cone of the box at f_e,
 # together with the walls, whose forces p are in the normal cone of the box (-inf, 0] at a (d - c) - p. Both are one box
 # problem (controller.complementarity).
 

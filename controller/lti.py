@@ -167,11 +167,10 @@ class Lti(ReadOnly):
 
     @property
     def count(self) -> int:
-        """Number of systems in the stack."""
+        """The number of systems in the stack."""
         return np.broadcast_shapes(*(getattr(self, name).shape[:-2] for name in "ABCD"))[0]
 
     def __getitem__(self, i: int) -> Lti:
-        """Return system i of a stack."""
         A, B, C, D = (part[i] if part.ndim > 2 else part for part in (self.A, self.B, self.C, self.D))
         return Lti(A, B, C, D, self.T)
 

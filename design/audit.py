@@ -255,8 +255,7 @@ def edge(ratio: _Ratio, inside: float, outside: float) -> float:
     The damping must suffice at `inside`. If it also suffices at `outside`, the result is `outside`. The distance to the
     edge is at most the width of the bracket; a secant estimates it. The steps are bisection, or inverse quadratic
     interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997). They aim half of _EDGE inside the
-    edge, so that the last argument is usually the result. Five values of `ratio` take less time than importing
-    scipy.optimize.brentq.
+    edge, so that the last argument is usually the result.
     """
     if suffices(ratio(outside)):
         return outside

@@ -68,9 +68,8 @@ def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
 def _v_hat(H: Block) -> tuple[Array, Block]:
     """Return H(1) and H(1)/2 - (H - H(1))/(z - 1), whose Hermitian part is that of T V-hat/|1 - 1/z|^2.
 
-    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) vanishes at z = 1, where it cannot be strictly positive, so it is
-    divided by |1 - 1/z|^2 (docs/theory.md). H(1) must be symmetric. The result is linear in H, so V and Theta-hat may
-    be passed separately.
+    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) vanishes at z = 1, so it is divided by |1 - 1/z|^2
+    (docs/theory.md). H(1) must be symmetric. The result is linear in H: V and Theta-hat may be passed separately.
     """
     H1, regular = H.over_z_minus_one()
     return H1, -regular
@@ -514,8 +513,7 @@ def asymmetric(V1: Array) -> str | None:
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     """Return the least s (k,) of the demand at w (k,), with _SOFTENED V(1) added to the gain where V vanishes.
 
-    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0. A
-    moving average without a constant vanishes at every zero of Theta-hat. If only V vanishes, the ratio is large.
+    If V and Theta-hat vanish together, V-hat vanishes, and the demand He V-hat >= Delta_V |V-hat|^2 is 0 >= 0.
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
@@ -543,11 +541,6 @@ def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     if not all(0 <= d < np.inf for d in values):
         raise ValueError(f"delta is {list(values)}, expected dampings >= 0 in N s/m")
     return values
-
-
-# Encoder steps under Coulomb friction (docs/theory.md): errors of at most q_j/2 change the force by |w_i| <= W_i, where
-# W_i = sum_j |F_ij|_1 q_j/2 and |F_ij|_1 is the sum of the absolute values of the impulse response. Coulomb friction of
-# at least W_i dissipates the work of w.
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends
@@ -588,12 +581,13 @@ def _l1_gain(F: Lti) -> Array:
 
 
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
-    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m].
+    """Return the Coulomb friction W (p,) [N] that dissipates the work of encoder steps (m,) [m] (docs/theory.md).
 
-    The friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind
-    a limiter or walls, nor for design.known_device, where w also multiplies beta (v+ - v). `axes` lists the number of
-    axes of each device; () means one each. Friction of a device with several axes opposes its velocity in space and
-    must be at least |W|_2 of these axes. Raises ValueError for a wrong number of steps or a negative step.
+    Errors of at most q_j/2 change force i by at most W_i = sum_j |F_ij|_1 q_j/2, with the `_l1_gain` |F_ij|_1. The
+    friction acts at the encoder's own coordinate, in addition to the damping delta. The bound is not proved behind a
+    limiter or walls, nor for design.known_device, where the error also multiplies beta (v+ - v). `axes` lists the
+    number of axes of each device; () means one each. Friction of a device with several axes opposes its velocity in
+    space and must be at least |W|_2 of these axes. Raises ValueError for a wrong number of steps or a negative step.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():

@@ -52,8 +52,6 @@ INTERIOR = _Settings("interior")  # `_interior`, for large blocks with few unkno
 
 @dataclass(frozen=True)
 class _Attempt:
-    """The outcome of one solver setting."""
-
     settings: str
     status: str
     value: float | None  # the objective; None if the result is refused

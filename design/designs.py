@@ -26,8 +26,6 @@ from haptic_loop.design.transparency import NO_FORCE, silent
 
 
 class _Kind(NamedTuple):
-    """One kind of design: its conditions, its function and its options."""
-
     conditions: tuple[Condition, ...]  # allowed conditions; `usual_condition` chooses the default
     module: str  # module of design/ that is imported on first use
     function: str  # name of the function from a loop to a Design

@@ -1,8 +1,4 @@
-"""Conditions with multipliers: this-environment with its facts, and any-environment.
-
-The blocks for a latency, walls, switching delays and limited forces are affine in their multipliers; `Multiplied`
-searches for the best multipliers. The members of ranges are proved one by one.
-"""
+"""Conditions with multipliers: this-environment with its facts, and any-environment."""
 
 from __future__ import annotations
 
@@ -713,7 +709,6 @@ class _AnyEnvironment(Multiplied):
         return compose_any(V, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """Return (the Phi of `least_phi`, None), (None, None) if no Phi is needed, or (None, reason for no Phi)."""
         if (reason := self.beyond(loop)) or not any(loop.psi):
             return None, reason
         try:

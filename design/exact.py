@@ -173,10 +173,9 @@ GROWTH = 2.0**-40  # multiple of the identity that is added if rounding makes th
 def _strictly_positive(S: Matrix) -> bool:
     """Return whether S > 0 is proved, for an exactly symmetric S (n, n).
 
-    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-_BITS. The error
-    is at most 2^-_BITS / 2 per entry, hence at most n 2^-_BITS in norm, which is subtracted from the diagonal. Rounding
-    keeps the numbers in the products short, however long those of S are. Raises ValueError if S is not exactly
-    symmetric.
+    S is scaled by powers of two to a diagonal near one, and every entry is rounded to a multiple of 2^-_BITS, so that
+    the products have short numbers. The error is at most 2^-_BITS / 2 per entry, hence at most n 2^-_BITS in norm,
+    which is subtracted from the diagonal. Raises ValueError if S is asymmetric.
     """
     if not (S.num == S.num.T).all():
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
@@ -506,8 +505,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """Return the solution P (n, n) of the Riccati equation of `find_storage`, by doubling and Newton's method.
 
     Newton's steps in extended precision reduce the residual that rounding leaves. They end when it is below _LEFT times
-    e, or after RICCATI_STEPS steps. Double precision is not enough where lightly damped modes make the margin small.
-    Raises LinAlgError if there is no solution.
+    e, or after RICCATI_STEPS steps. Raises LinAlgError if there is no solution.
     """
     G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)

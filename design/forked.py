@@ -56,12 +56,12 @@ class Forked(Generic[_Result]):
             os.close(writer)
 
     def _compute(self, writer: int) -> NoReturn:  # pragma: no cover - runs in the second process
-        """Send the pickled result, without output and without this process's files, and end."""
+        """Send the pickled result to `writer` and end, without output and without the first process's files."""
         code = 1
         try:
             import ctypes
 
-            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # This process ends with the first one.
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # The second process ends with the first.
             os.dup2(writer, 3)
             os.closerange(4, os.sysconf("SC_OPEN_MAX"))
             for stream in range(3):
@@ -73,7 +73,7 @@ class Forked(Generic[_Result]):
             os._exit(code)
 
     def result(self) -> _Result:
-        """Return the function's result, which must be called once only."""
+        """Return the function's result, once only."""
         if self._process:
             with open(self._reader, "rb") as file:
                 data: Any = file.read()

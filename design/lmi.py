@@ -1,7 +1,7 @@
 """The matrices of the paper's lemmas, the paper's loop-shaping objective, and scalings for solvers.
 
-The designs by Theorem 4 use this module. `lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be
-positive (semi)definite; their arguments are arrays or cvxpy expressions.
+`lemma1`, `lemma2` and `lemma3` return a symmetric matrix that must be positive (semi)definite; their arguments are
+arrays or cvxpy expressions.
 
 The strict inequalities (2), (15), (17) and (18) of the paper have no solution; docs/theory.md has the remedies.
 """

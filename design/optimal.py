@@ -51,8 +51,6 @@ _SEARCHED = 0.2  # least share of --seconds for the search between the vertices 
 
 @dataclass(frozen=True)
 class _BasisResult:
-    """Result of the design over one basis."""
-
     taps: int
     poles: int
     states: int  # order of the loop
@@ -205,8 +203,7 @@ def _for_known_devices(
 
     For fixed beta and fixed multipliers of the facts the block is affine in the forces. The filter over the smallest
     basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola through the three
-    merits, and the multipliers of the last accepted filter. They do not use the best beta of this filter, because with
-    it the program would return the same filter again.
+    merits, and the multipliers of the last accepted filter.
 
     Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
@@ -298,7 +295,6 @@ class _Search:
         return time.perf_counter() - self.started
 
     def over(self, share: float = 1.0) -> bool:
-        """Return whether this share of --seconds is over; without --seconds return False."""
         return self.options.seconds is not None and self.elapsed > share * self.options.seconds
 
     @property
@@ -543,7 +539,6 @@ class _Search:
 
     @property
     def known(self) -> KnownDevice:
-        """The condition for known devices, with limited forces if the options include the limiter."""
         return LimitedKnownDevice() if self.options.limiter else KNOWN_DEVICE
 
     def proved_elsewhere(self, plain: Optimal) -> Optimal:
@@ -593,9 +588,8 @@ class _Search:
     def _start(self, problem: program.Problem) -> Array:
         """Return unknowns of R = kappa I that satisfy every constraint strictly.
 
-        They exist because zero force satisfies each constraint strictly. For F = 0 the Schur complement of the
-        limiter's block is rho (Re M/z - beta/4), where M is its multiplier and
-        Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
+        For F = 0 every constraint holds strictly. That includes the limiter's: its Schur complement is
+        rho (Re M/z - beta/4), with the multiplier M and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:
@@ -653,7 +647,6 @@ class _Search:
 
 
 def _felt(g: float) -> float:
-    """Return the floor g of the static stiffness, or 0 if g is below _FELT_STIFFNESS."""
     return g if g >= _FELT_STIFFNESS else 0.0
 
 

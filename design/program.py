@@ -382,8 +382,7 @@ class Problem:
     def objective(self) -> tuple[Array, Array, Array]:
         """Return A, b, c of |A x - b|^2 + c'x: squared rms or largest mismatch, soft rows, lost stiffness, size of R.
 
-        The forces of a device depend on g and on the device's own row of R only. So each row is a separate
-        least-squares problem, which is reduced to its triangular factor.
+        Each device's row of R is a separate least-squares problem, which is reduced to its triangular factor.
         """
         parts = [part for case in self.cases if case.weight for part in self._weighed(case)]
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]

@@ -226,8 +226,7 @@ def design(
             any-environment uses only the first, known-device-any none.
         limiter: Whether the design must cover limited forces, too; any-environment does if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
-        W1: The output weight of (23).
-        W2: The input weight of (23).
+        W1, W2: The weights of output and input of (23).
 
     Raises:
         Infeasible: Theorem 4 admits no gains.
