@@ -467,10 +467,7 @@ class Network(
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
-        """Return the elongations that a part resists, each as (node, coefficient) pairs.
-
-        A part with a direction resists one elongation, a part without a direction one for each coordinate.
-        """
+        """Return the elongation that a part resists, or one per coordinate, each as (node, coefficient) pairs."""
         direction = part.along if isinstance(part, Spring) else part.normal
         ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
         count = len(ends[0][0]) if ends else 0
@@ -500,10 +497,7 @@ _Matrices = tuple[Array, Array, Array]
 
 
 class Networks(Environment):
-    """Networks with the same nodes, given by their matrices; the contacts are the first nodes.
-
-    Matrices with leading axes hold many networks.
-    """
+    """Networks with the same nodes, given by matrices (.., nodes, nodes); the contacts are the first nodes."""
 
     def __init__(self, contacts: tuple[str, ...], matrices: _Matrices) -> None:
         self.contacts, self.matrices = contacts, matrices
@@ -711,10 +705,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """Return the network with a two-sided spring-damper in place of each wall; it is zero if the wall does not touch.
-
-    By default all walls touch.
-    """
+    """Return the network with a spring-damper for each wall, zero if the wall does not touch; by default all touch."""
     if not network.walls:
         return network
     touching = [True] * len(network.walls) if touching is None else touching

@@ -289,10 +289,7 @@ class Lti(ReadOnly):
         return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
 
     def at_rest(self, x: Array) -> Array:
-        """Return the state s in equilibrium, s = A s + B x, for constant inputs x.
-
-        If the equilibrium is not unique (an environment with a free mass), return the solution of least norm.
-        """
+        """Return the state s = A s + B x for constant inputs x; of several solutions, the one of least norm."""
         s: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
         return s
 

@@ -191,10 +191,7 @@ def _largest(ratio: _Ratio, most: float, least: float) -> float | None:
 def sensitivity(
     loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None
 ) -> _Sensitivity:
-    """Return the errors in delta, T and delay that the certificate of this condition tolerates.
-
-    `needs` is the requirement of the condition, if the caller has it.
-    """
+    """Return the errors in delta, T and delay that the certificate tolerates; `needs` is its requirement, if known."""
     resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
@@ -297,10 +294,7 @@ class _Remedy:
 
 
 def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requirement | None = None) -> list[_Remedy]:
-    """Return single changes that certify the coupling or lower the requirement by more than 10 %.
-
-    `needs` is the requirement of the condition, if the caller has it.
-    """
+    """Return single changes that certify the coupling or lower the requirement, `needs` if known, by more than 10 %."""
     resolved, needs = named(condition), needs or requirement(loop, coupling, condition)
     if needs.certified or resolved.not_varied(loop):
         return []
@@ -323,10 +317,7 @@ def _remedies(loop: Loop, coupling: Coupling, condition: _Condition, needs: Requ
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """Return the least reduction of the delays `name` that certifies, or else the one with the least requirement.
-
-    The delays of all channels fall by the same number of samples, but not below 0.
-    """
+    """Return the least reduction of the delays `name`, one for all channels, that certifies, or else the best one."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)

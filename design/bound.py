@@ -322,10 +322,7 @@ class _Dual:
 
 
 def _splines(x: Array, knots: Array, degree: int) -> Array:
-    """Return the B-splines over the knots at x, (k, knots + degree - 1), by the recursion of Cox and de Boor.
-
-    scipy.interpolate has this function, too, but its import takes a third of a second.
-    """
+    """Return the B-splines over the knots at x, (k, knots + degree - 1), without SciPy, whose import is slow."""
     place = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2) + degree
     t = np.concatenate([[knots[0]] * degree, knots, [knots[-1]] * degree])
     x, splines = np.clip(x, knots[0], knots[-1])[:, None], np.eye(t.size - 1)[place]

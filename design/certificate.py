@@ -414,10 +414,7 @@ def _margin(requirement: Requirement) -> float:
 
 
 def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
-    """Return the `stored` multipliers in one sequence, or None if the condition has none.
-
-    Raises NotProved if their names or lengths differ from those of the condition.
-    """
+    """Return the `stored` multipliers in one sequence, or None if there are none. Raises NotProved for wrong ones."""
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
     if {name: len(values) for name, values in stored.items()} != expected:

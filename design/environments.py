@@ -228,10 +228,7 @@ class _Search:
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`).
-
-        With a `spare` (`_worst`) this is a lower bound for the block less `spare`.
-        """
+        """Return (lower bound of the ratio for all multipliers within bounds, best multiplier found from `values`)."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
@@ -393,10 +390,7 @@ class ThisEnvironment(Multiplied):
         return requirements[worst(requirements)]
 
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """Return the largest requirement of all members with `multiplier`.
-
-        For None, it is the better result of the usual multiplier and of the best multiplier of the worst member.
-        """
+        """Return the largest requirement of all members; None tries the usual and the worst member's multiplier."""
         loops = [loop.at(member.network) for member in loop.members()]
 
         def most(values: Any) -> tuple[Requirement, Loop]:

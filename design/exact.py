@@ -331,10 +331,7 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
 
 
 def _prove_positive_real(G: Lti, P: Matrix) -> str | None:
-    """Return None if P proves that G is strictly positive real, otherwise the reason.
-
-    Floating point with an a-priori error bound may refuse early; only exact arithmetic accepts.
-    """
+    """Return None if P proves that G is strictly positive real, else the reason. Floating point can only refuse."""
     n = G.order
     if P.shape != (n, n):
         return f"P has shape {P.shape}, the block has {n} states"
@@ -463,10 +460,7 @@ def _extended(M: Any) -> Array:
 
 
 def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
-    """Return G with states and channels of about size one, and the exponents of the powers of two for its states.
-
-    The size of a state is the largest gain from the scaled inputs to it, over frequency.
-    """
+    """Return G with states and channels of about size one, and the exponents of the powers of two for its states."""
     A, B, C, D = map(_extended, (G.A, G.B, G.C, G.D))
     channel = 1 / np.sqrt(np.maximum(np.abs(np.diag(D)), np.longdouble(1e-300)))
     B, C, D = B * channel, channel[:, None] * C, channel[:, None] * D * channel
@@ -528,10 +522,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
 
 
 def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
-    """Return the limit of X <- H + A'X (I + S X)^-1 A, or without S of X <- H + A X A', from X = 0, by doubling.
-
-    Raises LinAlgError if the iteration diverges or does not converge within DOUBLINGS steps.
-    """
+    """Return the limit of X <- H + A'X (I + S X)^-1 A, or without S of X <- H + A X A', from 0. Raises LinAlgError."""
     one = np.eye(len(A))
     for _ in range(budgets.DOUBLINGS):
         if S is None:

@@ -99,10 +99,7 @@ DEFAULT = Options()
 
 @dataclass(frozen=True, eq=False)
 class _Constraint:
-    """Linear matrix inequality for the forces G = R Psi E before their delay Theta, at every frequency.
-
-    The inequality is He[block(G, x)] > 0. The block is jointly affine in G and in the constraint's own unknowns x.
-    """
+    """The constraint He[block(G, x)] > 0 at every frequency, affine in G = R Psi E and its own unknowns x."""
 
     name: str
     block: Callable[[Sampled, Array], Sampled]

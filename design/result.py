@@ -185,10 +185,7 @@ class Infeasible(DesignFailed):
 
 
 def listed(values: Iterable[float | None], digits: int = 6, once: bool = False) -> str:
-    """Return the values as "1.37, 0.5", with `digits` significant digits; None is printed as inf.
-
-    With `once`, three or more values with the same digits are printed as one.
-    """
+    """Return values as "1.37, 0.5" with `digits` digits, None as inf; `once` prints three or more equal ones as one."""
     texts = ["inf" if v is None else f"{v + 0.0:.{digits}g}" for v in values]
     return texts[0] if once and len(texts) > 2 and len(set(texts)) == 1 else ", ".join(texts)
 

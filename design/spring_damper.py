@@ -670,10 +670,7 @@ _Q = "q11", "q12", "q22"
 
 
 def _moving_average_of_levels(loop: Loop, started: float) -> Design:
-    """Return the stiffest linear coupling for matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta) with a reserve.
-
-    Without the reserve V(1) attains its lower bound T/2 blockdiag(n_i Delta_i^-1), n_i = theta_i + 1.
-    """
+    """Return the stiffest linear coupling for matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta) with a reserve."""
     weight = _rounded_inverse(2 * even_level(loop) / loop.T)
     terms = np.array(loop.theta) + 1
     late = moving_sum(loop.theta, loop.T)

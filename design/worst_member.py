@@ -161,10 +161,7 @@ def search_ranges(
     over: Callable[[], bool] = lambda: False,
     ratio: Callable[[Loop], float] | None = None,
 ) -> Searched:
-    """Find the members of the loop's ranges in which the coupling needs the most damping.
-
-    `ratio` returns required over available damping in the loop of a member; by default that of this-environment.
-    """
+    """Find the members of the loop's ranges where `ratio`, by default that of this-environment, is largest."""
     assert loop.ranges
     parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
     return search(parts, lambda member: ratio(loop.at(member.network)), progress, over=over)

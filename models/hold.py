@@ -18,10 +18,7 @@ _Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class HeldPlant:
-    """The plant under a zero-order hold of T seconds: s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k].
-
-    A and B with a leading axis hold many plants.
-    """
+    """The plant under a hold of T s: s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]; leading axes hold many plants."""
 
     A: _Array  # (..., states, states)
     B: _Array  # (..., states, external forces + m)

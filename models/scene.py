@@ -97,10 +97,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The linear plant s' = A s + B u, x = C s, with u = [external forces; f] and the encoder positions x.
-
-    s holds n positions, n velocities, and the states of the humans' impedances.
-    """
+    """The plant s' = A s + B [external forces; f], x = C s; s = [positions; velocities; states of the impedances]."""
 
     A: _Array  # (2n + states, 2n + states)
     B: _Array  # (2n + states, outside + m)
