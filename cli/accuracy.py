@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
 
 
 def _verdict(judged: Sequence[bool], rows: Sequence[Row]) -> str:
-    """Return whether the default settings have the right verdicts, which `judged` says for each measured default."""
+    """State whether the default settings have the right verdicts; `judged` has one entry per measured default."""
     which = ("No default was measured", "The default that was measured judges", "The defaults judge")[len(judged)]
     words = f"{which} stability as the exact engine does" if judged else which
     words = words if all(judged) else "A DEFAULT JUDGES STABILITY WRONGLY"

@@ -39,7 +39,7 @@ class _CatalogueDevice:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """An audit and the sources of its numbers, in SI units; null has a "reason"."""
+    """An audit and the sources of its numbers, in SI units; a missing figure is null, with a "reason"."""
 
     case: str
     scenario: str | None

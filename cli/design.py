@@ -192,7 +192,7 @@ def _that_decays(
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
         decay = ringing(assemble(scenario, design.coupling))
-        assert decay  # There is no world, and with the spring of a coupling not all modes are free drifts.
+        assert decay  # Worlds are refused, and with the spring of a coupling not all modes are free drifts.
         return design, decay
 
     tried: list[Ringing] = []

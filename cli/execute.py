@@ -75,7 +75,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         nobody_reads()
     except OSError as error:
         code = _cannot(error)
-    # If Ctrl-C interrupted a call of exec(), as dataclass makes, Python would end by SIGINT unless exec() ran again.
+    # After a Ctrl-C in a call of exec(), as dataclass makes, Python would end by SIGINT unless exec() runs once more.
     exec("")
     sys.exit(code)
 

@@ -502,10 +502,7 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 
 
 def place(args: argparse.Namespace) -> str:
-    """Return the part of a file name that states case or scenario, and coupling and condition if options name them.
-
-    For example, it is `I-stiff` for `--coupling stiff.json`.
-    """
+    """Return case or scenario, coupling and condition as a part of a file name: I-stiff for --coupling stiff.json."""
     if args.scenario == DEFAULT:
         loop = args.case
     else:

@@ -52,7 +52,7 @@ class Move(Protocol):
     def __call__(self, done: int, total: int, what: str = ...) -> None: ...
 
 
-_SILENCE = 2.0  # [s] after which a command that prints nothing says what it does
+_SILENCE = 2.0  # [s] time after which a command that prints nothing says what it does
 
 
 @contextmanager

@@ -144,7 +144,7 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Return a function that says whether a file was touched since its last call; False without the file."""
+    """Return a function that says whether a file exists and was touched since the last call."""
     last = _mtime(path)
 
     def touched_again() -> bool:

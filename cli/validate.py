@@ -138,7 +138,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
-    """Return the nominal environment, vertices, worst point and random points of ranges; () for the nominal one."""
+    """Return the nominal environment, vertices, worst and random points of ranges; () for --environments nominal."""
     if args.environments == "nominal":
         return ()
     assert ranges is not None

@@ -27,8 +27,8 @@ PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # pairs of lossless hands, duration of a 
 class PassivityControl:
     """Passivity observer and series controller (Hannaford and Ryu, IEEE Trans. Robotics and Automation 18, 2002).
 
-    The observer adds up f dx; when the sum is negative, a damper dissipates the deficit in one tick. `delta` (m,)
-    [N s/m] is our credit for what the devices dissipate. The controller acts at the devices, behind the delays.
+    The observer adds up f dx; when the sum is negative, a damper dissipates the deficit in one tick. We added `delta`
+    (m,) [N s/m], the devices' damping, which the sum then counts. The damper acts at the devices, behind the delays.
     """
 
     at_device = True

@@ -225,7 +225,7 @@ def _point(row: Row) -> Array:
 
 @dataclass(frozen=True)
 class Credible:
-    """When a run leaves the range of the devices' linear model, with peak forces and speeds, and their limits.
+    """The time at which a run leaves the range of the devices' linear model; peak forces and speeds, and their limits.
 
     Each list has one entry per channel, but the peaks of a run without ticks are empty.
     """
@@ -346,7 +346,7 @@ _MOST_COMPARED = 256  # largest number of substeps of a refined reference
 _MOST_EVALUATIONS = 6e7  # largest number of evaluations of the dynamics in a refinement; they take two minutes
 _EVEN = 0.6  # least q
 _CONTRACTS = 0.7  # largest q of differences that count as convergent
-_FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three
+_FEW = 4.0  # error bound if the differences do not converge, in units of the largest of the last three differences
 
 
 @dataclass(frozen=True)
@@ -405,7 +405,7 @@ def compare_engines(
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
-    """Return the cheapest setting with an error up to `error` and the right verdict. Raises InputError without any."""
+    """Return the cheapest setting with the right verdict and an error up to `error`. Raises InputError if none has."""
     right = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if right:
         return min(right, key=lambda choice: choice.cost)

@@ -147,8 +147,7 @@ def _alternative(
     return replace(row, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Couplings over frequency.
+# ---- couplings over frequency
 
 
 @dataclass(frozen=True, eq=False)

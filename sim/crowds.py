@@ -60,7 +60,7 @@ _AT_RANDOM = 64  # size of the random sample of all humans
 
 
 def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
-    """Draw humans of a user's population, grouped by their structure: (indices of the group, sets)."""
+    """Draw humans of a user's population; yield (indices, sets of hands) for each group of equal structure."""
     drawn, layouts = {}, {}
     for i in indices:
         rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
@@ -87,7 +87,7 @@ class Validation:
     engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
     duration: float  # [s] length of the traces; 0 for no traces
     threads: int = 0  # number of MuJoCo's threads; 0: one, or one per core for large batches
-    environments: tuple[Member, ...] = ()  # environments for the sets in turn; if empty, the scenario's alone
+    environments: tuple[Member, ...] = ()  # the sets touch these in turn; if empty, all touch the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
     all_traces: bool = False  # MuJoCo, or a user's own engine, simulates all humans in place of a sample
 
@@ -381,7 +381,7 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine every batch in `shards` processes. An error of memory or a worker, or Ctrl-C, keeps finished batches."""
+    """Examine all batches in `shards` processes. After Ctrl-C or an error, return the findings of finished batches."""
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:

@@ -171,8 +171,7 @@ class ExactTimedEngine(_Exact):
         self._product(which[(buffer.first + k) % len(which)])(buffer.plant_row[k], buffer.plant_state[k + 1])
 
 
-# ----------------------------------------------------------------------------------------------------
-# MuJoCo's engines.
+# ---- MuJoCo's engines
 
 EXPONENTIAL = "exponential"  # this program's integrator, which reads MuJoCo's accelerations
 
@@ -519,7 +518,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Return the product of column j and matrix j for all j; a single matrix multiplies all columns."""
+    """Return a function that multiplies column j by matrix j; a single matrix multiplies all columns."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 

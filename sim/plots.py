@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 Row = Comparison = Any  # sim.accuracy.Row and sim.comparison.Comparison; importing them would be circular
 
 
-# ----------------------------------------------------------------------------------------------------
-# The style.
+# ---- the style
 
 #: Okabe and Ito's palette, with a line style for each colour
 STYLES: tuple[dict[str, Any], ...] = (
@@ -185,8 +184,7 @@ def _plain_numbers(axes: Any) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-# ----------------------------------------------------------------------------------------------------
-# Runs, as in the paper's Figures 5 and 6.
+# ---- runs, as in the paper's Figures 5 and 6
 
 _SAME = 1e-6  # [%] a smaller force error is rounding: the commanded force equals that of the object itself
 
@@ -484,8 +482,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
     return save(figure, path)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Checks: engines against each other, and random humans.
+# ---- checks: engines against each other, and random humans
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
@@ -525,8 +522,7 @@ def draw_population(mass: Array, damping: Array, growth: Array, title: str) -> F
     return figure
 
 
-# ----------------------------------------------------------------------------------------------------
-# Couplings over frequency, from the report of `python -m design.compare`.
+# ---- couplings over frequency, from the report of `python -m design.compare`
 
 #: (field, label, style) of E, F and M in every panel of singular values
 _PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (

@@ -64,7 +64,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Return the default hand of device i (from 0): 0.3 kg on a spring whose other end swings 15 mm at 0.6 Hz."""
+    """Return the default hand of device i (from 0): 0.3 kg on a spring whose far end moves by +-15 mm at 0.6 Hz."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
@@ -431,10 +431,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def own_environment(text: str) -> Any:
-    """Return the environment of FILE.py:NAME, for `Scenario.replace`; a class or a function is called.
-
-    Raises InputError if the file or the call fails.
-    """
+    """Load an environment from FILE.py:NAME; a class or a function is called. Raises InputError if this fails."""
     own = named("--environment", text)
     return called(f"--environment {text}", own) if callable(own) else own
 
@@ -480,7 +477,7 @@ def is_world(scenario: Scenario) -> bool:
 
 
 def require_no_world(scenario: Scenario, what: str) -> None:
-    """Raise InputError if the environment is a MuJoCo scene; `what` names the caller in all messages."""
+    """Raise InputError if the environment is a MuJoCo scene; `what` names the command in the message."""
     if is_world(scenario):
         able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge accept worlds"
         raise InputError(

@@ -228,7 +228,7 @@ _FADED = 1e-6  # eigenvalues up to this modulus are a delay line's poles at zero
 
 
 def ringing(simulation: Simulation) -> Ringing | None:
-    """Return the decay after an impulse, the slowest over all sets of touching walls.
+    """Return the decay after an impulse; with walls, the modes of all sets of touching walls count.
 
     Return None in a world, which has no eigenvalues, and for a loop whose modes are all free drifts.
     """
@@ -317,7 +317,7 @@ class _Contact:
     """Contacts with walls in a run, and the linear loops between which contacts switch."""
 
     made: int  # number of times that a wall was touched
-    ticks: int  # ticks in which some wall was touched
+    ticks: int  # number of ticks in which some wall was touched
     slopes_n_per_m: list[float]  # largest stiffness of each wall (controller.environment.Wall.slope)
     frozen: list[_Frozen]  # one for every set of touching walls
 
@@ -420,7 +420,7 @@ class ImpulseTest:
 
     growth: Array  # (nsim,) [1/s] fitted growth of the exact loop's dominant mode before a force clips; nan without fit
     error: Array  # (nsim,) [1/s] estimated error of `growth`; a smaller rate has no certain sign
-    clipped: NDArray[np.int64]  # (nsim,) ticks in which a force is at its limit or, with a limiter, the limiter acts
+    clipped: NDArray[np.int64]  # (nsim,) number of ticks with a force at its limit or, with a limiter, a limited force
     least_energy: Array  # (nsim,) [J] least energy W(N) (sim.crowds); without a limiter up to the first clipped tick
     audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W(N): the scale of its rounding
     settling: Array  # (nsim,) rms speed of the handles in the last quarter over that in the second quarter

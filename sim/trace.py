@@ -109,7 +109,7 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-        """Return (N,) whether a force reached `force_limit` (m,) [N]; `balls`: channels limited as a vector."""
+        """Return (N,) whether a force reached `force_limit` (m,) [N], which bounds the vector length in each ball."""
         return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
     def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
@@ -308,7 +308,7 @@ class Growth:
     error_per_s: float | None = None  # standard error of the rate
     frequency_hz: float | None = None
     amplitude_m: float | None = None  # amplitude of the oscillation's octave in the last window that shows it
-    slowest_hz: float | None = None  # slower oscillations are not seen
+    slowest_hz: float | None = None  # frequency below which oscillations are not seen
     trend: str | None = None  # "grows" or "decays", by more than _CLEAR standard errors, or "neither"
     reason: str | None = None  # why there is no rate
 
@@ -360,7 +360,7 @@ class _Lines(NamedTuple):
     brief: bool  # an oscillation is seen in some window; in too few windows for a rate if `octaves` is empty
     gone: bool  # no oscillation is seen in the last window
     floor: float  # [m] least amplitude that is above the encoders' rounding in every octave
-    slowest: float  # [Hz] slower oscillations are not seen
+    slowest: float  # [Hz] frequency below which oscillations are not seen
 
 
 def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:

@@ -150,13 +150,13 @@ class Traces:
 
     duration_s: float
     humans: int
-    clipped_runs: int  # traces in which a force reached its limit
+    clipped_runs: int  # number of traces in which a force reached its limit
     contacts: int  # number of times that a wall was touched
-    measured: int  # traces with a growth rate
-    witnessed: int  # traces that MuJoCo, or a user's own engine, also made
-    undecided: int  # traces that are too short for the sign of their rate; eigenvalues decide there
+    measured: int  # number of traces with a growth rate
+    witnessed: int  # number of traces that MuJoCo, or a user's own engine, also made
+    undecided: int  # number of traces too short for the sign of their rate; eigenvalues decide there
     largest_difference_per_s: float | None  # largest difference of the growth rates of trace and exact loop
-    stable_and_settling: int  # stable loops whose handles were slower in the last quarter than in the second
+    stable_and_settling: int  # number of stable loops whose handles were slower in the last quarter than in the second
     stable: int
     slowest_settling: float | None  # largest ratio of late to early speeds of handles among the stable loops
     slowest_decay_s: float | None  # decay time of the slowest mode that decays

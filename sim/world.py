@@ -48,7 +48,7 @@ class WorldFigures(ShellFigures):
     port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
-    unsettled_steps: int  # steps of the scene in which limited forces still changed after the last repetition
+    unsettled_steps: int  # number of steps in which limited forces still changed after the last repetition
     warnings: list[str]  # texts of MuJoCo's warnings
 
 
@@ -187,8 +187,7 @@ def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
     return [np.linalg.inv((D + D.T) / 2) for D in within]
 
 
-# ----------------------------------------------------------------------------------------------------
-# The net of a run
+# ---- the net of a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,14 +288,13 @@ class InWorld:
         )
 
 
-# ----------------------------------------------------------------------------------------------------
-# Hands and adversaries
+# ---- hands and adversaries
 
 RANDOM, LOSSLESS = "random hands", "lossless hands"
 _THROWN = 0.3  # [m/s] rms of the initial speeds of all bodies of devices and hands
 _NEVER = 1e3  # [J] W0 so large that the shell never acts
 _ADVERSARIES = 20  # number of sets of hands in `least_at_port`
-_BRAKED = 10  # runs of the adversary that stops and turns
+_BRAKED = 10  # number of runs in `_hit_and_brake`
 _STREAM = 11  # random stream of these draws, independent of the hands' stream with the same seed
 
 
@@ -361,7 +359,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Callable[[int], None]) -> float:
-    """Return the least energy [J] that entered the port in runs of 1 s in which the springs' ends stop and turn.
+    """Return the least energy [J] that entered the port in runs of 1 s; the springs' ends stop and turn at random.
 
     `done` is called with the number of finished runs.
     """

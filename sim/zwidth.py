@@ -49,7 +49,7 @@ MODEL_KEPT = "model kept"  # the second case of `EnvironmentSweep`, listed besid
 
 @dataclass(frozen=True, eq=False)
 class _Sweep(ABC):
-    """Devices, delays and an environment; K and B are (n,) arrays for n cells."""
+    """A sweep over K and B for these devices, delays and environment; arguments K and B are arrays (n,) of n cells."""
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
@@ -99,7 +99,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def usual_scale(self) -> str:
-        """Linear against a rigid wall; else logarithmic, as couplings far above `stiffness_scale` can be safe."""
+        """Return "linear" for a rigid wall, else "log", because couplings far above `stiffness_scale` can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
@@ -315,7 +315,8 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
     """Return a grid of n x n cells. Default ranges follow from the loop and include the marks.
 
     The scale of K is the sweep's stiffness_scale, that of B the largest delta. A linear map goes up to 2.5 times these
-    scales, a logarithmic one from far below to far above. Raises InputError for an impossible range, or a mark outside.
+    scales, a logarithmic one from 1/30 to 30 times (K) and from 1/100 to 10 times (B). Raises InputError for an
+    impossible range, or a mark outside.
     """
     scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":

@@ -31,7 +31,7 @@ class _Ratio:
 
     required_over_available: Array  # (rows, columns) required over available damping
     certified_cells: int
-    contradicted_cells: int | None = off_table("if given")  # certified, but unstable with a human of the population
+    contradicted_cells: int | None = off_table("if given")  # number of certified cells that are unstable with a human
     reason: str | None = off_table("if given")  # why some cells have no figure
 
 
@@ -44,7 +44,7 @@ class _Population:
     growth_rate_per_s: Array  # (rows, columns)
     unstable_humans_at_least: Array  # (rows, columns), among the humans that were tried in the cell
     stable_cells: int
-    decided_cells: int  # cells that were reached before an interruption
+    decided_cells: int  # number of cells that were reached before an interruption
     reason: str | None = off_table("if given")
 
 
@@ -164,7 +164,7 @@ class _Simulated:
 
 @dataclass(frozen=True, eq=False)
 class MapReport:
-    """The report of a map. Rows are stiffnesses; null: infinite, not applicable, or not reached (interrupted)."""
+    """The report of a map. Rows are stiffnesses. Null means infinite, not applicable, or not reached."""
 
     rigid: bool
     scenario: str | None

@@ -74,7 +74,7 @@ class Analysis:
 
 
 def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float]) -> Analysis:
-    """Check whether V satisfies Theorem 4 with this environment. Raises ValueError if it is not passive.
+    """Check whether V satisfies Theorem 4 with this environment. Raises ValueError for one that is not passive.
 
     The problem minimises s subject to E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
     Delta_V + s >= 0; the margin is -s.

@@ -63,7 +63,7 @@ def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.ran
     """Return how many hands' motions grow a hundredfold after the first tenth of the ticks.
 
     Each tick multiplies the state by one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average.
-    Without `mean`, it is the step after which `energy` (hands, 2) times [x^2, v^2] is largest.
+    Without `mean`, each hand takes the step after which `energy` (hands, 2) times [x^2, v^2] is largest.
     """
     hands = len(energy)
     z = 1e-3 * rng.standard_normal((hands, steps.shape[2], 1))

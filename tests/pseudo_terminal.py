@@ -62,7 +62,7 @@ class RealTimeEmulator:
         self._period, self._pace = 1e6 * T, pace
         self._start = time.monotonic_ns()
         self._lost = 0.0  # [us] by which this process was delayed
-        self.late = 0  # ticks that began more than half a period late
+        self.late = 0  # number of ticks that began more than half a period late
         self._queue: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
         self._number = count()
         self._partial = b""

@@ -117,7 +117,7 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
 def contact_by_hand(z, T, mass=0.0, stiffness=0.0, damping=0.0, coupling=None):
     """Return F, J, H and Y (k,) at k points z: the responses of a tip that a spring-damper coupling holds.
 
-    F, J map a device's displacement and a wall's force at the tip to the sent force; H, Y map them to the tip's
+    F and J map a device's displacement and a wall's force at the tip to the sent force; H and Y map them to the tip's
     displacement. The tip has a mass [kg], and a spring [N/m] and a damper [N s/m] to ground.
     """
     s = (1 - 1 / z) / T

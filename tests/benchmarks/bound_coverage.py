@@ -34,7 +34,7 @@ class Case:
     seed: int
     rigid: bool
     mass: float  # [kg]
-    motor: float  # part of the mass, where there is a transmission
+    motor: float  # the motor's share of the mass of a compliant device
     stiffness: float  # [N/m] of the transmission
     viscous: float  # [N s/m]
     coulomb: float  # [N]

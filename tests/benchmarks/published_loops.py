@@ -1,7 +1,7 @@
 """Write benchmarks/figures.csv: PYTHONPATH=. python tests/benchmarks/published_loops.py     (a quarter of an hour)
 
-For loops n* and o*, the columns EXPENSIVE but for `designed_rms_db` are copied from the present file;
-tests/benchmarks/optimal_loops.py prints their figures.
+For loops n* and o*, the columns of EXPENSIVE other than `designed_rms_db` are copied from the present file;
+tests/benchmarks/optimal_loops.py computes them.
 """
 
 from __future__ import annotations

@@ -90,4 +90,4 @@ def test_audit_of_devices_with_three_axes(benchmark, devices):
     ratios = {name: round(needs.ratio, 6) for name, needs in found.assessment.requirements.items()}
     print(f"\naudit of {m} channels ({devices} x 3): {time.process_time() - begin:.2f} CPU s; {ratios}")
     least = np.linalg.eigvalsh(loop.Delta()[:3, :3])[0]
-    assert ratios["any-environment"] == pytest.approx(0.8 / least, rel=1e-4)  # 0.8 N s/m: a dense sweep for one axis
+    assert ratios["any-environment"] == pytest.approx(0.8 / least, rel=1e-4)  # 0.8 N s/m is needed for one axis

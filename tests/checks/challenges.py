@@ -33,7 +33,7 @@ from haptic_loop.sim.passivity_layer import EnergyNet, netted
 from haptic_loop.sim.run import assemble, run_blocks
 from haptic_loop.sim.scenario import Scenario
 
-ENOUGH = 1.02  # times the damping or friction that a guarantee requires
+ENOUGH = 1.02  # damping (or friction) over that which a guarantee requires
 _GIVEN = 0.005  # [J] energy that a budget may give
 _PUSHED = 24  # number of motions that are simulated together
 _GROWN = 1.5  # a hand's motion grows if its rms speed in the last quarter exceeds this many times that in the first
@@ -212,7 +212,7 @@ class _Rubbing:
     def __init__(self, plants: HeldPlant, friction: Array) -> None:
         self._A, self._B, self._most = plants.A, plants.B[..., -len(friction) :], friction.T[..., None]
         states, m = plants.A.shape[-1], len(friction)
-        self._speeds = slice(states // 2, states // 2 + m)  # of the devices; a force accelerates only its own device
+        self._speeds = slice(states // 2, states // 2 + m)  # the devices' speeds; a force accelerates only one device
         self._gain = np.diagonal(self._B[:, self._speeds], axis1=1, axis2=2)[..., None]
 
     def start(self, buffer: StepBuffer) -> None:

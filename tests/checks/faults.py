@@ -63,7 +63,7 @@ class Fault:
     shown: bool = False  # a person moves each axis in its + direction before arming
     deadman: bool = False  # forces act only while the dead-man switch at the device is held
     period: float = 1.0  # one tick by the device's clock, in T
-    lasts: float = _LASTS  # [s] after arming
+    lasts: float = _LASTS  # [s] from arming to the end of the case
 
 
 def _spoiled(force: float | None) -> _Call:

@@ -66,7 +66,7 @@ class _Proof:
     """The proof for one network; its devices have 0.5 to 1.5 times the required damping."""
 
     number: int
-    required: float  # over the available damping
+    required: float  # required over available damping
     proved: bool
     reason: str | None
 
@@ -160,8 +160,8 @@ class _Slow:
     """Traces of 2 s of fifty hands on one network that decays in seconds, beside the eigenvalues."""
 
     network: int
-    decided: int  # traces whose rate is larger than its error
-    contradicted: int  # decided traces that contradict the eigenvalues
+    decided: int  # number of traces whose rate is larger than its error
+    contradicted: int  # number of these traces that contradict the eigenvalues
     worst: float  # |rate - eigenvalue's| over the error that the trace states
     holds: bool
 

@@ -1,8 +1,8 @@
 """Test this-environment in `make validate` under uneven ticks, which are drawn or chosen by an adversary.
 
-Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of what this-
-environment requires for periods up to T_max, for forces that latch late, or for both. Lossless hands start with random
-speeds, everything else at rest. The adversary chooses the tick that leaves hands and devices most mechanical energy.
+Each loop has one or two devices, a random spring-damper and a random network. The damping is a multiple of that which
+this-environment requires for periods up to T_max, for forces that latch late, or for both. Lossless hands start with
+random speeds, all else at rest. The adversary chooses the tick that leaves hands and devices most mechanical energy.
 
 With ENOUGH damping this energy may never exceed that at the start. The work of the forces plus the least dissipation
 delta a^2/tau_max + delta b^2/(T_max - tau_min), with the motions a and b before and after the latch of each tick and

@@ -140,7 +140,7 @@ def silence() -> Iterator[Case]:
     yield Case("run of a feather", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", FEATHER))
 
 
-#: by command: options that are refused
+#: command -> options that are refused
 REFUSED = {
     "run": """--error 0 | --error -1 | --error 1e-400 | --error inf | --error 1e-6 --engine exact
         --error 1e-6 --integrator RK4 | --error 1e-6 --substeps 4 | --energy-budget -1 | --energy-budget 1,0.5

@@ -2,9 +2,8 @@
 
 The command makes small mistakes, one at a time, in the functions of the modules of TABLE: it reverses a comparison or a
 sign, changes a number, leaves out a refusal, or writes `max` for `min`. Then it runs the tests that call the changed
-function, the fastest first, until one fails: the mutant is killed. A process that has collected the tests is forked for
-each mutant. The seed decides which mistakes are drawn. mutate.survivors.md explains mutants that may survive; any other
-survivor, or a score below GOAL, fails the run.
+function, the fastest first, until one fails: the mutant is killed. mutate.survivors.md explains mutants that may
+survive; any other survivor, or a score below GOAL, fails the run.
 
     python tests/tools/mutate.py [--only design/exact.py] [--count 40] [--seed 0] [--jobs 2]
 """
@@ -47,12 +46,11 @@ TABLE = {
     "hw/limits.py": "hw/test_limits",
     "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
 }
-_ENOUGH = 6.0  # CPU seconds that the tests of one mutant may take without the mistake; the fastest tests are taken
+_ENOUGH = 6.0  # CPU seconds that the tests of one mutant may take without the mistake; the fastest tests are chosen
 _TIMEOUT = 3.0  # a mutant is ended after 15 s of CPU time plus this many times the usual CPU time of its tests
 
 
-# ----------------------------------------------------------------------------------------------------
-# Running the tests in forks of a process that has collected them.
+# ---- running the tests in forks of a process that has collected them
 
 
 class _Runner:
