@@ -116,10 +116,7 @@ class HeldLine:
         self._held = np.zeros((m, nsim))
 
     def carry(self, k: int, force: Array) -> None:
-        """Overwrite `force` (m, nsim), sent at tick k, with the force that the devices apply at tick k.
-
-        Raises ValueError if no delays are given for tick k.
-        """
+        """Replace `force` (m, nsim), sent at tick k, by the force that acts then. Raises ValueError without delays."""
         if k >= self._fresh.shape[0]:
             raise ValueError(f"delays are given for {self._fresh.shape[0]} ticks, expected a row for tick {k}, too")
         self._sent[k % self._sent.shape[0]] = force

@@ -602,7 +602,7 @@ _Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at 
 
 
 def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
-    """Return required over available damping (n,) of force maps with responses `at` and poles (n, p), or inf."""
+    """Return required over available damping (n,), or inf, of n force maps with these responses and poles (n, p)."""
     here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
     sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= _STATIC) & (least >= -_STATIC)
@@ -617,7 +617,7 @@ def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array
 def any_environment_ratios(
     V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
 ) -> Array:
-    """Return required over available damping (count,) of any-environment for the `count` couplings whose V is given."""
+    """Return required over available damping (count,) of any-environment; `V` samples the V of `count` couplings."""
 
     def needed(w: Array) -> Array:
         return _least_scales(demand(V(on_circle(w))))

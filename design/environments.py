@@ -390,7 +390,10 @@ class ThisEnvironment(Multiplied):
         return requirements[worst(requirements)]
 
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """Return the largest requirement of all members; None tries the usual and the worst member's multiplier."""
+        """Return the largest requirement of all members with `multiplier`.
+
+        For None, it is the better result of the usual multiplier and of the best multiplier of the worst member.
+        """
         loops = [loop.at(member.network) for member in loop.members()]
 
         def most(values: Any) -> tuple[Requirement, Loop]:

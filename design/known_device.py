@@ -441,10 +441,7 @@ class _Search:
         return tuple(values.tolist())
 
     def idle(self, z: Complex, parts: Complex, x: Array) -> Complex:
-        """Return the block (k, n, n) without L at beta and multipliers of x.
-
-        alpha weighs dx + beta (v+ - v), so for switching delays the block is not affine in (alpha, beta).
-        """
+        """Return the block (k, n, n) without L at x; for switching delays it is not affine in (alpha, beta)."""
         m, beta, weights = self.device.size, self.beta(x), self.weights(x)
         block = parts[0] + np.tensordot(np.concatenate([x[: self.m], weights]), parts[1:], axes=1)
         alpha, loop = named_parts(self.sweep.unknowns, self.values(x)).get("alpha"), self.sweep.loop

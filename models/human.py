@@ -55,7 +55,7 @@ class Impedance:
             _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
 
     def changed(self, change: Callable[[_Array], _Array]) -> Impedance:
-        """Return a copy with `change`, which indexes or repeats leading axes, in A, B, C and D, without a new check."""
+        """Return a copy after `change` of A, B, C and D, which indexes or repeats leading axes, without a new check."""
         changed = object.__new__(Impedance)
         for name in "ABCD":
             _freeze(changed, name, change(getattr(self, name)))
