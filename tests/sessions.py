@@ -1,6 +1,9 @@
 """Sessions in virtual time, for the tests of hw/."""
 
+import os
+import pickle
 import re
+import warnings
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import SafetyLimits
@@ -23,6 +26,32 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **optio
     if recorder is not None:
         session.record = recorder
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
+
+
+def in_fork(call, *arguments):
+    """Call in a fork of this process, which changes no object here. Return the result, or raise the exception."""
+    read, write = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forks in programs with threads: the fork needs none
+        child = os.fork()
+    if not child:
+        try:
+            result = call(*arguments), None
+        except BaseException as error:
+            result = None, error
+        try:
+            with open(write, "wb") as pipe:
+                pickle.dump(result, pipe)
+        finally:
+            os._exit(0)
+    os.close(write)
+    with open(read, "rb") as pipe:
+        data = pipe.read()
+    os.waitpid(child, 0)
+    result, error = pickle.loads(data)
+    if error is not None:
+        raise error
+    return result
 
 
 class MovesAxes:

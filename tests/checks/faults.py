@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
-from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
+from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Info
@@ -26,6 +26,7 @@ from haptic_loop.sim.scenario import Scenario, load
 from tests.sessions import MovesAxes
 
 _WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
+LATE = 0.595  # [s] from arming to a time before most faults
 _LASTS = 0.9336  # [s] from arming to the end of a case
 _T_MS = 1.2
 
@@ -464,6 +465,28 @@ def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
     """Run one case; with `free` nobody holds the faulty device. `made` are couplings for a delay of one tick."""
+    rehearsal = _prepared(case, scenario, made, free)
+    return rehearsal, _rehearsed(case, rehearsal)
+
+
+def begins_late(case: Fault) -> bool:
+    """Return whether nothing happens in a case before LATE, so that it begins as `CASES[0]` or with free handles."""
+    late = replace(case, name=CASES[0].name, stage=A, cause="", faults=(), within=None, action=None, counted=())
+    same = replace(late, acts=_WHEN, host_stall=0.0, lasts=_LASTS, free=False) == CASES[0]
+    return same and all((FaultInjection.parse(text).start or 0.0) > LATE for text in case.faults)
+
+
+def rehearse_late_case(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
+    """Continue a rehearsal of `CASES[0]`, which has reached LATE, with the fault of a case that `begins_late`."""
+    faults = tuple(FaultInjection.parse(text) for text in case.faults)
+    rehearsal.actions, rehearsal.emulator._waiting = _actions(case, rehearsal), list(faults)
+    (cable,) = rehearsal._cables
+    cable.up, cable.down = (Line(way, faults, rehearsal.seed, rehearsal.latency_us) for way in ("up", "down"))
+    return _rehearsed(case, rehearsal)
+
+
+def _prepared(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False) -> Rehearsal:
+    """Return the rehearsal of a case before its first tick."""
     info = info_of(scenario)
     scenario = _without_hand(scenario, case) if free and not case.free else scenario
     cap = tuple(d.force_limit for d in scenario.device)
@@ -476,27 +499,38 @@ def _rehearse_case(
     emulator = Emulator(nobody(scenario) if case.free else scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick
 
-    def frozen(session: Session, now: int) -> Said:
-        rehearsal.freeze(case.host_stall)
-        return ()
-
     rehearsal = Rehearsal(
         session,
         emulator,
         _plan(case, scenario, made),
         faults,
-        actions=[(case.acts, case.action)] if case.action else [(_WHEN, frozen)],
         clock=case.period,
         watch=MovesAxes(emulator) if case.shown else lambda session: None,
     )
+    rehearsal.actions = _actions(case, rehearsal)
+    return rehearsal
+
+
+def _actions(case: Fault, rehearsal: Rehearsal) -> list[tuple[float, _Call]]:
+    """Return what a person does in a case, or that the host freezes."""
+
+    def frozen(session: Session, now: int) -> Said:
+        rehearsal.freeze(case.host_stall)
+        return ()
+
+    return [(case.acts, case.action)] if case.action else [(_WHEN, frozen)]
+
+
+def _rehearsed(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
+    """Run a case to its end."""
     rehearsal.run_until_armed(case.lasts)
     timed = case.within is not None and rehearsal.armed_us is not None
     to_zero = rehearsal.zero_after(_WHEN) if timed else None
     zero_ms = None if to_zero is None else 1e3 * to_zero
     force = float(np.abs([m.applied for m in rehearsal.moments]).max(initial=0.0))
-    wrong = tuple(_wrong(case, rehearsal, zero_ms, force))
-    told = case.name, str(session.stage), session.cause, force, emulator.plant.fastest
-    return rehearsal, _FaultOutcome(*told, zero_ms, case.within, wrong)
+    wrong, session = tuple(_wrong(case, rehearsal, zero_ms, force)), rehearsal.session
+    told = case.name, str(session.stage), session.cause, force, rehearsal.emulator.plant.fastest
+    return _FaultOutcome(*told, zero_ms, case.within, wrong)
 
 
 def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
