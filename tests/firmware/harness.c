@@ -41,6 +41,7 @@ size_t harness_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *
 
 void harness_estop(hl_device *d) { hl_estop(d); }
 void harness_fault(hl_device *d) { hl_fault(d); }
+void harness_number(hl_device *d, uint32_t tick) { d->k = (uint16_t)tick; }
 void harness_deadman(hl_device *d, int held) { hl_deadman(d, held != 0); }
 
 #ifdef HARNESS_MAIN
@@ -51,7 +52,7 @@ static uint32_t word(void)
     return (uint32_t)b[0] | (uint32_t)b[1] << 8 | (uint32_t)b[2] << 16 | (uint32_t)b[3] << 24;
 }
 
-/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F | D held; every tick answers:
+/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F | D held | K tick; every tick answers:
  * n (16 bits), n bytes, a force (16 bits) per axis */
 int main(void)
 {
@@ -64,6 +65,7 @@ int main(void)
         if (operation == 'E') harness_estop(d);
         else if (operation == 'F') harness_fault(d);
         else if (operation == 'D') harness_deadman(d, (int)word());
+        else if (operation == 'K') harness_number(d, word());
         else if (operation == 'R') {
             uint32_t now = word(), n = word();
             uint8_t *data = (uint8_t *)malloc(n ? n : 1); /* n bytes exactly, so that the sanitizer finds an access beyond them */

@@ -105,7 +105,10 @@ class Firmware:
     def set_deadman(self, held):
         self.lib.harness_deadman(self.memory, held)
 
-    deadman = property(fset=set_deadman)
+    def set_tick(self, number):
+        self.lib.harness_number(self.memory, number)
+
+    deadman, k = property(fset=set_deadman), property(fset=set_tick)
 
 
 class Traffic:
@@ -214,20 +217,21 @@ def mutated(rng: random.Random, frame: bytes) -> bytes:
     return bytes(data)
 
 
-def episode(seed: int, ticks: int, silent: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
+def episode(seed: int, ticks: int, first: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
     """Play traffic to the Python device. Return info, operations, answers to the ticks, and the phases and causes seen.
 
-    The operations are those of `between_ticks` and the ticks themselves, ("T", now, counts). In the first `silent`
-    ticks there is no traffic.
+    The operations are those of `between_ticks`, the ticks themselves, ("T", now, counts), and ("K", number), which
+    sets the number of the last tick to `first`.
     """
     rng = random.Random(seed)
     about = info(rng.randint(1, 8), rng.choice((100_000, 333_333, 1_200_000, 1_200_000, 2_000_001)))
     device, now, period = Device(about), rng.choice((0, 2**32 - 50_000)), about.period_ns // 1000
-    traffic, script, answers, seen, latched = Traffic(seed, device), [], [], set(), 0
-    for number in range(silent + ticks):
-        ops = traffic.between_ticks(now) if number >= silent else []
+    traffic, script, answers, seen, latched = Traffic(seed, device), [("K", first)], [], set(), 0
+    play(device, script[0])
+    for _ in range(ticks):
+        ops = traffic.between_ticks(now)
         now = (now + period) & 0xFFFFFFFF
-        counts = struct.unpack(f"<{about.axes}i", rng.randbytes(4 * about.axes)) if ops else (0,) * about.axes
+        counts = struct.unpack(f"<{about.axes}i", rng.randbytes(4 * about.axes))
         for op in ops:
             play(device, op)
         answers.append(device.tick(now, counts))
@@ -251,6 +255,8 @@ def play(device, op: tuple):
             device.fault()
         case ("D", held):
             device.deadman = held
+        case ("K", number):
+            device.k = number
     return None
 
 
@@ -331,7 +337,7 @@ def written(about: Info, script: list[tuple]) -> bytes:
         out.append(struct.pack("<I", ord(op[0])))
         if op[0] == "R":
             out.append(struct.pack("<II", op[1] & 0xFFFFFFFF, len(op[2])) + op[2])
-        elif op[0] == "D":
+        elif op[0] in "DK":
             out.append(struct.pack("<I", op[1]))
         elif op[0] == "T":
             out.append(struct.pack(f"<I{about.axes}i", op[1], *op[2]))

@@ -134,8 +134,15 @@ class StandIn:
         return "no device found"
 
 
-def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None):
-    """Run a session of Live with the stand-in to its end; return it, its recorder and its couplings."""
+#: a coupling that is certified for latencies up to 0.3 ms
+SOFT = SpringDamper([400.0, 400.0], [0.2, 0.2])
+
+
+def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None, own=None):
+    """Run a session of Live with the stand-in to its end; return it, its recorder and its couplings.
+
+    The coupling is `own`, or designed for the measured latency.
+    """
     session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
@@ -143,7 +150,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 
         def plan(ages):
             judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
-            made.extend(certified_couplings(judged, "I", None, None, link, spare=0))
+            made.extend(certified_couplings(judged, "I", None, None, link, spare=0, own=own))
             return made
 
         live = Live(session, device, plan, Operator(True, seconds), watch=watch)
@@ -263,7 +270,7 @@ def test_a_device_that_is_unplugged_is_lost(scenario):
     def watch(session):
         sdk.broken |= session.stage == Stage.ARMED
 
-    session, *_ = held_session(scenario, sdk, watch=watch)
+    session, *_ = held_session(scenario, sdk, watch=watch, own=SOFT)
     assert (session.stage, session.cause) == (Stage.LOST, "a call to the device failed: no device found")
     assert sdk.force.tolist() == [0.0, 0.0]
 
@@ -275,7 +282,7 @@ def test_saturated_motors_are_device_faults(scenario):
     def watch(session):
         sdk.saturated |= session.stage == Stage.ARMED
 
-    session, *_ = held_session(scenario, sdk, watch=watch)
+    session, *_ = held_session(scenario, sdk, watch=watch, own=SOFT)
     assert session.stage == Stage.STOPPED
     assert session.cause == "the device is in ramp, cause device"
 
@@ -295,7 +302,7 @@ def test_emergency_stops_zero_forces_at_once(scenario):
     with ForceDimension(scenario, "1x,0x", sdk, sdk.clock, sdk.sleep) as device:
 
         def plan(ages):
-            return certified_couplings(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, spare=0)
+            return [certified_coupling(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, SOFT)]
 
         live = Live(session, device, plan, Operator(True, 3.0), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)

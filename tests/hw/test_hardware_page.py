@@ -26,6 +26,7 @@ CALLED = {
 IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # rows that do not quote the message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
 def test_the_pages_fault_table_equals_rehearsals(row, scenario, rungs):
     fault, ends, cause, zero = row

@@ -169,7 +169,12 @@ def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "stage"), [("SIGINT", Stage.FINISHED), ("SIGTERM", Stage.FINISHED), ("SIGUSR1", Stage.ESTOP)]
+    ("name", "stage"),
+    [
+        ("SIGINT", Stage.FINISHED),
+        pytest.param("SIGTERM", Stage.FINISHED, marks=pytest.mark.slow),
+        ("SIGUSR1", Stage.ESTOP),
+    ],
 )
 def test_signals_end_sessions_while_forces_act(scenario, name, stage):
     """In virtual time SIGINT and SIGTERM end a session by a ramp longer than 90 ms, SIGUSR1 by a latched e-stop."""

@@ -26,7 +26,7 @@ def stages(session):
     return [event.stage for event in session.log if not event.cause.startswith("positions count from")]
 
 
-@pytest.mark.parametrize("start", [0, 0.05, 0.2, 0.2496, 0.26, 0.5])
+@pytest.mark.parametrize("start", [0.2496, 0.5])
 def test_a_session_arms_by_itself_once(scenario, rungs, start):
     """Late answers, in ramp-in or after it, end a session if nobody arms the softer coupling."""
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
@@ -42,11 +42,11 @@ def test_a_key_during_a_hindrance_arms_nothing(scenario, rungs, monkeypatch):
     monkeypatch.setattr(Session, "held", property(lambda session: held[0]))
     operator = Operator(True, 5.0)
     rehearsal = rehearsal_of(scenario, rungs, operator)
-    session = rehearsal.run(0.5)
+    session = rehearsal.run(0.3)
     operator.press("a", session, session.now)
     assert session.stage == Stage.DISARMED
     held[0] = True
-    assert rehearsal.run_until_armed(1.5).stage == Stage.ARMED
+    assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
 
 
 def test_sessions_with_late_answers_never_reach_full_gain(scenario, rungs):
@@ -54,6 +54,8 @@ def test_sessions_with_late_answers_never_reach_full_gain(scenario, rungs):
     session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
     assert Stage.DISARMING in stages(session)
     assert Stage.ARMED not in stages(session)
+    assert session.stage == Stage.REFUSED
+    assert stages(session).count(Stage.ARMING) == 1
 
 
 def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
@@ -72,16 +74,15 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     """A key pressed in a ramp-out must not arm the next coupling."""
     operator = Operator(False, 5.0)
     rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.5")
-    session = rehearsal.run(0.5)
+    session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == ()
     rehearsal.run_until_armed(0.6)
     assert session.stage == Stage.ARMED
-    begun = session.now
     while session.stage != Stage.DISARMING:
         rehearsal.run(1e-6 * session.now + 0.01)
     operator.press("a", session, session.now)
-    rehearsal.run(1e-6 * begun + 1.5)
+    rehearsal.run(1e-6 * session.now + 0.4)
     assert session.stage == Stage.DISARMED
     assert stages(session).count(Stage.ARMING) == 1
     operator.press("a", session, session.now)
@@ -89,12 +90,13 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     assert stages(session).count(Stage.ARMING) == 2
 
 
-@pytest.mark.parametrize("key", ["x", "\n", "A"])
-def test_other_keys_do_nothing(scenario, rungs, key):
+def test_other_keys_do_nothing(scenario, rungs):
     rehearsal = rehearsal_of(scenario, rungs, Operator(False, 1.0))
-    session = rehearsal.run(0.5)
-    assert Operator(False, 1.0).press(key, session, session.now) == ()
+    session = rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
+    for key in ("x", "\n", "A"):
+        assert Operator(False, 1.0).press(key, session, session.now) == ()
+        assert session.stage == Stage.DISARMED
 
 
 @pytest.mark.parametrize("encoders", [True, False])
@@ -102,7 +104,7 @@ def test_sessions_that_never_armed_have_not_finished(scenario, rungs, encoders):
     settings = LinkSettings(measure=100, test_encoders=encoders)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), settings)
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False)
-    assert rehearsal.run(1.0).stage == Stage.DISARMED
+    assert rehearsal.run(0.3).stage == Stage.DISARMED
     Operator(False, 5.0).press("q", session, session.now)
     assert (session.stage, session.cause) == (Stage.STOPPED, "key q, before any force acted")
 
@@ -118,7 +120,7 @@ def shown(scenario, rungs, monkeypatch, *faults, mm=6.0, seconds=8.0):
     emulator = Emulator(free, faults)
     person = MovesAxes(emulator, mm)
     rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults, operator=Operator(True, 5.0), watch=person)
-    rehearsal.run_until_armed(0.6) if seconds is None else rehearsal.run(seconds)
+    rehearsal.run_until_armed(0.6) if seconds is None else rehearsal.run_to_the_end(seconds)
     return session, rehearsal, person.axes
 
 
@@ -129,31 +131,29 @@ def test_axes_moved_as_asked_arm(scenario, rungs, monkeypatch):
     assert rehearsal.armed_us > 1e6 * (0.1 + 2 * 0.5 + 0.3)  # the measurement, two rests, the time to let go
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("faults", "mm", "words"),
+    ("faults", "words"),
     [
-        (["exchange"], 6, r"axis 2 moved by \+6 mm instead of axis 1, twice: the axes are exchanged"),
-        (["exchange"], -6, "axis 2 moved by -6 mm instead of axis 1, twice"),
-        (["motor=-1", "reverse"], 6, r"axis 1 moved by -6 mm, not in \+ direction, twice: reverse both its motor"),
-        (["axis2:motor=-1", "axis2:reverse"], 6, r"axis 2 moved by -6 mm, not in \+ direction"),
-        ([], -6, "axis 1 moved by -6 mm, not in"),
+        (["exchange"], r"axis 2 moved by \+6 mm instead of axis 1, twice: the axes are exchanged"),
+        (["axis2:motor=-1", "axis2:reverse"], r"axis 2 moved by -6 mm, not in \+ direction"),
     ],
 )
-def test_axes_moved_otherwise_are_refused(scenario, rungs, monkeypatch, faults, mm, words):
-    session, rehearsal, _ = shown(scenario, rungs, monkeypatch, *faults, mm=mm)
+def test_axes_moved_otherwise_are_refused(scenario, rungs, monkeypatch, faults, words):
+    session, rehearsal, _ = shown(scenario, rungs, monkeypatch, *faults)
     assert session.stage == Stage.REFUSED
     assert re.match(words, session.cause), session.cause
     assert rehearsal.armed_us is None
 
 
-@pytest.mark.parametrize("faults", [["exchange"], ["motor=-1", "reverse"]])
-def test_no_force_shows_exchanged_axes(scenario, rungs, faults):
-    """Without the person the motor test passes, because motors and encoders are exchanged or reversed together."""
-    assert rehearsal_of(scenario, rungs, None, *faults).run_until_armed(0.6).stage == Stage.ARMED
+def test_no_force_shows_exchanged_axes(scenario, rungs):
+    """Without the person the motor test passes, because motors and encoders are exchanged and reversed together."""
+    rehearsal = rehearsal_of(scenario, rungs, None, "exchange", "motor=-1", "reverse")
+    assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
 
 
 def test_small_motions_show_no_axis(scenario, rungs, monkeypatch):
-    session, _, axes = shown(scenario, rungs, monkeypatch, mm=4.9, seconds=3.0)
+    session, _, axes = shown(scenario, rungs, monkeypatch, mm=4.9, seconds=1.7)
     assert (session.stage, axes) == (Stage.DISARMED, [1])
     session.arm(session.now)
     assert session.stage == Stage.DISARMED
@@ -193,6 +193,13 @@ def test_honest_motions_pass_the_check(places):
     answers, check = checked(places)
     assert not answers
     assert check.request is None
+
+
+@pytest.mark.parametrize("x", [6, -6])
+def test_a_motion_of_another_axis_is_named_twice(x):
+    (answer,), check = checked([(0, x), (0, 0), (0, x)])
+    assert answer.startswith(f"axis 2 moved by {x:+} mm instead of axis 1, twice: the axes are exchanged")
+    assert check.request is not None
 
 
 def test_the_way_back_from_a_wrong_motion_does_not_count():

@@ -43,7 +43,7 @@ def rehearsal_of(scenario, rungs, operator):
 # the deadman
 
 
-@pytest.mark.parametrize("until", [0.0, 0.4, 0.9])
+@pytest.mark.parametrize("until", [0.0, 0.4, pytest.param(0.9, marks=pytest.mark.slow)])
 def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
     """The session ramps out in 100 ms, one second after the last sign of a person."""
     shown = []
@@ -76,7 +76,7 @@ def test_the_devices_deadman_allows_and_ends_forces(scenario, rungs):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
     rehearsal.emulator.device.deadman = False
-    rehearsal.run(1.0)
+    rehearsal.run(0.3)
     assert session.stage == Stage.DISARMED
     assert session.arm(session.now) == ()
     assert session.log[-1][1:] == (Stage.DISARMED, "the deadman at the device is not held")
@@ -199,15 +199,15 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     assert "% of the forces were cut" in report.session.cause
 
 
-@pytest.mark.parametrize(("cut", "stage"), [(400, "finished"), (450, "stopped")])
-def test_a_second_of_clipped_forces_counts(scenario, rungs, cut, stage):
+def test_a_second_of_clipped_forces_counts(scenario, rungs):
     """A session has not finished if more than half of the 833 ticks of any second were clipped, however long it was."""
-    recorder, session = Recorder(2), rehearsal_until_finished(scenario, rungs)
-    state = session.link.last
-    for k in range(4000):
-        asked = (12.0, 0.0) if 2000 <= k < 2000 + cut else (0.1, 0.0)
-        recorder(TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state))
-    assert outcome("I", session, recorder, 0).session.stage == stage
+    session = rehearsal_until_finished(scenario, rungs)
+    for cut, stage in ((400, "finished"), (450, "stopped")):
+        recorder, state = Recorder(2), session.link.last
+        for k in range(4000):
+            asked = (12.0, 0.0) if 2000 <= k < 2000 + cut else (0.1, 0.0)
+            recorder(TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state))
+        assert outcome("I", session, recorder, 0).session.stage == stage
 
 
 @pytest.mark.parametrize(
