@@ -365,6 +365,8 @@ class Shell(_Net):
         W = np.maximum(self.energy, 0.0)
         scale = np.ones_like(W)
         short = W + linear - square < 0
+        if not short.any():  # on nearly every tick
+            return scale
         W, b, c = W[short], linear[short], square[short]
         root = np.sqrt(b**2 + 4 * c * W)
         gains = b > 0  # `gains` selects the form of the upper root without cancellation; here b > 0 implies c > b
