@@ -85,6 +85,7 @@ def test_every_command_judges_by_the_own_condition(command, words, folder, monke
         assert "does not hold" not in text
 
 
+@pytest.mark.slow
 def test_the_given_condition_decides_an_audit(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert (

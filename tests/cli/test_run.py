@@ -362,10 +362,10 @@ def test_long_names_of_couplings_stay_apart():
 
 
 def test_no_plot_removes_the_old_picture(tmp_path):
-    picture, options = tmp_path / "out" / "figure.png", ["--coupling", "none", "--duration", "0.01"]
-    run(tmp_path, *options)
-    assert picture.exists()
-    _, report = run(tmp_path, *options, "--no-plot")
+    picture = tmp_path / "out" / "figure.png"
+    picture.parent.mkdir()
+    picture.touch()
+    _, report = run(tmp_path, "--coupling", "none", "--duration", "0.01", "--no-plot")
     assert not picture.exists()
     assert str(picture) not in report["files"]
 

@@ -51,7 +51,7 @@ def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0)
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_linear_scene_is_the_network(tmp_path, coupling):
-    """Behind a coupling the scene sends the network's forces for three seconds, and u = x - V f.
+    """Behind a coupling the scene sends the network's forces for one second, and u = x - V f.
 
     Tendon springs are longer by 1e-12 of their 0.1 m, which is 9e-11 N; rounding of the lengths adds 1e-14 N a tick.
     """
@@ -59,7 +59,7 @@ def test_a_linear_scene_is_the_network(tmp_path, coupling):
     port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
     F = coupling.around(NETWORK.E(T))
     state, inner = np.zeros(F.order), np.zeros(V.order)
-    for k in range(3000):
+    for k in range(1000):
         x = 0.01 * np.sin(2 * np.pi * np.array([1.0, 1.7]) * k * T) + 0.001 * (k > 500)
         force = port.step(x - V.C @ inner)
         u = x - (V.C @ inner + V.D @ force)
@@ -73,7 +73,7 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
     text = f'<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody></mujoco>'
     port, limit = world(tmp_path, text).port([3.0, 5.0]), np.array([3.0, 5.0])
     v, u, hit = np.zeros(2), np.zeros(2), np.zeros(2, int)
-    for k in range(1000):
+    for k in range(500):
         goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 30.0]) * k * T)
         force = port.step(goal)
         stiff = np.array([1500.0, 900.0])
@@ -84,7 +84,7 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
         v = v + T * expected / 0.03
         u = u + T * v
         assert np.abs(port.u - u).max() < 1e-11
-    assert hit.min() > 100
+    assert hit.min() > 50
     assert port.unsettled == 0
 
 
@@ -226,7 +226,7 @@ def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_contact_creates_no_more_than_the_lemma(tmp_path, scene):
     """tests/checks/test_worlds.py checks more than 120,000 constraints."""
-    assert count_of_the_lemma(tmp_path, scene, 600) > 1000
+    assert count_of_the_lemma(tmp_path, scene, 300) > 500
 
 
 def test_friction_loss_takes_more_than_it_creates(tmp_path):

@@ -25,7 +25,10 @@ def test_every_loop_has_a_row_and_a_line():
     assert all(f"`{column}`" in page for column in table()[0] if column not in ("loop", "devices"))
 
 
-@pytest.mark.parametrize("path", LOOPS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.slow if p.stem.startswith(("p3", "p4")) else (), id=p.stem) for p in LOOPS],
+)
 def test_the_table_has_the_figures_of_the_loop(path):
     for name, value in cheap(path).items():
         published = ROWS[path.stem][name]

@@ -50,6 +50,11 @@ def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+def _called(node: ast.Call) -> str:
+    """Return the last name of the called expression, or "" if it does not end in a name."""
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
+
+
 @cache
 def _nodes(path: Path) -> list[ast.AST]:
     return list(ast.walk(_tree(path)))
@@ -88,7 +93,7 @@ def imported(path: Path) -> set[str]:
                 inside = {f"{node.module}.{alias.name}".removeprefix("haptic_loop.") for alias in node.names}
                 modules = {name for name in inside if file_of(name)}
                 names |= modules or {(node.module or "").removeprefix("haptic_loop.")}
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            elif isinstance(node, ast.Call) and _called(node).endswith("import_module"):
                 names |= {
                     arg.value.removeprefix("haptic_loop.")
                     for arg in node.args
@@ -179,7 +184,7 @@ def test_replaced_fields_exist():
     wrong = [
         f"{path.name}:{node.lineno}: {keyword.arg}"
         for path, node in nodes
-        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("replace", "change")
+        if isinstance(node, ast.Call) and _called(node) in ("replace", "change")
         for keyword in node.keywords
         if keyword.arg and keyword.arg not in fields
     ]

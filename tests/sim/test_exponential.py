@@ -379,7 +379,7 @@ def test_gaps_between_runs_bound_the_finest_error():
 )
 def test_unreachable_errors_are_refused(scenario, error, message):
     with pytest.raises(InputError, match=message):
-        cheapest(assemble(scenario, PUBLISHED["I"]), error, 100)
+        cheapest(assemble(scenario, PUBLISHED["I"]), error, 50)
 
 
 def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):

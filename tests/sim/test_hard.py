@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from driven import driven
+from scipy.optimize import brentq
 from worlds import STIFF
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
@@ -33,12 +34,11 @@ def test_verdicts_are_right_near_the_boundary(side, wrong):
 
     At 0.1 1/s cheaper settings call the loop stable. MuJoCo's integrators err towards stable, so none is wrong at -0.1.
     """
-    low, high = 1.0, 2.0
-    while high - low > 1e-9:
-        middle = (low + high) / 2
-        growth = exact_growth(assemble(nominal().replace(delta=(middle, middle)), NoCoupling()))
-        low, high = (middle, high) if growth > side else (low, middle)
-    loop = assemble(nominal().replace(delta=(low, low)), NoCoupling())
+
+    def damped(delta):
+        return assemble(nominal().replace(delta=(delta, delta)), NoCoupling())
+
+    loop = damped(brentq(lambda delta: exact_growth(damped(delta)) - side, 1.0, 2.0, xtol=1e-9))
     assert exact_growth(loop) == pytest.approx(side, abs=1e-6)
     own = simulated_growth(loop, "RK4", default_substeps(loop, "RK4"))
     assert own == pytest.approx(side, abs=1e-3)  # RK4 erred by 2e-4 when measured

@@ -26,10 +26,10 @@ BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # its limited forces are
 
 
 def weak(*limits):
-    """Return two seconds of the default scenario with these force limits [N]."""
+    """Return one second of the default scenario with these force limits [N]."""
     base = load()
     devices = tuple(msgspec.structs.replace(d, force_limit=f) for d, f in zip(base.device, limits, strict=True))
-    return base.replace(device=devices, duration=2.0)
+    return base.replace(device=devices, duration=1.0)
 
 
 def test_the_limiter_follows_from_the_requirements():

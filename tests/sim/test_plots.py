@@ -322,6 +322,7 @@ def test_every_unit_in_a_picture_becomes_rotary():
     ticks = [len(part.majorTicks) for axis in figure.axes for part in (axis.xaxis, axis.yaxis)]
     plots.relabel(figure, "rad")
     assert [len(part.majorTicks) for axis in figure.axes for part in (axis.xaxis, axis.yaxis)] == ticks
+    figure.set_layout_engine("none")
     figure.canvas.draw()
     texts = [text.get_text() for text in figure.findobj(Text)]
     assert {"2 mrad", "1 N m"} <= set(texts)
@@ -337,9 +338,7 @@ def test_lines_are_told_apart_without_colours():
     ("suffix", "begin"), [("png", b"\x89PNG"), ("pdf", b"%PDF-"), ("svg", b"<?xml"), ("PDF", b"%PDF-")]
 )
 def test_a_picture_has_the_format_of_its_suffix(suffix, begin, tmp_path):
-    f = np.sin(np.arange(2000) / 20)[:, None]
-    path = plots.save(plots.draw_run(trace(f), "t", 8.0), tmp_path / f"a.{suffix}")
-    assert path.read_bytes().startswith(begin)
+    assert plots.save(Figure(), tmp_path / f"a.{suffix}").read_bytes().startswith(begin)
 
 
 @pytest.mark.parametrize("name", ["a", "a.jpg", "a.pn"])

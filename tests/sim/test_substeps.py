@@ -124,7 +124,7 @@ def test_runs_use_and_report_default_substeps(tmp_path):
         "--coupling",
         "published",
         "--duration",
-        "0.3",
+        "0.1",
         "--no-plot",
     ]
     options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]

@@ -164,7 +164,7 @@ def test_a_run_reports_the_times_of_ticks(tmp_path, capsys):
     recorded = tmp_path / "ticks.txt"
     recorded.write_text("# s\n1.1e-3\n0.8e-3\n\n1.4e-3\n")
     save(Stored(PAIR.loop("I"), SOFT.form()), tmp_path / "soft.json")
-    options = ["--coupling", str(tmp_path / "soft.json"), "--no-plot", "--duration", "1", "--out", str(tmp_path)]
+    options = ["--coupling", str(tmp_path / "soft.json"), "--no-plot", "--duration", "0.33", "--out", str(tmp_path)]
     assert main([*options, "--period", str(recorded), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
     assert report["run"]["timing"]["period_s"] == pytest.approx({"least": 0.8e-3, "mean": 1.1e-3, "largest": 1.4e-3})

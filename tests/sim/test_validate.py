@@ -521,7 +521,7 @@ class OwnEngine(ExactEngine):
 def test_own_engines_judge_every_hand(delays):
     """A user's engine, built for each set of humans, gives the growth rates of the stacked exact engine."""
     scenario = load().replace(varying_delay=delays)
-    found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
+    found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 3, MIXED, OwnEngine, 0.5), range(3))
     np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
     np.testing.assert_allclose(found.trace, found.exact, rtol=1e-5)
     np.testing.assert_allclose(found.switching_mujoco, found.switching, rtol=1e-6)
@@ -547,7 +547,7 @@ def slow_loops(humans: int, seed: int, duration: float) -> Findings:
 
 
 def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
-    found = slow_loops(60, 3, 1.5)
+    found = slow_loops(30, 3, 1.5)
     assert not found.disagreements.any()
     decided = found.trace_decides
     assert 0 < decided.sum() < decided.size
@@ -557,10 +557,10 @@ def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
 
 
 def test_traces_decide_only_what_eigenvalues_say():
-    """These are 150 of the 2,000 slow loops of `make validate`."""
-    rows = list(slow(0, 150))
+    """These are 75 of the 2,000 slow loops of `make validate`."""
+    rows = list(slow(0, 75))
     assert all(row.holds for row in rows)
-    assert 0 < sum(row.decided for row in rows) < 150
+    assert 0 < sum(row.decided for row in rows) < 75
 
 
 def test_inaccurate_traces_are_no_disagreement():

@@ -97,12 +97,12 @@ class Touch:
 
 @pytest.mark.parametrize(("name", "lossless"), checkered(NAMES, [False, True]))
 def test_no_hand_is_given_more_than_the_account(name, lossless):
-    """Hands are thrown at each scene with delays of 0 and 2 samples, and the shell never acts."""
+    """Hands are thrown at each scene, one device with a delay of 2 samples, and the shell never acts."""
     rng = np.random.default_rng(3)
     for run in (0, 2):
         loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
         touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
-        for _ in range(350):
+        for _ in range(175):
             assert touch.tick() <= START_J + touch.port.released + 1e-12
         assert not touch.shell.limited[0]
 
@@ -114,7 +114,7 @@ def test_without_gravity_energy_rises_within_the_account(name):
     touch = Touch(loop, Hands(np.random.default_rng(5), 1, True, 0.3, T=T, delta=loop.delta), gravity=False)
     model, data = touch.port.world.model, touch.port.data
     mass = np.diag(model.dof_M0)
-    for _ in range(350):
+    for _ in range(200):
         risen = touch.tick()
         kinetic = data.qvel @ mass @ data.qvel / 2  # bodies here translate, or turn about one fixed hinge
         assert risen + kinetic <= START_J + touch.port.released + 1e-9
@@ -122,9 +122,10 @@ def test_without_gravity_energy_rises_within_the_account(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_packaged_world_runs_and_is_guaranteed(name):
-    loop = load(f"world-{name}").replace(duration=0.3)
-    trace = simulate(loop, certified(loop), engine="exact")
-    world, again = trace.meta["world"], simulate(loop, certified(loop), engine="exact")
+    loop = load(f"world-{name}").replace(duration=0.2)
+    design = certified(loop)
+    trace = simulate(loop, design, engine="exact")
+    world, again = trace.meta["world"], simulate(loop.replace(duration=0.05), design, engine="exact")
     assert trace.meta["guaranteed"]
     assert (
         "no passive hand is given more than W0 = 2 mJ beyond what gravity and springs released"
@@ -132,10 +133,10 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
     )
     energies = {"given_J", "port_least_J", "released_J", "created_J"}
     assert set(world) == {"ticks", "ticks_acted", "unsettled_steps", "warnings"} | energies
-    assert (world["ticks"], world["ticks_acted"], world["unsettled_steps"]) == (300, 0, 0)
+    assert (world["ticks"], world["ticks_acted"], world["unsettled_steps"]) == (200, 0, 0)
     assert trace.meta["scene"]["active"] == []
     assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
-    np.testing.assert_array_equal(trace.f, again.f)
+    np.testing.assert_array_equal(trace.f[:50], again.f)
 
 
 @pytest.mark.slow
@@ -371,7 +372,7 @@ def test_a_run_reports_the_energy_account(tmp_path, capsys):
 def test_a_validation_throws_both_kinds_of_hands(tmp_path, capsys):
     code, shown = command(
         capsys,
-        *("validate", "--scenario", "world-peg", "--humans", "4", "--duration", "0.3", "--no-plot"),
+        *("validate", "--scenario", "world-peg", "--humans", "4", "--duration", "0.1", "--no-plot"),
         *("--out", str(tmp_path)),
     )
     report = json.loads((tmp_path / "report.json").read_text())
@@ -511,7 +512,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     assert [contact.body for contact in _contacts_of(loop.environment)] == ["left", "right"]
 
 
-@pytest.mark.parametrize("every", [2, 4])
+@pytest.mark.parametrize("every", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_default_couplings_of_slow_worlds_do_not_ring(every):
     """If a scene steps every few ticks, forces alternate from tick to tick by less than 0.1 N rms.
 
@@ -528,14 +529,12 @@ def test_default_couplings_of_slow_worlds_do_not_ring(every):
 
 
 def test_worlds_with_slow_steps_keep_the_account(tmp_path):
-    for every in (2, 4):
-        loop = scenario(tmp_path, TRAY, more=f"{UP}\nevery = {every}")
-        hands = Hands(np.random.default_rng(1), 1, True, 0.1, T=T, delta=loop.delta)
-        touch = Touch(loop, hands)
-        assert touch.port.world.h == every * T
-        for _ in range(500):
-            assert touch.tick() <= START_J + touch.port.released + 1e-12
-        assert not touch.shell.limited[0]
+    loop = scenario(tmp_path, TRAY, more=f"{UP}\nevery = 4")
+    touch = Touch(loop, Hands(np.random.default_rng(1), 1, True, 0.1, T=T, delta=loop.delta))
+    assert touch.port.world.h == 4 * T
+    for _ in range(500):
+        assert touch.tick() <= START_J + touch.port.released + 1e-12
+    assert not touch.shell.limited[0]
 
 
 def test_thrown_hands_may_outlast_the_scenario(tmp_path):
