@@ -90,7 +90,7 @@ def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
     the highest bit, so that the sum of two masks is never a mask. Any three masks are therefore independent: any three
     pairs of ends meet in every combination, unless one belongs to a part with ranges that may also be absent.
     Such a part usually has 3 or 5 corners: several words give the same vertex, and some combinations may be missing.
-    Random vertices then replace these words; they leave out fewer combinations than a shifted copy of the code.
+    Random vertices then replace these words.
     """
     sizes = [len(part.corners) for part in parts]
     if prod(sizes) <= _MOST_VERTICES:

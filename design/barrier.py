@@ -4,8 +4,7 @@ minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka
 
 The log-det barrier method follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x). This point is
 strictly feasible, and its objective is at most degree/t above the minimum, where degree is the total size of the S_k. A
-Newton step is a least-squares problem in the directions S^-1/2 dS S^-1/2, where dS is the change of S. The best length
-of a step follows from the eigenvalues of these matrices without further evaluations.
+Newton step is a least-squares problem in the directions S^-1/2 dS S^-1/2, where dS is the change of S.
 """
 
 from __future__ import annotations

@@ -488,7 +488,7 @@ def _half_widths(loop: Loop) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The condition limiter: forces are sent through the limiter of controller.law. any-environment with psi = 0 covers
+# The condition "limiter": forces pass through the limiter of controller.law. any-environment with psi = 0 covers
 # limited forces without this condition, with rho = 0 (docs/theory.md).
 
 BETA = 0.01  # default rho of a limiter under this-environment, relative to the device's least damping over T

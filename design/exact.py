@@ -401,9 +401,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     P is over the states that an input reaches (`reached`). It solves the discrete algebraic Riccati equation of G with
     D reduced by a share of the margin mu, the minimum over |z| = 1 of the least eigenvalue of He G. The equation has an
     added term e I, where e |(zI - A)^-1 B|^2 is at most the rest of mu. The equation is first solved in coordinates in
-    which white noise at the inputs moves all states equally and independently. P is much better conditioned there. The
-    original states are tried next, and then the white-noise coordinates with a larger share of mu. The result is
-    transformed back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
+    which white noise at the inputs moves all states equally and independently, because P is better conditioned there,
+    then in the original states, and last in the first coordinates with a larger share of mu. The result is transformed
+    back exactly, and rounded to _STORED_BITS if the rounded P is still a proof.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"

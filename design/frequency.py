@@ -100,7 +100,7 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
     return below, above
 
 
-#: [rad/sample] _LOWEST stands for 0 with an error of 1e-8, as responses are even in w. _BELOW resolves slow poles.
+#: [rad/sample] _LOWEST stands for 0 (error 1e-8, because responses are even in w). _BELOW resolves slow poles.
 _LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
 _EVEN = 192  # least number of evenly spaced frequencies, and number of logarithmically spaced frequencies
 _PER_LOBE = 24  # evenly spaced frequencies for each lobe that a delay causes in the response

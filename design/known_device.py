@@ -11,7 +11,6 @@ motor, its transmission and every passive hand behind the transmission satisfy
 with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b_max/4, the motor's displacement dx in a period, its speeds v and v+
 at the ends, dv = v+ - v, and its acceleration a. L is the least over all motions with these dx, v and v+.
 docs/theory.md has the proof. The blocks below state that the environment's side returns less energy than L.
-For equal devices design.necessary computes a lower bound of the damping that any condition on them requires.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
 solution so that a refined sweep passes, and rounds it to decimals. It returns the best solution that exact arithmetic
-proves, if there is one. Since R(1) = g I, the static stiffness is F(1) = g E(1): every spring of the environment is
-scaled by g.
+proves, if there is one. Since R(1) = g I, the static stiffness is F(1) = g E(1).
 """
 
 from __future__ import annotations

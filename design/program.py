@@ -617,8 +617,7 @@ def _evened(E: Complex, size: Array) -> Complex:
     """Return L, which adds to the mismatch M the errors in motions with small forces: |M L|^2 = |M|^2 + addition.
 
     Divided by |E|^2, the addition is _EVEN times the mean of |M v|^2/(|E v|^2 + _LEAST_FORCE^2 |E|^2) over the m right
-    singular vectors v of E. Many couplings with nearly the same mismatch differ only in motions with small forces. The
-    addition selects a coupling whose error is small relative to these forces, too.
+    singular vectors v of E. Without it, couplings with nearly the same mismatch may differ much in these motions.
     """
     unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
     faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)
