@@ -6,8 +6,9 @@ the matrix exponential would decide the verdict.
 
 All conditions but the known-device ones assume that a device with unit damping dissipates |dx|^2 / T in a tick. In fact
 it dissipates the integral of v^2. For a sinusoid of frequency f, |dx|^2 / T is (sin a / a)^2 times the integral, with
-a = pi f T. At the frequency f where it binds, a condition therefore requires too much damping, by (a / sin a)^2: 4.8 %
-at 101 Hz and T = 1.2 ms. If the damping lacks no more than this, no search has found an unstable human.
+a = pi f T. At the frequency f where a condition binds, the share 1 - (sin a / a)^2 of the damping that it requires is
+therefore not needed: 4.7 % at 101 Hz and T = 1.2 ms. If no more than this share is missing, no search has found an
+unstable human.
 """
 
 from __future__ import annotations
