@@ -11,6 +11,7 @@ import gc
 import os
 import select
 import signal
+import termios
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -40,10 +41,9 @@ class SerialPort:
             import serial
         except ImportError:
             raise InputError("--port needs pyserial: pip install 'haptic-loop[hw]'") from None
-        self._error = serial.SerialException
         try:
             self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
-        except (serial.SerialException, ValueError, OSError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"--port {path}: {error}") from None
         with suppress(Exception):  # some drivers lack it; on FTDI chips it sets the latency timer from 16 to 1 ms
             self._serial.set_low_latency_mode(True)
@@ -83,8 +83,8 @@ class SerialPort:
     def discard(self) -> None:
         """Discard the bytes that have come. Raises PortLost."""
         try:
-            self._serial.reset_input_buffer()
-        except (self._error, OSError, TypeError) as error:
+            termios.tcflush(self._fd, termios.TCIFLUSH)
+        except termios.error as error:
             raise PortLost(f"the port is gone: {error}") from None
 
     def __enter__(self) -> Self:

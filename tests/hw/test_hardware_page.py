@@ -1,6 +1,7 @@
 """The numbers of docs/hardware.md hold for the session, the bridge's options and its serial line."""
 
 import gc
+import os
 import re
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from haptic_loop.cli import bridge
+from haptic_loop.hw.haptic_device import PortLost
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.transport import SerialPort, _no_collections
 from tests.checks.faults import CASES, _rehearse_case
@@ -82,3 +84,14 @@ def test_serial_ports_ask_for_low_latency(known, monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=Serial, SerialException=OSError))
     SerialPort("/dev/ttyUSB0", 921_600)
     assert asked == [("/dev/ttyUSB0", True)]
+
+
+def test_ports_that_vanish_are_lost():
+    """Every call to a port whose other end is gone raises PortLost, also a call that discards bytes."""
+    other, own = os.openpty()
+    with SerialPort(os.ttyname(own), None) as port:
+        os.close(own)
+        os.close(other)
+        for call in (port.read, port.discard, lambda: port.write(b"0")):
+            with pytest.raises(PortLost):
+                call()
