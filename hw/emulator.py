@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -93,6 +93,7 @@ _AXIS = {
     "lose": ("share of the counts in negative direction that its encoder shows", -10.0, 10.0, 0.5),
     "own": ("newtons that its motor makes while armed, whatever FORCE says", -12.0, 12.0, 2.0),
 }
+_MOTOR = ("motor", "oneway", "limit", "zone")  # the faults in _AXIS that change the force of a motor
 KINDS = _LINE | _DEVICE | _AXIS
 _FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
 
@@ -307,15 +308,13 @@ class Emulator:
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick as a multiple of T
         self.applied: Array = np.zeros(scenario.channels)  # [N] forces of the motors
-        self._motor: Array = np.ones((2, scenario.channels))  # shares of a positive and of a negative force
-        self._most: Array = np.full(scenario.channels, np.inf)  # [N] forces at which motors saturate
-        self._zone: Array = np.zeros(scenario.channels)  # [N] dead zones of motors
-        self._swapped, self._exchanged, self._crossed, self._motors_fail = False, False, 0.0, False
+        self._swapped, self._exchanged, self._crossed = False, False, 0.0
         # start of the tick [us], the remaining share of the tick, and whether none of the tick has passed
         self._begun, self._rest, self._at_tick = 0, 0.0, False
         self._offset = [0] * scenario.channels  # [counts] by which each encoder has jumped
-        # by axis: function from the true count to the count that a broken encoder shows
-        self._encoder: dict[int, Callable[[int], int]] = {}
+        #: by axis and kind of fault: from the commanded to the true force
+        self._motors: dict[tuple[int, str], Callable[[float], float]] = {}
+        self._encoders: dict[int, Callable[[int], int]] = {}  # by axis: from the true count to the count shown
         for fault in faults:
             if fault.kind in _AXIS and fault.axis >= scenario.channels:
                 have = f"the scenario has {scenario.channels} channels"
@@ -342,13 +341,10 @@ class Emulator:
     def _motor_forces(self, steps: tuple[int, ...]) -> Array:
         """Return the forces (m,) [N] that the motors make of latched forces, with the faults of the motors."""
         forces = np.array(steps) * self.force_step
-        if not self._motors_fail:
-            return forces
         if self._exchanged:
             forces[:2] = forces[1::-1]
-        forces = np.clip(forces, -self._most, self._most)
-        forces -= np.clip(forces, -self._zone, self._zone)
-        forces *= np.where(forces > 0, *self._motor)
+        for (axis, _), motor in self._motors.items():
+            forces[axis] = motor(forces[axis])
         forces[1:2] += self._crossed * forces[0]
         return forces
 
@@ -368,7 +364,7 @@ class Emulator:
             self._rest = 0.0
         self._misbehave(now)
         counts = tuple(
-            max(-_FARTHEST, min(_FARTHEST, self._encoder.get(i, int)(n + o)))
+            max(-_FARTHEST, min(_FARTHEST, self._encoders.get(i, int)(n + o)))
             for i, (n, o) in enumerate(zip(self.plant.counts(), self._offset, strict=True))
         )
         if self._swapped:
@@ -391,11 +387,19 @@ class Emulator:
     def _in_counts(self, fault: FaultInjection) -> int:
         return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
 
-    def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
-        """Return the function from true counts to the counts of an encoder that breaks now."""
-        step = self.info.encoder_step[fault.axis]
+    def _broken(self, fault: FaultInjection) -> Callable[[Any], Any]:
+        """Return how a motor or an encoder that breaks now changes a force [N] or a count."""
+        step, value = self.info.encoder_step[fault.axis], fault.value
         now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
         match fault.kind:
+            case "motor":
+                return lambda force: value * force
+            case "oneway":
+                return lambda force: force if force > 0 else value * force
+            case "limit":
+                return lambda force: max(-value, min(value, force))
+            case "zone":
+                return lambda force: force - max(-value, min(value, force))
             case "freeze":
                 return lambda n: now
             case "toggle":
@@ -407,26 +411,26 @@ class Emulator:
             case "wrap":
                 return lambda n: (n + most // 2) % most - most // 2
             case "bit":
-                return lambda n: n & ~(1 << int(fault.value))
+                return lambda n: n & ~(1 << int(value))
             case "scale":
-                return lambda n: round(fault.value * n)
+                return lambda n: round(value * n)
             case "lose":
                 lost, before = 0.0, now
 
                 def shown(n: int) -> int:
                     nonlocal lost, before
-                    lost, before = lost + min(0, n - before) * (1 - fault.value), n
+                    lost, before = lost + min(0, n - before) * (1 - value), n
                     return round(n - lost)
 
                 return shown
             case "late":
-                earlier = deque([now], maxlen=1 + int(fault.value))
+                earlier = deque([now], maxlen=1 + int(value))
                 return lambda n: (earlier.append(n), earlier[0])[1]
             case "noise":
                 draw = np.random.default_rng(fault.axis)
-                return lambda n: round(n + draw.normal(0.0, fault.value))
+                return lambda n: round(n + draw.normal(0.0, value))
             case "drift":
-                each, begun = fault.value * 1e-9 * self.info.period_ns, self.device.k
+                each, begun = value * 1e-9 * self.info.period_ns, self.device.k
                 return lambda n: n + round(each / (1e-12 * step) * distance(self.device.k, begun))
         return lambda n: n + most * (self.device.k % 2)
 
@@ -442,7 +446,6 @@ class Emulator:
     def _misbehave(self, now: int) -> None:
         for fault in [u for u in self._waiting if u.active(self.since_armed(now))]:
             self._waiting.remove(fault)
-            self._motors_fail |= fault.kind in ("motor", "oneway", "limit", "zone", "cross", "exchange")
             match fault.kind:
                 case "stall":
                     self.stalled_until = now + round(1e6 * fault.value)
@@ -453,14 +456,6 @@ class Emulator:
                     self.device.deadman = held
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
-                case "motor":
-                    self._motor[:, fault.axis] = fault.value
-                case "oneway":
-                    self._motor[1, fault.axis] = fault.value
-                case "limit":
-                    self._most[fault.axis] = fault.value
-                case "zone":
-                    self._zone[fault.axis] = fault.value
                 case "swap" | "exchange":
                     self._swapped, self._exchanged = True, fault.kind == "exchange"
                 case "cross":
@@ -479,9 +474,11 @@ class Emulator:
                     self.device.fault()
                 case "letgo":
                     self.device.deadman = False
-                case kind if kind in _AXIS:  # all other faults of one axis happen to its encoder
-                    earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
-                    self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
+                case kind if kind in _MOTOR:  # A later fault of the same kind replaces the earlier one.
+                    self._motors[fault.axis, kind] = self._broken(fault)
+                case kind if kind in _AXIS:  # all other faults of one axis break its encoder, one after the other
+                    earlier, broken = self._encoders.get(fault.axis, int), self._broken(fault)
+                    self._encoders[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:
