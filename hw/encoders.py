@@ -380,12 +380,8 @@ class EncoderTest:
         farthest, sided_before = self._before[axis] if self._before else (0.0, 0.0)
         weak = self._block < _BLOCKS - 1 + (self._closing and not self._unknown_hands)
         least, most_uneven, most_late = _WEAKENED * farthest, _UNEVEN + sided_before, _LATE + self._at_once
+        small, lopsided = size < 1 / _TEST_RATIO, sided - unsure > most_uneven
         late_for_sure = doubt < _LATE and late > most_late
-        small, lopsided, late_for_sure = (
-            size < 1 / _TEST_RATIO,
-            sided - unsure > most_uneven,
-            doubt < _LATE and late > most_late,
-        )
         if not weak and best.explains and lopsided:
             what = "its encoder loses counts in one direction" if blamed else "its motor is weak in one direction"
             return f"{name} moves much farther in one direction than in the other: {what}"

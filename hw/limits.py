@@ -203,15 +203,20 @@ class SafetyLimits:
             if seconds > scenario.T:
                 more = f"more than T = {1e6 * scenario.T:g} us (for a link without UART, give --baud none)"
                 reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
-        for i in range(m):
-            damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
-            if damping < scenario.delta[i] * (1 - 1e-6):
-                reasons.append(
-                    f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
-                )
-            reasons += _coarse(i, info, self, scenario.T)
-            if strongest < self.cap[i] * (1 - 1e-3):
-                reasons.append(f"axis {i + 1} can apply {strongest:g} N, the force limit is {self.cap[i]:g} N")
+        units, widest = Units.of(info), _COARSEST * self.jump
+        device = info.osp_damping, units.encoder_step, units.force_step, info.hard_limit
+        axes = zip(*device, scenario.delta, self.cap, strict=True)
+        for i, (damping, count, step, hard, delta, cap) in enumerate(axes, start=1):
+            finest, strongest = min(cap / _FEWEST_STEPS, self.slew * scenario.T), hard * step
+            if 1e-6 * damping < delta * (1 - 1e-6):
+                reasons.append(f"axis {i} guarantees {1e-6 * damping:g} N s/m, the certificate needs delta = {delta:g}")
+            if step > finest:
+                reasons.append(f"one force step of axis {i} is {step:g} N, at most {finest:g} N is allowed")
+            if count > widest:
+                mm = f"{1e3 * count:g} mm, at most {1e3 * widest:g} mm is allowed"
+                reasons.append(f"one encoder count of axis {i} is {mm}")
+            if strongest < cap * (1 - 1e-3):
+                reasons.append(f"axis {i} can apply {strongest:g} N, the force limit is {cap:g} N")
         return reasons
 
     def configuration(self, info: Info, theta: int) -> Config:
@@ -304,15 +309,6 @@ def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     up, down = wire.wire_bytes(wire.State, axes), wire.wire_bytes(wire.Force, axes)
     seconds = (up + down) * _BITS_PER_BYTE / baud
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
-
-
-def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
-    """Return messages about a force step or encoder step of axis i that is too coarse for the limits."""
-    force, count = 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
-    most, widest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T), _COARSEST * limits.jump
-    wide = f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * widest:g} mm is allowed"
-    strong = f"one force step of axis {i + 1} is {force:g} N, at most {most:g} N is allowed"
-    return [strong] * (force > most) + [wide] * (count > widest)
 
 
 def probe_delay(T: float) -> int:
