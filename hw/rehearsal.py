@@ -36,7 +36,7 @@ from haptic_loop.sim.trace import Trace
 _MEASURE = 200  # answers that are timed; few suffice, because latencies are constant in virtual time
 #: The delay is chosen as in hw.bridge: it covers this share of the ages of measured answers, plus a guard [us].
 _QUANTILE, _GUARD_US = 0.99, 100.0
-_BEGIN_US = 500  # time from the device's first tick to the start of the session
+_BEGIN = 5e-4  # [s] time from the device's first tick to the start of the session
 _GRACE_US = 50_000  # [us] time after the end of a session: a device must rest 30 ms after STOP (hw.session)
 _LONGEST = 60.0  # [s] longest virtual time in which a session connects, is armed and ends, in addition to its run
 _LATENCY_US = 60  # latency of one direction, which gives answers a median age of about 130 us
@@ -141,8 +141,13 @@ class Rehearsal:
             up, down = (Line(way, faults, self.seed, self.latency_us) for way in ("up", "down"))
             self._cables.append(_Cable(self, emulator, up, down, 1e6 * self.session.scenario.T * clock))
             self.at(begin_us, self._cables[-1].tick)
-        device = _device_of(self._cables, self.session)
-        self._driver = Driver(self.session, device, self.plan, lambda: round(self.now))
+        clock, serial = lambda: round(self.now), partial(SerialDevice, clock=lambda: 1e-6 * self.now)
+        device: HapticDevice = serial(self._cables[0])
+        if self.further:
+            boards = [serial(cable, patience=0.0) for cable in self._cables]
+            axes = [cable.emulator.info.axes for cable in self._cables]
+            device = Boards(boards, axes, self.session.settings.behind, clock, self.wait)
+        self._driver = Driver(self.session, device, self.plan, clock)
 
     def run(self, seconds: float) -> Session:
         """Run until `seconds` of virtual time are over, and return the session."""
@@ -163,7 +168,10 @@ class Rehearsal:
 
     def freeze(self, seconds: float) -> None:
         """Let time pass without the host, as a busy or hung computer does."""
-        self._pass(1e6 * seconds)
+        until = self.now + 1e6 * seconds
+        while self._queue[0][0] <= until:
+            self._next()
+        self.now = until
 
     @property
     def _over(self) -> bool:
@@ -172,10 +180,10 @@ class Rehearsal:
     def _turn(self) -> None:
         """Call the device once, then do the actions of the person."""
         if not self.session.log:
-            self._pass(_BEGIN_US)
+            self.freeze(_BEGIN)
             self.session.start(round(self.now))
         if self.session.stage in ENDED and any(cable.gone for cable in self._cables):
-            self._pass(1000)
+            self.freeze(1e-3)
         else:
             self._driver.turn()
         session, now = self.session, round(self.now)
@@ -197,8 +205,7 @@ class Rehearsal:
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
         """Advance time by at most `seconds`, until bytes have come or a cable was pulled. Return whether they have."""
         until, cables = self.now + 1e6 * seconds, cables or self._cables
-        one = cables[0]  # usually the only cable; the loop checks it first to save time
-        while not (ready := bool(one.data or one.gone or (cables[1:] and _come(cables)))):
+        while not (ready := any(cable.data or cable.gone for cable in cables)):
             if self._queue[0][0] > until:
                 self.now = until
                 break
@@ -209,12 +216,6 @@ class Rehearsal:
 
     def at(self, when: float, what: Callable[[], object]) -> None:
         heapq.heappush(self._queue, (when, next(self._number), what))
-
-    def _pass(self, us: float) -> None:
-        until = self.now + us
-        while self._queue[0][0] <= until:
-            self._next()
-        self.now = until
 
     def _next(self) -> None:
         self.now, _, what = heapq.heappop(self._queue)
@@ -236,22 +237,6 @@ class Rehearsal:
             return 0.0
         quiet = next((m.t_us for m in self.moments if m.t_us > last), None)
         return None if quiet is None else 1e-6 * (quiet - begin)
-
-
-def _come(cables: Sequence[_Cable]) -> bool:
-    """Return whether bytes have come over any of the cables, or whether any was pulled."""
-    return any(cable.data or cable.gone for cable in cables)
-
-
-def _device_of(cables: Sequence[_Cable], session: Session) -> HapticDevice:
-    """Return the device behind the cables: one board, or several with a clock each."""
-    rehearsal = cables[0].rehearsal
-    serial = partial(SerialDevice, clock=lambda: 1e-6 * rehearsal.now)
-    if len(cables) == 1:
-        return serial(cables[0])
-    axes, behind = [cable.emulator.info.axes for cable in cables], session.settings.behind
-    devices = [serial(cable, patience=0.0) for cable in cables]
-    return Boards(devices, axes, behind, lambda: round(rehearsal.now), rehearsal.wait)
 
 
 @dataclass(frozen=True, eq=False)
