@@ -49,6 +49,7 @@ class _Board:
 
     def __init__(self, device: SerialDevice, axes: slice, behind: int) -> None:
         self.device, self.axes, self.behind = device, axes, behind
+        self.info: wire.Info | None = None
         self.period = 0.0  # [us] length of a tick, from INFO
         self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
@@ -190,7 +191,6 @@ class Boards:
         ]
         self._lead = next(board for board in self._boards if not board.behind)
         self._clock, self._wait = clock, wait
-        self._infos: list[wire.Info | None] = [None] * len(devices)
         self._asked: wire.Config | None = None  # configuration that not all boards have acknowledged yet
         self._step: int | None = None  # number of the last step
         self._configured, self._driving, self._misses = False, False, 0
@@ -216,9 +216,9 @@ class Boards:
         Raises SafetyStop if the boards do not fit together.
         """
         with self._together():
-            for i, board in enumerate(self._boards):
-                self._infos[i] = self._infos[i] or board.device.info()
-            known = [info for info in self._infos if info]
+            for board in self._boards:
+                board.info = board.info or board.device.info()
+            known = [board.info for board in self._boards if board.info]
             if len(known) < len(self._boards):
                 self._wait(_LONGEST)
                 return None

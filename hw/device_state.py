@@ -8,6 +8,8 @@ There are two implementations because each tests the other, and because rehearsa
 file without a compiler. docs/protocol.md states the rules. Forces are tuples of steps, one entry per axis.
 """
 
+import operator
+
 from haptic_loop.hw import protocol as wire
 
 _SLOTS = 16  # places for forces that wait for their tick: a power of two above MAX_THETA
@@ -43,10 +45,6 @@ class Device:
         # source tick of the last FORCE that was used or too late, and how long [us] before its latch (theta = 0: before
         # the end of its tick) it came
         self.echo, self.margin = 0, wire.NO_MARGIN
-
-    @property
-    def _status(self) -> int:
-        return self.phase | self.cause << 4 | wire.DEADMAN * self.deadman
 
     def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
         """Begin a period: return the forces that act from now on, and the bytes to send. `counts` was just sampled."""
@@ -119,7 +117,8 @@ class Device:
         if self.config is None:
             return out
         errors, misses = (self.decoder.rejected + self.unexpected) & 0xFF, self.misses & 0xFF
-        state = wire.State(self._status, self.k, self.echo, self.margin, errors, misses, self.now, counts, self.applied)
+        status = self.phase | self.cause << 4 | wire.DEADMAN * self.deadman
+        state = wire.State(status, self.k, self.echo, self.margin, errors, misses, self.now, counts, self.applied)
         self.margin = wire.NO_MARGIN
         return out + wire.encode(state)
 
@@ -182,10 +181,7 @@ class Device:
             (config.axes != self.info.axes, wire.Refused.AXES),
             (not 0 <= config.theta <= wire.MAX_THETA, wire.Refused.THETA),
             (config.ramp == 0 or release > wire.MAX_RELEASE_NS, wire.Refused.RELEASE),
-            (
-                any(not 1 <= c <= most for c, most in zip(config.cap, self.info.hard_limit, strict=False)),
-                wire.Refused.CAP,
-            ),
+            (min(config.cap) < 1 or any(map(operator.gt, config.cap, self.info.hard_limit)), wire.Refused.CAP),
             (0 in config.slew, wire.Refused.SLEW),
         )
         return next((reason for wrong, reason in reasons if wrong), wire.Refused.ACCEPTED)

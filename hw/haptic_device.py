@@ -90,15 +90,11 @@ class SerialDevice:
 
         Raises SafetyStop if the device still drives 50 ms after the first CONFIG.
         """
-        answer = self._answer(config)
-        if (
-            not isinstance(answer, wire.Ack)
-            or answer.crc != wire.config_crc(config)
-            or answer.refused == wire.Refused.RUNNING
-        ):
-            return None
-        self._question = None
-        return answer.refused
+        answer, crc = self._answer(config), wire.config_crc(config)
+        if isinstance(answer, wire.Ack) and answer.crc == crc and answer.refused != wire.Refused.RUNNING:
+            self._question = None
+            return answer.refused
+        return None
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:

@@ -196,7 +196,10 @@ class Measurement:
         part = 1 - len(ages) / max(1, everything if everything >= needed else counted)
         if part > _MISSED:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
-        self._check_clock(state)
+        elapsed, ticks = (state.t_us - self._first.t_us) & 0xFFFFFFFF, distance(state.tick, self._first.tick)
+        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DEVICE_TOLERANCE:
+            each = f"{elapsed / ticks:.1f} us by its own clock, T is {self._T_us:g} us"
+            raise SafetyStop(f"a tick of the device lasts {each}")
         if self._sent is None and len(self._answers.inferred) > _INFERRED * len(ages):
             self._apart = max(2, min(self._theta, math.ceil(max(ages.values()) / self._T_us)))
             self._begin()
@@ -223,14 +226,6 @@ class Measurement:
     @property
     def result(self) -> Ages:
         return Ages(tuple(self._answers.by_tick.values()), self._missing, tuple(self._ticks))
-
-    def _check_clock(self, state: State) -> None:
-        assert self._first is not None
-        elapsed = (state.t_us - self._first.t_us) & 0xFFFFFFFF
-        ticks = distance(state.tick, self._first.tick)
-        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _DEVICE_TOLERANCE:
-            each = elapsed / ticks
-            raise SafetyStop(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
 
 
 # Lateness of answers

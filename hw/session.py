@@ -96,14 +96,11 @@ class Session:
             return None
         if last is None:
             return "no STATE has come yet"
-        places = zip(last.counts, before, self.units.encoder_step, strict=True)
-        near = [
-            f"{i}"
-            for i, (n, then, step) in enumerate(places, 1)
-            if abs(n - then) * step < ELSEWHERE / self.limits.lever
-        ]
-        where = f"within {1e3 * ELSEWHERE / self.limits.lever:.3g} mm of its place in the previous sitting"
-        return f"handle {', '.join(near)} is {where}: move it farther and let go" if near else None
+        far = ELSEWHERE / self.limits.lever
+        moved = np.abs(np.subtract(last.counts, before)) * self.units.encoder_step
+        near = ", ".join(str(i + 1) for i in np.flatnonzero(moved < far))
+        where = f"within {1e3 * far:.3g} mm of its place in the previous sitting"
+        return f"handle {near} is {where}: move it farther and let go" if near else None
 
     @property
     def units(self) -> Units:
@@ -215,25 +212,19 @@ class Session:
         self.now = now
         if self.stage in ENDED:
             return self._shutdown.again(now) if self._shutdown else ()
+        waited, silence, most = now - self.entered, now - self.heard, _ARMING_US * self.scenario.channels
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
-            return self._no_answer() if now - self.entered > _PATIENCE_US else ()
-        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US * self.scenario.channels:
-            return self._end(
-                Stage.STOPPED,
-                f"the device did not arm and pass its test within {_ARMING_US * self.scenario.channels // 1000} ms",
-            )
-        silence = now - self.heard
+            if waited <= _PATIENCE_US:
+                return ()
+            question, n = "HELLO" if self.stage == Stage.CONNECTING else "CONFIG", self.counters.host_errors
+            noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
+            return self._end(Stage.LOST, f"no answer to {question} within {1e-6 * waited:.1f} s{noise}")
+        if self.stage == Stage.ARMING and self.gain == 0 and waited > most:
+            return self._end(Stage.STOPPED, f"the device did not arm and pass its test within {most // 1000} ms")
         if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
-            return self._end(
-                Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms: the device hangs, or a brown-out reset it"
-            )
+            cause = f"no new STATE for {silence / 1000:.1f} ms: the device hangs, or a brown-out reset it"
+            return self._end(Stage.LOST, cause)
         return ()
-
-    def _no_answer(self) -> Said:
-        question, n = "HELLO" if self.stage == Stage.CONNECTING else "CONFIG", self.counters.host_errors
-        noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
-        waited = 1e-6 * (self.now - self.entered)
-        return self._end(Stage.LOST, f"no answer to {question} within {waited:.1f} s{noise}")
 
     def _on_info(self, info: wire.Info) -> Said:
         if reasons := self.limits.objections(info, self.scenario, self.settings.baud):
