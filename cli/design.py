@@ -17,6 +17,7 @@ from haptic_loop.design.assessment import Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import off_table, out_file
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.program import OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
@@ -27,7 +28,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world
 if TYPE_CHECKING:
     from haptic_loop.design import coverage
     from haptic_loop.design.api import Filed
-    from haptic_loop.design.bound import BoundBeside
+    from haptic_loop.design.bound import Bound, BoundBeside
     from haptic_loop.sim.stability import Ringing
 
 
@@ -48,13 +49,14 @@ def main(argv: list[str]) -> int:
 
         return world.design(args, scenario, out, {} if args.limiter is not None else _options_of(args, args.coupling))
     loop = _loop(args, scenario)
+    begun = _begun_bound(args, loop)
     design, decay = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     slow = args.coupling == "optimal"  # Its bound takes seconds, so the verdict is printed before the bound.
     if slow:
         render.announce(args, verdicts.verdict(assessment))
-    report = replace(_reported(args, loop, design, assessment, stored), ringing=decay)
+    report = replace(_reported(args, loop, design, assessment, stored, begun), ringing=decay)
     nearby = report.robustness
     verdict = verdicts.lost(assessment, nearby) if slow else verdicts.verdict(assessment, nearby)
     tables, lines = _tables(scenario, report)
@@ -240,8 +242,17 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
     return qualified(scenario, args.case, assessment)
 
 
+def _begun_bound(args: argparse.Namespace, loop: Loop) -> Forked[Bound] | None:
+    """Begin to compute the bound on optimal couplings, which depends on the loop and the band alone, or return None."""
+    if args.coupling != "optimal" or args.condition == "known-device":
+        return None
+    from haptic_loop.design.bound import MOST, bound
+
+    return Forked(bound, loop, args.band_hz or BAND_HZ, niceness=10) if loop.channels <= MOST else None
+
+
 def _bound_and_robustness(
-    args: argparse.Namespace, loop: Loop, design: Design, file: str
+    args: argparse.Namespace, loop: Loop, design: Design, file: str, begun: Forked[Bound] | None
 ) -> tuple[BoundBeside | None, Robustness | None, bool]:
     """Return a bound on the error of optimal couplings, the robustness, and whether Ctrl-C skipped one of them."""
     from haptic_loop.design.bound import BoundBeside
@@ -252,21 +263,28 @@ def _bound_and_robustness(
         if isinstance(design, Optimal):
             with render.progress(f"{note}: computing the bound"):
                 band, chosen = args.band_hz or BAND_HZ, Options(**_options_of(args, "optimal"))
-                limit = BoundBeside.of(loop, design, design.figures.rms_mismatch_db, band, chosen)
+                limit = BoundBeside.of(loop, design, design.figures.rms_mismatch_db, band, chosen, begun)
         with render.progress(f"{note}: computing robustness"):
             return limit, robustness_nearby(loop, design.coupling, named(design.asked)), False
     except KeyboardInterrupt:
         return limit, None, True
 
 
-def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
+def _reported(
+    args: argparse.Namespace,
+    loop: Loop,
+    design: Design,
+    assessment: Assessment,
+    stored: Filed,
+    begun: Forked[Bound] | None,
+) -> _Report:
     from haptic_loop.design import coverage
     from haptic_loop.design.optimal import Optimal
 
     best = design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.SwitchingFigures.of(loop, design.coupling, known) if loop.varying_delay else None
-    limit, nearby, interrupted = _bound_and_robustness(args, loop, design, str(stored.file))
+    limit, nearby, interrupted = _bound_and_robustness(args, loop, design, str(stored.file), begun)
     nominal = None
     if kind_of(args.coupling).model:
         nominal = partial(design_by_kind, kind=args.coupling, **_options_of(args, args.coupling))

@@ -396,7 +396,7 @@ def audit(
     wanted = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     constant = loop.at(loop.environment).switching(None)
     conditions = {each.name: each for each in (*conditions_of(loop), wanted)}
-    searched = Forked(_searched, constant, coupling, conditions, wanted.name, helping=not loop.varying_delay)
+    searched = Forked(_searched, constant, coupling, conditions, wanted.name, not loop.varying_delay)
     assessment = assess(loop, coupling, condition=wanted, ranges_seed=seed, force_limit=force_limit, progress=progress)
     needs, switching = assessment.requirements, None
     if loop.varying_delay:

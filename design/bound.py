@@ -38,6 +38,7 @@ from haptic_loop.design.barrier import EntryInequality, Program, centre, packed,
 from haptic_loop.design.conditions import even_level
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.files import off_table
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
@@ -68,7 +69,7 @@ _LARGEST_CHARGE = 0.005  # The search ends if the bound is below the barrier's v
 
 
 @dataclass(frozen=True)
-class _Bound:
+class Bound:
     """A lower bound of the rms mismatch of couplings that this-environment certifies; an estimate unless `proved`."""
 
     rms: float  # relative to the environment
@@ -81,7 +82,7 @@ class _Bound:
         return decibels(self.rms)
 
 
-def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
+def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> Bound:
     """Return a lower bound, or its estimate, of the rms mismatch of the couplings that this-environment certifies.
 
     The loop has up to MOST channels. `knots` is the number of knots of h, by default that of _KNOTS. Periods up to
@@ -98,7 +99,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     sampled, charged = (float(np.sqrt(max(square - _QUADRATURE, 0.0))) for square in dual.best())
     proved = charged > 0 or sampled == 0  # A bound of zero needs no proof.
-    return _Bound(charged if proved else sampled, proved, sampled, time.perf_counter() - started)
+    return Bound(charged if proved else sampled, proved, sampled, time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,16 +466,22 @@ class BoundBeside:
 
     @classmethod
     def of(
-        cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float], options: Options
+        cls,
+        loop: Loop,
+        best: Design,
+        reached_db: float,
+        band_hz: tuple[float, float],
+        options: Options,
+        begun: Forked[Bound] | None = None,
     ) -> BoundBeside:
-        """Return the bound for the loop of a design; `reached_db` is the rms mismatch of the design."""
+        """Return the bound for the loop of a design with the rms mismatch `reached_db`; `begun` computes `bound`."""
         if loop.channels > MOST:
             return cls(reason=_NO_BOUND)
         if best.condition == "known-device":
             return cls(reason="no bound is known for couplings of known devices")
         if best.objective == 0:
             return cls(reason="the mismatch is zero: there is nothing to bound")
-        least = bound(loop, band_hz)
+        least = begun.result() if begun else bound(loop, band_hz)
         if not least.rms:
             return cls(reason="the bound is zero, so it does not limit the design")
         more = {

@@ -17,9 +17,9 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Generic, NoReturn, ParamSpec, TypeVar
+from functools import partial
+from typing import Any, Generic, NoReturn, TypeVar
 
-_Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 #: Whether second processes are allowed: in a command that has its process for itself, and loads no user's own code.
@@ -30,12 +30,13 @@ _PR_SET_PDEATHSIG = 1  # number of an operation of Linux's prctl
 
 
 class Forked(Generic[_Result]):
-    """A call of a function that neither prints nor writes files, in a second process if that is possible."""
+    """A call of a function that neither prints nor writes files, in a second process if that is possible.
 
-    def __init__(
-        self, function: Callable[_Arguments, _Result], *arguments: _Arguments.args, **options: _Arguments.kwargs
-    ) -> None:
-        self._call = lambda: function(*arguments, **options)
+    With a `niceness` above 0 the second process gives way to the first one on a busy machine.
+    """
+
+    def __init__(self, function: Callable[..., _Result], *arguments: Any, niceness: int = 0) -> None:
+        self._call, self._niceness = partial(function, *arguments), niceness
         self._process = 0  # number of the second process, or 0 if there is none
         if allowed and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1:
             with suppress(OSError):  # There may be too many processes or open files.
@@ -62,6 +63,7 @@ class Forked(Generic[_Result]):
             import ctypes
 
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # The second process ends with the first.
+            os.nice(self._niceness)
             os.dup2(writer, 3)
             os.closerange(4, os.sysconf("SC_OPEN_MAX"))
             for stream in range(3):
