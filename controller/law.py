@@ -66,7 +66,7 @@ class Law(ReadOnly):
 
     @property
     def unsolved(self) -> int:
-        """Number of times that limited forces were set to 0 because no solution was found."""
+        """The number of times that limited forces were set to 0 because no solution was found."""
         return 0
 
     @property
@@ -75,7 +75,7 @@ class Law(ReadOnly):
 
     @property
     def unlimited(self) -> Self:
-        """Return the law without force limits."""
+        """The law without force limits."""
         return self
 
     @property

@@ -150,7 +150,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """Number of core states, without delay lines at the outputs, because these take little time in a response."""
+        """The number of core states, without delay lines at the outputs, which cost little time in a response."""
         return self._lines[0].size
 
     @property

@@ -105,7 +105,7 @@ class Process(ReadOnly):
 
     @property
     def unlimited(self) -> Process:
-        """Return the process without limiter, force limits and encoder steps."""
+        """The process without limiter, force limits and encoder steps."""
         endless, ideal = np.full(self.channels, np.inf), np.zeros(self.channels)
         return replace(self, law=self.law.unlimited, force_limit=endless, encoder_step=ideal)
 

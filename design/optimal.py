@@ -352,7 +352,7 @@ class _Search:
 
     @property
     def simple(self) -> float:
-        """Largest kappa for which R = kappa I satisfies this-environment with MARGIN unused; 1 if `bare` is 0."""
+        """The largest kappa for which R = kappa I satisfies this-environment with MARGIN unused; 1 if `bare` is 0."""
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:

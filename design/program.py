@@ -360,7 +360,7 @@ class Problem:
 
     @property
     def own(self) -> list[tuple[int, int]]:
-        """First and end index of each constraint's own unknowns, case by case."""
+        """The first and end index of each constraint's own unknowns, case by case."""
         counts = [len(constraint.start) for case in self.cases for constraint in case.constraints]
         return list(pairwise(accumulate(counts, initial=self.span.unknowns)))
 

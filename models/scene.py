@@ -87,7 +87,7 @@ class Scene:
 
     @property
     def outside(self) -> int:
-        """Number of external inputs: the actuators before the motors."""
+        """The number of external inputs: the actuators before the motors."""
         return int(self.model.nu) - self.channels
 
     @cached_property
@@ -315,7 +315,7 @@ class _Placed(NamedTuple):
 
     @property
     def handles(self) -> int:
-        """Number of joints that belong to handles; they come first."""
+        """The number of joints that belong to handles; they come first."""
         return self.port.handles * self.port.axes
 
 
