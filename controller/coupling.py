@@ -163,6 +163,7 @@ class SpringDamper(ReadOnly, Coupling):
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
     def channels(self, T: Number) -> list[Lti]:
+        """Return V_i(z) of each channel. A channel without damper has no state."""
         beta = self._beta(T)
         return [
             _spring_damper(k, b, beta, T)
@@ -170,6 +171,7 @@ class SpringDamper(ReadOnly, Coupling):
         ]
 
     def compliance(self, T: Number) -> Lti:
+        """Return the diagonal V(z)."""
         return Lti.diag(*self.channels(T))
 
     def __repr__(self) -> str:
@@ -317,6 +319,7 @@ class MovingAverage(ReadOnly, Coupling):
         return 1 / (self.weight * self.terms + self.constant)
 
     def channels(self, T: Number) -> list[Lti]:
+        """Return V_i(z) of each channel."""
         rows = zip(numbers(self.weight, T), self.terms, numbers(self.constant, T), strict=True)
         return [taps([w + e, *[w] * (n - 1)], T) for w, n, e in rows]
 

@@ -255,6 +255,7 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return sum(self.recorded) / len(self.recorded) if self.recorded else (self.shortest + self.longest) / 2
 
     def draw(self, rng: np.random.Generator, ticks: int) -> Array:
+        """Draw the periods (ticks,) [s]."""
         if self.recorded:
             return np.resize(np.array(self.recorded), ticks)
         return rng.choice(np.linspace(self.shortest, self.longest, _PERIODS), ticks)

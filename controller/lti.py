@@ -369,6 +369,7 @@ class Lti(ReadOnly):
         return np.append(eigenvalues, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:
+        """Return whether every pole lies strictly inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
     def split_at_one(self) -> tuple[Array, Lti]:

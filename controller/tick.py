@@ -93,6 +93,7 @@ class Process(ReadOnly):
 
     @property
     def linear(self) -> Array:
+        """The matrix (m + order, order + m) from [z; x] to [f; z+], while no wall touches and no force is limited."""
         return self.ticked.linear
 
     @cached_property

@@ -580,6 +580,7 @@ class Assessment:
 
     @property
     def gains(self) -> dict[str, Any]:
+        """Order and gains of the coupling (Coupling.figures)."""
         return self.coupling.figures(self.loop.T)
 
     @property

@@ -108,9 +108,11 @@ class EntryInequality:
         return k * (n**2 * square**2 + square * own * (square + n * square + own))
 
     def at(self, x: Array) -> Complex:
+        """Return S(x), shape (k, r, r)."""
         return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
+        """Return the change of S if x changes by `step`, (k, r, r)."""
         r = self.left.shape[-1]
         X, own = np.split(step, [r * r * self.functions.shape[1]])
         filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)

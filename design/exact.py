@@ -61,6 +61,7 @@ class Matrix:
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def fractions(self) -> NDArray[np.object_]:
+        """Return a (p, m) array of Fraction."""
         return np.array([[Fraction(int(v), self.den) for v in row] for row in self.num], dtype=object).reshape(
             self.shape
         )

@@ -301,6 +301,7 @@ def _reach(bracket: Array) -> Array:
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:
+    """Return z = exp(j w)."""
     return np.exp(1j * w)
 
 

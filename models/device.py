@@ -191,6 +191,7 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
 
     @property
     def bodies(self) -> dict[str, float]:
+        """The mass [kg] of the only body, the motor, which the hand holds."""
         return {"motor": self.mass}
 
     def __post_init__(self) -> None:

@@ -92,6 +92,7 @@ class Scene:
 
     @cached_property
     def plant(self) -> Plant:
+        """The linear plant of the model (see `plant`)."""
         return plant(self.model)
 
 

@@ -43,6 +43,7 @@ def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
 
 
 def verdict(growth: float) -> str:
+    """Return "stable" or "unstable" for a growth rate [1/s]."""
     return "unstable" if unstable(growth) else "stable"
 
 
