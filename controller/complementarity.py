@@ -171,7 +171,9 @@ class BoxProblem(_Problem):
         """Solve for v by principal pivoting: change all wrong signs at once, and after 4 n rounds only the first one.
 
         The sign of a force is 1 at its upper limit, -1 at its lower limit, and 0 between them. Changing only the first
-        wrong sign terminates for every P-matrix M (docs/theory.md, "Forces that are limited").
+        wrong sign terminates for every P-matrix M: index n changes only when all others are right for its present
+        sign, so that, by uniqueness, it has each of its three signs at most once. Between two of its changes the same
+        holds for index n - 1, and so on.
         """
         n, k = q.shape
         M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
