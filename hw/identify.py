@@ -16,7 +16,6 @@ if __name__ == "__main__":  # before the imports, which --help does not need
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from haptic_loop.hw.control import Controller
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction, friction
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session
-from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, starts, viscosity
+from haptic_loop.hw.viscosity import Spectra, Viscosity, doubt, fitted, starts, viscosity
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # highest frequency of a slow sweep over its lowest
@@ -34,7 +33,8 @@ _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as shares of the larg
 _CYCLES = 3  # cycles of the swing at each amplitude
 _LEAD = 0.3  # [s] of zero force, while the gain rises
 _BAND_HZ = (20.0, 300.0)  # band in which the motion shows a transmission
-_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])  # lower limits of the first seven parameters of Spectra.model
+#: lower limits of the first seven parameters of Spectra.model; c = 0: friction without memory
+_LEAST = np.array([-20.0] * 4 + [0.0, 0.0, -2e-3])
 _STEPS = 40  # largest number of evaluations in a fit
 _VAGUE = 0.3  # largest unexplained share of the motion with which a fitted transmission is accepted
 _SPRUNG = 5.0  # [N/m] largest stiffness of a free axis with its cable; a hand is stiffer
@@ -211,18 +211,9 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
 
     The encoder is at the motor, where dry friction acts. So the force less dry friction drives a linear plant.
     """
-    import scipy
-
     spectrum = Spectra(x, force - dry_friction(x, T, found), T, band=_BAND_HZ, points=len(x))
-
-    def error(p: Array) -> Array:
-        return spectrum.error(np.append(p, 0.0), 1.0)  # c = 0: friction without memory
-
-    def jacobian(p: Array) -> Array:
-        return spectrum.jacobian(np.append(p, 0.0), 1.0)[:, :7]
-
-    how: dict[str, Any] = {"bounds": (_LEAST, np.inf), "x_scale": "jac", "max_nfev": _STEPS}
-    fits = [scipy.optimize.least_squares(error, start[:7], jacobian, **how) for start in starts([spectrum], found)]
+    limits = _LEAST, np.full(7, np.inf)
+    fits = [fitted(spectrum.error, spectrum.jacobian, p[:7], limits, _STEPS) for p in starts([spectrum], found)]
     fit = min(fits, key=lambda fit: fit.cost)
     if 2 * fit.cost > (_VAGUE * np.linalg.norm(spectrum.motion) / np.abs(spectrum.motion).max()) ** 2:
         return None

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction, at_radius, dry_friction
-from haptic_loop.hw.viscosity import Spectra, starts
+from haptic_loop.hw.viscosity import Spectra, fitted, starts
 
 _BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, 1 N causes less motion than a count of 5 um
 _TOLD = 0.01  # allowed error of the model, as a share of the motion; the encoder's noise is allowed in addition
@@ -50,7 +49,7 @@ class TransmissionBounds:
 
 
 class _Joint:
-    """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay, 0].
+    """The records of one axis with one model of them all: p = [log m1, log m2, log k, log b, delta, lag, delay].
 
     m1 and m2 [kg] are the masses of motor and handle, k [N/m] and b [N s/m] belong to the transmission, delta [N s/m]
     is the motor's damping, and the forces have a lag and a delay [s]. Spectra.model has d for b, and b for delta.
@@ -62,30 +61,23 @@ class _Joint:
 
     def errors(self, p: Array) -> list[NDArray[np.complex128]]:
         """Return the difference of motion and model for every record, in units of the allowed error."""
-        p = np.append(p, 0.0)
-        return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
+        return [(r.motion - r.model(p)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
 
     def _derivatives(self, p: Array) -> list[NDArray[np.complex128]]:
-        """Return the derivatives (frequencies, 7) of `errors` with respect to p without its last entry."""
-        p = np.append(p, 0.0)
-        return [-r.derivatives(p, 1.0)[:, :7] / s[:, None] for r, s in zip(self.records, self._scale, strict=True)]
+        """Return the derivatives (frequencies, 7) of `errors` with respect to p."""
+        return [-r.derivatives(p) / s[:, None] for r, s in zip(self.records, self._scale, strict=True)]
 
     def fitted(self, start: Array, keep: Sequence[NDArray[np.bool_]]) -> Array:
-        """Return p without its last entry, fitted from `start` to the frequencies `keep` of each record."""
-        import scipy
+        """Return p, fitted from `start` to the frequencies `keep` of each record."""
 
         def real(values: list[NDArray[np.complex128]]) -> Array:
             kept = np.concatenate([each[some] for each, some in zip(values, keep, strict=True)])
             return np.concatenate([kept.real, kept.imag])
 
         T = self.records[0].T
-        low, high = np.append(_FIXED, -0.2 * T), np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T])
-        how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "loss": "soft_l1", "max_nfev": _STEPS}
-        begin = np.clip(start, low + 1e-13, high - 1e-13)
-        fit = scipy.optimize.least_squares(
-            lambda p: real(self.errors(p)), begin, lambda p: real(self._derivatives(p)), **how
-        )
-        return fit.x
+        limits = np.append(_FIXED, -0.2 * T), np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T])
+        functions = (lambda p: real(self.errors(p))), (lambda p: real(self._derivatives(p)))
+        return fitted(*functions, start, limits, _STEPS, loss="soft_l1").x
 
 
 def transmission_bounds(

@@ -159,21 +159,22 @@ class Spectra:
         self._s = 1j * (w + 2 * np.pi / T * np.array(_ALIASES)[:, None])
         self._hold = -np.expm1(-self._s * T) / (self._s * T)
 
-    def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
-        """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
+    def model(self, p: Array, tau: float = 1.0) -> NDArray[np.complex128]:
+        """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c, end] and a memory of `tau` [s].
 
         m1 and m2 [kg] are motor and handle, k [N/m] and d [N s/m] the transmission between them. The model assumes
-        that a force `end` [N] in one more tick stops the motion left at the end of the record.
+        that a force `end` [N] in one more tick stops the motion left at the end of the record. Entries that p lacks
+        at its end are 0.
         """
-        (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
+        (m1, m2, k, d), (b, lag, late, c, end), s = *_parameters(p), self._s
         link = k + d * s
         handle = link / s if self.held else m2 * s * link / (m2 * s * s + link)
         impedance = m1 * s + b + c / (1 + tau * s) + handle
         return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * (self.force + end)
 
-    def derivatives(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
-        """Return the exact derivatives (frequencies, 9) of `model` with respect to p and `end`."""
-        (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
+    def derivatives(self, p: Array, tau: float = 1.0) -> NDArray[np.complex128]:
+        """Return the exact derivatives (frequencies, len(p)) of `model` with respect to p."""
+        (m1, m2, k, d), (b, lag, late, c, end), s = *_parameters(p), self._s
         link, memory = k + d * s, 1 / (1 + tau * s)
         still = np.zeros_like(s) if self.held else link / (m2 * s * s + link)  # the handle's part of the motor's motion
         moving = 1 - still
@@ -184,18 +185,32 @@ class Spectra:
         columns = [bent * m1 * s, bent * m2 * s * still**2, per_link * k, per_link * d * s]
         columns += [bent, -response * s / (1 + lag * s), -response * s, bent * memory]
         sums = np.stack(columns).sum(axis=1) * (self.force + end)
-        return np.vstack([sums, response.sum(axis=0)]).T
+        return np.vstack([sums, response.sum(axis=0)]).T[:, : len(p)]
 
-    def error(self, p: Array, tau: float, end: float = 0.0) -> Array:
+    def error(self, p: Array, tau: float = 1.0) -> Array:
         """Return the real and imaginary parts of motion less model, over the largest motion."""
-        return self._real(self.motion - self.model(p, tau, end))
+        return self._real(self.motion - self.model(p, tau))
 
-    def jacobian(self, p: Array, tau: float, end: float = 0.0) -> Array:
-        """Return the derivatives of `error` with respect to p and `end`, (2 frequencies, 9)."""
-        return self._real(-self.derivatives(p, tau, end))
+    def jacobian(self, p: Array, tau: float = 1.0) -> Array:
+        """Return the derivatives of `error` with respect to p, (2 frequencies, len(p))."""
+        return self._real(-self.derivatives(p, tau))
 
     def _real(self, values: NDArray[np.complex128]) -> Array:
         return np.concatenate([values.real, values.imag]) / np.abs(self.motion).max()
+
+
+def _parameters(p: Array) -> tuple[Array, Array]:
+    """Return [m1, m2, k, d] and [b, lag, delay, c, end] of `Spectra.model`."""
+    return np.exp(p[:4]), np.append(p[4:], np.zeros(9 - len(p)))
+
+
+def fitted(error: Any, jacobian: Any, start: Array, bounds: tuple[Array, Array], steps: int, **more: Any) -> Any:
+    """Fit p by least squares from `start`, which is moved 1e-13 inside the `bounds`; `more` is for scipy."""
+    import scipy
+
+    begin = np.clip(start, bounds[0] + 1e-13, bounds[1] - 1e-13)
+    how = {"bounds": bounds, "x_scale": "jac", "max_nfev": steps} | more
+    return scipy.optimize.least_squares(error, begin, jacobian, **how)
 
 
 def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False) -> list[Array]:
@@ -207,8 +222,8 @@ def starts(spectra: Sequence[Spectra], friction: Friction, clamped: bool = False
     for hz, part in product(_MODES_HZ, _PARTS):
         m1, m2 = part * friction.mass, (1 - part) * friction.mass
         k = (2 * np.pi * hz) ** 2 * m1 * (1.0 if clamped else m2 / friction.mass)
-        p = np.array([*np.log([m1, m2, k, 0.03 * np.sqrt(k * m1)]), max(friction.viscous, 1e-3), 1e-5, 1e-5, 0.0])
-        sizes = (np.log(np.abs(each.model(p, 1.0) / each.motion) + 1e-15) for each in spectra)
+        p = np.array([*np.log([m1, m2, k, 0.03 * np.sqrt(k * m1)]), max(friction.viscous, 1e-3), 1e-5, 1e-5, 0.0, 0.0])
+        sizes = (np.log(np.abs(each.model(p) / each.motion) + 1e-15) for each in spectra)
         tried.append((float(sum(np.abs(size).mean() for size in sizes)), len(tried), p))
     return [p for *_, p in sorted(tried)[:2]]
 
@@ -228,24 +243,15 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
     low = np.array([-20.0] * 4 + [0.0, 0.0, -T, 0.0, -np.inf])  # delay >= -T: an encoder may be read after forces latch
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf, np.inf])
 
-    def error_of(spectra: Spectra, tau: float, p: Array) -> Array:
-        """Return errors for p = [log m1, log m2, log k, log d, b, lag, delay, c, end]."""
-        return spectra.error(p[:8], tau, p[8])
-
-    def jacobian_of(spectra: Spectra, tau: float, p: Array) -> Array:
-        return spectra.jacobian(p[:8], tau, p[8])
-
-    def fitted(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
+    def fit_of(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
         """Return the fit that begins at `start`; without tau, c stays near 0."""
         top = np.where(np.arange(9) == _C, 1e-12, high) if tau is None else high
-        begin = np.clip(start, low + 1e-13, top - 1e-13)
-        how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
-        error, jacobian = (partial(of, spectra, tau or 1.0) for of in (error_of, jacobian_of))
-        return scipy.optimize.least_squares(error, begin, jacobian, **how)
+        error, jacobian = (partial(of, tau=tau or 1.0) for of in (spectra.error, spectra.jacobian))
+        return fitted(error, jacobian, start, (low, top), _STEPS)
 
-    begins = [np.insert(start, _C, 0.0) for start in starts([few], friction)]
-    rough = min((fitted(few, start) for start in begins), key=lambda fit: fit.cost)
-    plain = fitted(every, rough.x)
+    begins = starts([few], friction)
+    rough = min((fit_of(few, start) for start in begins), key=lambda fit: fit.cost)
+    plain = fit_of(every, rough.x)
     left, points = plain.fun, len(every.force)
     noise = np.sqrt(float(left @ left) / len(left))
     # weak priors, because a rigid device does not determine a transmission, and a delay acts like a lag
@@ -264,14 +270,14 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
 
     least, memory, best, part = np.inf, 0.0, float(left @ left), 0.0
     for tau in _TAUS:
-        change, spread, squares = linear(jacobian_of(every, tau, plain.x), left)
+        change, spread, squares = linear(every.jacobian(plain.x, tau), left)
         b, c = float(plain.x[_B] + min(change[_B], 0.0)), float(change[_C])
         tried = [_split(start, friction.viscous) for start in (plain.x, begins[0])]
         if unsure := abs(c) + _QUANTILE * spread[_C] > _MUCH * plain.x[_B]:
             tried.append(plain.x + change)
-        near = min((fitted(few, start, tau) for start in tried), key=lambda fit: fit.cost)
+        near = min((fit_of(few, start, tau) for start in tried), key=lambda fit: fit.cost)
         if unsure or near.x[_C] > _MUCH * (near.x[_B] + near.x[_C]):
-            fit = fitted(every, near.x, tau)
+            fit = fit_of(every, near.x, tau)
             if points * np.log(2 * fit.cost / float(left @ left)) < _SURE:
                 _, spread, _ = linear(fit.jac, fit.fun)
                 squares = 2 * float(fit.cost)
