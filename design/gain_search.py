@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -464,29 +464,41 @@ def _optimum(sampled: SampledLoop, start: SpringDamper, known: Sequence[Array]) 
     return None, budgets.GAIN_ROUNDS
 
 
+class Optimum(NamedTuple):
+    """Best local optimum of a search; without one `gains` is None."""
+
+    gains: SpringDamper | None = None
+    rms: float = np.inf  # mismatch, as a ratio
+    searches: int = 0  # number of searches until now
+    multiplier: Sequence[Sequence[float]] | None = None
+
+
 def least_rms(
-    sampled: SampledLoop, starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
-) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
-    """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
+    sampled: SampledLoop,
+    starts: Iterable[SpringDamper],
+    band_hz: tuple[float, float] = BAND_HZ,
+    before: Optimum = Optimum(),  # noqa: B008 - immutable
+) -> Optimum:
+    """Return the best local optimum that is reached from the starts, or `before` if that is better.
 
     All searches share the frequencies that they add to `sampled`. For more than FEW channels the first optimum is
     returned, because steps are expensive and the start hardly matters.
     """
-    best, least, searches, multiplier, loop = None, np.inf, 0, None, sampled.loop
-    known: list[Array] = []
+    best, loop = before, sampled.loop
+    known = [sampled.point(before.gains)] if before.gains else []
     for start in starts:
         x, runs = _optimum(sampled, start, known)
-        searches += runs
+        best = best._replace(searches=best.searches + runs)
         if x is None:
             continue
         known.append(x)
         coupling = sampled.coupling(x)
         rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band_hz)
-        if rms < least:
-            best, least, multiplier = coupling, rms, sampled.multiplier(x)
+        if rms < best.rms:
+            best = Optimum(coupling, rms, best.searches, sampled.multiplier(x))
         if loop.channels > FEW:
             break
-    return best, least, searches, multiplier
+    return best
 
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:

@@ -24,11 +24,13 @@ from haptic_loop.design.conditions import even_damping, even_level, theta_hat, t
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import ANY_ENVIRONMENT, LIMITER, least_phi, stiffest_alpha
 from haptic_loop.design.facts import Latency, PeriodCost
+from haptic_loop.design.forked import Forked
 from haptic_loop.design.frequency import on_circle, peaks, too_long
 from haptic_loop.design.gain_search import (
     FEW,
     KnownDeviceLoop,
     LimiterLoop,
+    Optimum,
     SampledLoop,
     SwitchingLoop,
     damper_rate,
@@ -207,7 +209,7 @@ def design(
     loop: Loop,
     condition: str = "any-environment",
     starts: Sequence[SpringDamper] = (),
-    limiter: bool = False,
+    limiter: bool | None = False,
     band_hz: tuple[float, float] | None = None,
     W1: Lti | None = None,
     W2: Lti | None = None,
@@ -224,7 +226,7 @@ def design(
         condition: The name of a condition.
         starts: Gains at which a search starts; they need not be feasible. Without them default starts are used.
             any-environment uses only the first, known-device-any none.
-        limiter: Whether the design must cover limited forces, too; any-environment does if psi = 0.
+        limiter: Whether the design must cover limited forces, too (None: if possible); any-environment does if psi = 0.
         band_hz: The band of the rms mismatch [Hz].
         W1, W2: The weights of output and input of (23).
 
@@ -260,10 +262,6 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
         raise DesignFailed(None, (), f"{loop.channels} channels, allowed are {most} for a spring-damper by {what}")
 
 
-class _NoLinearDesign(DesignFailed):
-    """No coupling was found even for forces that are not limited."""
-
-
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
     """Return a spring-damper as `design` does, with limited forces covered, not covered, or covered if possible.
 
@@ -284,16 +282,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     refusal = LIMITER.not_designed(loop)
     if limiter and refusal:
         raise ValueError(refusal)
-    if refusal:
-        return design(loop, condition, **options)
-    try:
-        return design(loop, condition, limiter=True, **options)
-    except _NoLinearDesign:
-        raise  # a search without limits would repeat the one that failed
-    except DesignFailed:
-        if limiter:
-            raise
-        return design(loop, condition, **options)
+    return design(loop, condition, limiter=False if refusal else limiter, **options)
 
 
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
@@ -327,12 +316,12 @@ def _short(coupling: SpringDamper) -> SpringDamper:
 def _for_this_environment(
     loop: Loop,
     starts: Sequence[SpringDamper],
-    limiter: bool,
+    limiter: bool | None,
     band_hz: tuple[float, float] | None,
 ) -> Design:
     """Return the spring-damper of least rms mismatch that this-environment certifies.
 
-    With `limiter` and up to FEW channels a first search ignores the limits, and a second one starts from its gains.
+    If `limiter` is not False, it covers limited forces, or with None those below the limits if no such gains are found.
     """
     each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
     if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
@@ -346,32 +335,57 @@ def _for_this_environment(
     many = loop.channels > FEW
     if many:
         starts = likeliest_first(sampled, starts)
-    coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
-    nothing = coupling is None and not many
-    if limiter and not nothing:  # The search starts at the unlimited result, because limits soften it only a little.
-        limited = LimiterLoop(loop, band)
-        linear, before = coupling, searches
-        coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
-        if coupling is None and linear:
-            coupling, rms, searches, c = least_rms(limited, starts, band)
-        searches += before
-    if coupling is None:
+    if limiter is False:
+        linear = best = least_rms(sampled, starts, band)
+    elif many:
+        linear, best = Optimum(), least_rms(LimiterLoop(loop, band), starts, band)
+    else:
+        linear, best = _limited(sampled, starts, band)
+    if limiter is None and not best.gains:
+        best = least_rms(sampled, starts, band) if many else linear
+    if best.gains is None:
         certifies = "the this-environment condition certifies"
         if span:
             certifies += f" under any switching from {span.lo} to {span.hi} samples"
-        if limiter and not nothing:
+        if limiter and (many or linear.gains):
             certifies += " while forces are limited"
         line = (
             f"no spring-damper was found that {certifies} for theta = {loop.theta}, psi = {loop.psi}, "
             f"delta = {loop.delta}"
         )
-        raise (_NoLinearDesign if limiter and nothing else DesignFailed)(None, (), line)
-    coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
+        raise DesignFailed(None, (), line)
+    K, B, rms = best.gains.K, best.gains.B, best.rms
+    coupling = _short(SpringDamper(K, np.where(_NEGLIGIBLE * usable(loop) > B, 0.0, B)))
     if many:
         rms = rms_mismatch(loop.F(coupling), loop.E(), loop.lam, band)
     requirement = this_environment(loop.F(coupling), loop)
     wall_s = time.perf_counter() - started
-    return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c)
+    return Design(coupling, "this-environment", "rms", rms, requirement, best.searches, wall_s, c=best.multiplier)
+
+
+def _limited(
+    sampled: SampledLoop, starts: Sequence[SpringDamper], band: tuple[float, float]
+) -> tuple[Optimum, Optimum]:
+    """Return the best gains without limits, and those for limited forces.
+
+    The search for limited forces starts at the gains without limits, because limits soften them only a little. It
+    begins from the result of the first start while a second process searches from the others, which are rarely better.
+    """
+    first = least_rms(sampled, starts[:1], band)
+    others = Forked(least_rms, sampled, starts[1:], band, first)
+    limited, best = None, Optimum()
+    if others.begun and first.gains:
+        limited = LimiterLoop(sampled.loop, band)
+        best = least_rms(limited, [first.gains], band)
+    linear = others.result()
+    if not linear.gains:
+        return linear, linear
+    if limited is None or linear.rms < first.rms:
+        limited = LimiterLoop(sampled.loop, band)
+        best = least_rms(limited, [linear.gains], band)
+    if not best.gains:
+        best = least_rms(limited, starts, band)
+    return linear, best._replace(searches=linear.searches + best.searches)
 
 
 def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
@@ -384,19 +398,19 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
     started, band = time.perf_counter(), band_hz or BAND_HZ
     plain = least_rms(SampledLoop(loop, band), starts or _default_starts(loop), band)
-    first = [plain[0]] if plain[0] else []
+    first = [plain.gains] if plain.gains else []
     coupling, rms, searches, _ = least_rms(
         KnownDeviceLoop(loop, band), [*first, *(starts or _default_starts(loop))], band
     )
-    searches += plain[2]
-    if plain[0] and not rms < plain[1]:
-        coupling, rms = plain[0], plain[1]
+    searches += plain.searches
+    if plain.gains and not rms < plain.rms:
+        coupling, rms = plain.gains, plain.rms
     if coupling is None:
         line = f"no spring-damper was found that {KNOWN_DEVICE.name} certifies for theta = {loop.theta}"
         raise DesignFailed(None, (), f"{line}, psi = {loop.psi}, delta = {loop.delta}")
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
     requirement, wall_s = KNOWN_DEVICE.judge(loop, coupling), time.perf_counter() - started
-    beside = f"{decibels(plain[1]):z.2f} dB rms" if plain[0] else "no spring-damper"
+    beside = f"{decibels(plain.rms):z.2f} dB rms" if plain.gains else "no spring-damper"
     note = f"known-device, {decibels(rms):z.2f} dB rms; this-environment, for devices of which less is known: {beside}"
     return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
 
