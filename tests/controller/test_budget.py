@@ -149,12 +149,11 @@ def test_the_budget_holds_on_stiffer_springs():
 @pytest.mark.parametrize(
     ("hold", "loss", "told"),
     [
-        (0, 0.0, "never"),
         (3, 0.3, "late"),
-        pytest.param(3, 0.3, "at once", marks=pytest.mark.slow),
+        pytest.param(0, 0.0, "never", marks=pytest.mark.slow),
         *(
             pytest.param(*case, marks=pytest.mark.validate)
-            for case in [(0, 0.0, "late"), (0, 0.0, "at once"), (3, 0.3, "never")]
+            for case in [(0, 0.0, "late"), (0, 0.0, "at once"), (3, 0.3, "never"), (3, 0.3, "at once")]
         ),
     ],
 )
@@ -299,7 +298,7 @@ def test_any_environment_loops_are_never_limited():
     rng, eps = np.random.default_rng(10), 0.05
     scenario = load()
     coupling = certified((1 - eps) * np.array(scenario.delta))
-    x = motions(rng, 600, 60)
+    x = motions(rng, 400, 60)
     stiff = Network(
         ("a", "b"), (Spring(("a", "ground"), 1e5, 3.0), Spring(("a", "b"), 4e4), Spring(("b", "ground"), 9e4))
     )
@@ -311,12 +310,12 @@ def test_any_environment_loops_are_never_limited():
     assert acted_on(beyond.around(environment(stiff, T)), x, (1, 2), scenario.delta, **options).max() > 0
 
 
-@pytest.mark.parametrize("theta", [0, 1, 2, 5])
+@pytest.mark.parametrize("theta", [0, 2])
 def test_delayed_springs_within_bounds_are_never_limited(theta):
     rng, eps = np.random.default_rng(11), 0.05
     most = (1 - eps) * DELTA / ((theta + 0.5) * T)
-    ramps = np.abs((np.arange(600)[:, None, None] + rng.integers(0, 60, (1, 2, 40))) % 80 - 40.0) * 1e-3
-    x = np.concatenate([motions(rng, 600, 60), ramps - ramps[:1]], axis=2)
+    ramps = np.abs((np.arange(400)[:, None, None] + rng.integers(0, 60, (1, 2, 40))) % 80 - 40.0) * 1e-3
+    x = np.concatenate([motions(rng, 400, 60), ramps - ramps[:1]], axis=2)
     inside, beyond = (Lti.constant(np.diag(most * scale), T) for scale in (1 - 1e-9, 1.1))
     options = {"start": 1e-12}
     assert acted_on(inside, x, (theta, theta), DELTA, **options).max() == 0
@@ -448,7 +447,7 @@ def test_hands_behind_the_shell_get_its_budget():
 def test_the_shell_leaves_implicit_passive_environments_alone():
     rng = np.random.default_rng(14)
     E, V = environment(FIGURE_4, T), SpringDamper([879.0, 552.0], [0.39, 0.52]).compliance(T)
-    shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 800, 20), E.feedback(V)
+    shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 400, 20), E.feedback(V)
     solve = np.linalg.inv(np.eye(2) + E.D @ V.D)
     z, y = np.zeros((E.order, 20)), np.zeros((F.order, 20))
     for now in x:

@@ -37,6 +37,7 @@ def test_response_is_the_definition(blocks):
     close(G.at(Z), expected)
 
 
+@pytest.mark.validate
 def test_response_agrees_with_python_control(blocks):
     import control  # the import takes a second, and every worker collects this file
 

@@ -204,7 +204,7 @@ def test_maxwell_elements_are_passive_despite_rounding():
         a, D = b / (b + k * period), k * b / period / (k + b / period)
         return Lti([[a]], [[1, -1]], [[D * (a - 1)], [D * (1 - a)]], (D - less) * np.array([[1, -1], [-1, 1]]), period)
 
-    for i in range(120):
+    for i in range(60):
         E = maxwell(np.exp(rng.uniform(3, 9)), np.exp(rng.uniform(-2, 4)), rng.choice([1e-3, 5e-4, 1.2e-3]))
         block = Block.of(E)
         below += E.dc()[0, 0] < 0
@@ -214,7 +214,7 @@ def test_maxwell_elements_are_passive_despite_rounding():
             assert definiteness(Matrix.of(static)).semidefinite
             largest = 2e-6 * np.abs(E.D).max()  # the largest correction that Block accepts
             np.testing.assert_allclose(static.astype(float), 0, rtol=0, atol=largest)
-    assert below > 12
+    assert below > 6
     with pytest.raises(ValueError, match=r"static stiffness E\(1\) is \[\[-1e-05, 1e-05\], \[1e-05, -1e-05\]\]"):
         Block.of(maxwell(500.0, 6.0, T, less=1e-5))
 
