@@ -93,13 +93,16 @@ EVERY = {  # fields of a loop by the fact that they add; `walls` and `rho` are r
     "limiter": {"rho": 13.0},
     "switching": {"varying_delay": DelayRange((0,), (1,))},
 }
-SETS = [names for count in (2, 3, 4) for names in itertools.combinations(EVERY, count)]
-
-
-#: Only `make validate` tests the sets of three facts, which lie between the sets of two and the set of all.
+SETS = [names for count in (2, 3) for names in itertools.combinations(EVERY, count)]
+#: `make test` tests two sets, which have each fact once; `make suite` also the set of all facts.
+QUICK_SETS = ("latency", "switching"), ("walls", "limiter")
 MOST_SETS = pytest.mark.parametrize(
     "names",
-    [pytest.param(names, marks=[pytest.mark.validate] if len(names) == 3 else []) for names in SETS],
+    [
+        *QUICK_SETS,
+        pytest.param(tuple(EVERY), marks=pytest.mark.slow),
+        *(pytest.param(names, marks=pytest.mark.validate) for names in SETS if names not in QUICK_SETS),
+    ],
     ids="-".join,
 )
 
@@ -216,16 +219,14 @@ def test_no_hand_gains_energy_under_worst_timing(share, some):
     assert (growing(loop, COUPLING, share * need(loop, COUPLING), None, ticks=TICKS // 8) > 0) == some
 
 
-@pytest.mark.parametrize("names", [("latency", "walls"), ("latency", "switching")], ids="-".join)
+@pytest.mark.parametrize("names", [("walls", "limiter"), ("latency", "switching")], ids="-".join)
 def test_some_hands_gain_energy_far_below_the_requirement(names):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 0.5 * least_of(names), rho, ticks=TICKS // 8) > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "names", [("walls", "limiter"), pytest.param(("latency", "walls"), marks=pytest.mark.validate)], ids="-".join
-)
+@pytest.mark.validate
+@pytest.mark.parametrize("names", [("walls", "limiter"), ("latency", "walls")], ids="-".join)
 def test_facts_are_proved_at_every_vertex(names):
     """All vertices share one set of multipliers; no vertex needs more when it is judged alone."""
     loop, rho = combined(names)
@@ -347,11 +348,13 @@ def lossless(rng):
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.validate)])
-@pytest.mark.parametrize("limited", [False, True])
 @pytest.mark.parametrize(
-    "further",
-    [LATE, SWITCHED, pytest.param(LATE | SWITCHED, marks=pytest.mark.validate)],
-    ids=["latency", "switching", "both"],
+    ("limited", "further"),
+    [
+        pytest.param(limited, further, marks=[] if limited == (further is LATE) else pytest.mark.validate)
+        for limited in (True, False)
+        for further in (LATE, SWITCHED)
+    ],
 )
 def test_no_hand_gains_energy_before_lossless_environments(further, limited, count):
     """Ages and latencies are the worst ones; the limited loops have a wall and a limiter with rho = 0."""

@@ -270,7 +270,7 @@ def test_the_kyp_form_is_supply_less_storage_increase():
 def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
     """The integer matrix is within its bound of the exact matrix of the rounded P, whatever the units are."""
     rng, fullest = np.random.default_rng(16), 0.0
-    for _ in range(30):
+    for _ in range(12):
         n, m = 5, 2
         units = [Fraction(10) ** int(k) for k in rng.integers(-3, 4, n + m)]
         states, channels, back = np.diag(units[:n]), np.diag(units[n:]), np.diag([1 / v for v in units[:n]])

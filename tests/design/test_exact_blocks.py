@@ -20,7 +20,7 @@ from asked import (
     walls_demand,
 )
 from scipy.optimize import minimize_scalar
-from worlds import FIGURE_4, SOFT, STIFF, T
+from worlds import FIGURE_4, SOFT, STIFF, T, checkered
 
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper, _InternalModel
@@ -161,9 +161,9 @@ def any_environment_limit(K: float, B: float, theta: int) -> float:
     return highest(needed)
 
 
-@pytest.mark.parametrize("theta", [0, 1, 3])
-@pytest.mark.parametrize(("K", "B"), [(900.0, 0.0), (900.0, 0.4), (50.0, 2.0)])
-def test_one_spring_damper_meets_its_any_environment_limit(K, B, theta):
+@pytest.mark.parametrize(("theta", "gains"), checkered((0, 1, 3), ((900.0, 0.0), (900.0, 0.4), (50.0, 2.0))))
+def test_one_spring_damper_meets_its_any_environment_limit(theta, gains):
+    K, B = gains
     V = SpringDamper([K], [B]).compliance(rational(T))
     limit = any_environment_limit(K, B, theta)
     if not B:
@@ -239,10 +239,10 @@ def test_a_spring_damper_with_phi_meets_its_limit():
 # switching
 
 
-@pytest.mark.parametrize(("lo", "hi"), [(0, 1), (1, 3)])
-@pytest.mark.parametrize("weight", [0.5, 1.0, 3.0])
-def test_switching_before_a_spring_needs_the_closed_form(lo, hi, weight):
+@pytest.mark.parametrize(("weight", "ages"), checkered((0.5, 1.0, 3.0), ((0, 1), (1, 3))))
+def test_switching_before_a_spring_needs_the_closed_form(weight, ages):
     """The limit is T (alpha/2 + h^2 K^2/(2 alpha) + K ((lo + hi)/2 + 1/2)), or (hi + 1/2) K T if alpha = h K."""
+    lo, hi = ages
     K, h = 1000.0, (hi - lo) / 2
     alpha = weight * h * K
     G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)

@@ -143,7 +143,7 @@ def least_scale_of(demand):
 def test_weights_are_admitted_if_every_latency_admits_them():
     """`Latency` accepts Q exactly if eigenvalues at many latencies show that it is allowed, also an indefinite Q."""
     rng, agreed = np.random.default_rng(0), np.zeros(2, dtype=int)
-    for _ in [None] * 200:
+    for _ in [None] * 60:
         first, last = np.sort(np.round(rng.uniform(0, T, 2), 6))
         loop = change(WALL, latency=((first, last),), T_max=float(rng.choice([T, 1.5e-3])))
         tau = np.linspace(first, last, 2000)[:, None, None]
@@ -160,7 +160,7 @@ def test_weights_are_admitted_if_every_latency_admits_them():
             admitted = Latency().excess(loop, entries) is None
             assert admitted == (share < 1)
             agreed[int(admitted)] += 1
-    assert agreed.min() == 200
+    assert agreed.min() == 60
 
 
 def test_forged_weights_are_refused():

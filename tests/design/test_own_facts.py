@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT, STIFF
+from worlds import PAIR, SOFT, STIFF, checkered
 
 from haptic_loop import certify, load
 from haptic_loop.cli import check
@@ -83,7 +83,7 @@ def test_an_own_fact_adds_its_damping(base, shipped, fact):
     assert own.required == pytest.approx([d + fact.less * PAIR.T for d in plain.required], rel=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_files_name_the_bounds_of_own_known_devices():
     """Theorem B bounds the period from below, too, so that a certificate names T_min and the devices' bounds."""
     loop = change(KNOWN, T_max=1.2e-3, T_min=0.8e-3)
@@ -93,8 +93,7 @@ def test_files_name_the_bounds_of_own_known_devices():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fact", FACTS)
-@pytest.mark.parametrize("shipped", [KNOWN_DEVICE, KNOWN_DEVICE_ANY])
+@pytest.mark.parametrize(("shipped", "fact"), checkered((KNOWN_DEVICE, KNOWN_DEVICE_ANY), FACTS))
 def test_known_devices_keep_an_own_fact(shipped, fact):
     """At constant speed L <= s delta dx^2/T, which bounds the damping from below; beta -> 0 bounds it from above."""
     own = condition(type(shipped), fact)
@@ -109,6 +108,7 @@ def test_known_devices_keep_an_own_fact(shipped, fact):
     np.testing.assert_allclose(there, without + added, rtol=0, atol=1e-9 * max(fact.less, np.abs(without).max()))
 
 
+@pytest.mark.slow
 def test_a_known_device_takes_facts_from_plain():
     own = type(
         "Own", (KnownDevice,), {"name": "own", "covers": ("psi",), "plain": condition(ThisEnvironment, FACTS[2])}
@@ -251,7 +251,7 @@ def test_certify_refuses_switching_for_an_own_condition():
     ("loop", "base", "shipped"),
     [
         pytest.param(PAIR, LimitedForces, LIMITER, id="plain"),
-        pytest.param(KNOWN, LimitedKnownDevice, LimitedKnownDevice(), id="known-device", marks=pytest.mark.slow),
+        pytest.param(KNOWN, LimitedKnownDevice, LimitedKnownDevice(), id="known-device", marks=pytest.mark.validate),
     ],
 )
 def test_an_own_limiter_counts_once_it_is_proved(loop, base, shipped):

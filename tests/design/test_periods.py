@@ -164,7 +164,9 @@ def grown(damping, mean, seed=7):
     return growing(steps, energy, mean, rng, 20_000 if mean else 6000)
 
 
-@pytest.mark.parametrize("mean", [50, 1000, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "mean", [50, pytest.param(1000, marks=pytest.mark.validate), pytest.param(None, marks=pytest.mark.slow)]
+)
 def test_hands_grow_only_below_the_longest_periods_requirement(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)
