@@ -114,6 +114,7 @@ def test_every_descent_step_is_feasible_and_better():
         assert norm < before
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")  # the optimum is compared to 1e-3 only
 def test_the_zeros_are_optimal_for_the_poles(inner):
     """For the design's poles condition and norm are convex at each frequency: the design is the optimum of cvxpy."""

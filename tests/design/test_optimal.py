@@ -46,10 +46,14 @@ def loop_of(name: str) -> Loop:
     return load(next(LOOPS.glob(f"{name}*.toml"))).loop("I")
 
 
+#: the bases that the design of each loop reported, by the loop's name
+REPORTED = {}
+
+
 @cache
 def best(name: str):
     """Return the design over two bases for a loop of benchmarks/loops."""
-    return design(loop_of(name), SHORT)
+    return design(loop_of(name), SHORT, progress=REPORTED.setdefault(name, []).append)
 
 
 @cache
@@ -90,8 +94,11 @@ def dense() -> np.ndarray:
 
 #: loop, largest rms mismatch [dB] with the two smallest bases, least share of the static stiffness
 REACHED = [
-    *(("n0", -33.7, 0.99), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5)),
-    *(pytest.param(*each, marks=pytest.mark.validate) for each in (("n1", -12.6, 0.9), ("n4", -22.9, 0.9))),
+    *(("n0", -33.7, 0.99), ("n3", -4.9, 0.5)),
+    *(
+        pytest.param(*each, marks=pytest.mark.validate)
+        for each in (("n1", -12.6, 0.9), ("n2", -9.2, 0.75), ("n4", -22.9, 0.9))
+    ),
 ]
 
 
@@ -105,7 +112,7 @@ def test_designs_reach_the_recorded_figures(name, most, stiffness):
 
 
 @pytest.mark.parametrize(
-    "name", ["n0", "n2", "n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n4", "o13"))]
+    "name", ["n0", "n3", *(pytest.param(name, marks=pytest.mark.validate) for name in ("n2", "n4", "o13"))]
 )
 def test_the_sweep_certifies_the_optimal_coupling(name):
     loop, found = loop_of(name), best(name)
@@ -132,7 +139,7 @@ def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
     np.testing.assert_array_equal(read.built().R, old.R)
 
 
-@pytest.mark.parametrize("name", ["n0", "n2", pytest.param("n4", marks=pytest.mark.validate)])
+@pytest.mark.parametrize("name", ["n0", pytest.param("n4", marks=pytest.mark.validate)])
 def test_static_stiffness_is_an_exact_share(name):
     """F(1) = g E(1) in fractions, also with other springs, so F(1) stays symmetric."""
     loop, coupling = loop_of(name), best(name).coupling
@@ -199,8 +206,7 @@ def test_safe_environments_get_no_coupling():
 
 
 def test_every_basis_is_reported_as_it_is_finished():
-    heard = []
-    found = design(loop_of("n3"), SHORT, progress=heard.append)
+    found, heard = best("n3"), REPORTED["n3"]
     assert tuple(heard) == found.bases
     assert [basis.taps for basis in heard] == [4, 8]
     assert all(basis.certified for basis in heard)
@@ -244,7 +250,7 @@ def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
         assert "renders 0.200 of the stiffness" in found.bases[2].rejected
 
 
-@pytest.mark.parametrize("refused", [1, 3])
+@pytest.mark.parametrize("refused", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
     """After one failed proof the best filter is scaled down; after three the previous basis's filter is proved."""
     usual, left, asked = prove, iter(range(refused)), []
@@ -257,8 +263,8 @@ def test_without_a_proof_forces_or_bases_shrink(monkeypatch, refused):
 
     monkeypatch.setattr("haptic_loop.design.optimal.prove", refusing)
     loop = loop_of("n3")
-    found = design(loop, SHORT)
-    assert [basis.taken for basis in found.bases] == [True, True]
+    found = design(loop, SMALLEST if refused == 1 else SHORT)
+    assert all(basis.taken for basis in found.bases)
     assert found.proved
     assert len(asked) == refused + 1
     assert found.coupling is asked[-1]
@@ -306,13 +312,8 @@ def random_loop(seed: int) -> Loop:
     return Loop(float(rng.choice([0.0005, 0.001, 0.002])), *delays, lam, delta, network)
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        1,
-        *(pytest.param(n, marks=pytest.mark.validate) for n in (0, *range(2, 12))),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.validate) for n in (0, *range(2, 12)))])
 def test_random_loops_get_a_proved_design(seed):
     loop = random_loop(seed)
     found = design(loop, SMALLEST)
@@ -345,12 +346,12 @@ def test_scaled_walls_need_the_closed_form(theta):
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
         assert ratio_in(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
-    found = design(loop, SMALLEST).coupling
-    half = ForceFilter(found.poles, found.pairs, found.R / 2)
-    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, found) / 2, rel=1e-6)
+    whole = smallest("n3").coupling
+    half = ForceFilter(whole.poles, whole.pairs, whole.R / 2)
+    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, whole) / 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("theta", [1, 16])
+@pytest.mark.parametrize("theta", [1, pytest.param(16, marks=pytest.mark.validate)])
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     """F(1) T/2 is the mass at z = 1 of a measure of total delta and zero moments 1 .. theta: at most delta/(theta + 1).
 
@@ -399,11 +400,11 @@ def test_designs_keep_their_objective_and_their_cap():
 @pytest.mark.parametrize(
     ("further", "asked"),
     [
-        ({"objective": "sup", "limiter": True}, {}),
-        pytest.param({"objective": "sup", "high_gain": 1.2}, {}, marks=pytest.mark.validate),
-        ({"objective": "sup"}, {"varying_delay": DelayRange((4,), (6,))}),
         ({"high_gain": 1.2, "limiter": True}, {"T_max": 0.0015}),
-        ({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}),
+        pytest.param({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}, marks=pytest.mark.slow),
+        pytest.param({"objective": "sup", "limiter": True}, {}, marks=pytest.mark.validate),
+        pytest.param({"objective": "sup", "high_gain": 1.2}, {}, marks=pytest.mark.validate),
+        pytest.param({"objective": "sup"}, {"varying_delay": DelayRange((4,), (6,))}, marks=pytest.mark.validate),
     ],
 )
 def test_several_demands_can_be_combined(further, asked):
@@ -489,10 +490,7 @@ def test_fewer_delay_constraints_weaken_the_bound(monkeypatch):
 @pytest.mark.slow
 def test_a_bound_names_what_it_leaves_out(monkeypatch):
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
-    loop, light = loop_of("n3"), loop_of("o01")
-    T_max = msgspec.structs.replace(light, T_max=1.2 * light.T)
-    weaker = msgspec.structs.replace(light, delta=tuple(d / 1.2 for d in light.delta))
-    assert short_bound(T_max).rms == pytest.approx(short_bound(weaker).rms, rel=1e-6)
+    loop = loop_of("n3")
     band = (0.5, 80.0)
     assert BoundBeside.of(loop, best("n3"), -5.0, band, SHORT).gap_db > 0
     late = msgspec.structs.replace(loop, latency=((0.0, 1e-4),))
@@ -501,12 +499,16 @@ def test_a_bound_names_what_it_leaves_out(monkeypatch):
     assert limited.words.endswith("dB rms, even without latency and the limiter")
 
 
-def test_the_rms_bound_bounds_the_supremum(monkeypatch):
+def test_rms_mismatch_is_at_most_the_scaled_supremum():
     """|M|_F <= sqrt(m) |M| and |E|_F >= |E|, so rms <= sqrt(m) sup."""
-    monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
-    for name in ("n0", "n2"):
+    for name, channels in (("n0", 2), ("n3", 1)):
         figures = best(name).figures
-        assert figures.rms_mismatch <= np.sqrt(2) * figures.relative_mismatch
+        assert figures.rms_mismatch <= np.sqrt(channels) * figures.relative_mismatch
+
+
+@pytest.mark.slow
+def test_the_rms_bound_bounds_the_supremum(monkeypatch):
+    monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
     found = BoundBeside.of(loop_of("n3"), best("n3"), -5.0, (0.5, 80.0), replace(SHORT, objective="sup"))
     assert found.gap_db is None
     assert found.relative_mismatch_db == found.rms_mismatch_db
@@ -611,7 +613,7 @@ ORDINARY = {
 }
 
 
-@pytest.mark.parametrize("name", [*list(ORDINARY)[:2], pytest.param(list(ORDINARY)[2], marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [*list(ORDINARY)[:2], pytest.param(list(ORDINARY)[2], marks=pytest.mark.validate)])
 def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     """With four taps and three poles, cvxpy with many frequencies reaches the same objective to 0.1 dB."""
     monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # the cone program has neither of these terms
@@ -739,6 +741,7 @@ def brief(monkeypatch):
     monkeypatch.setattr("haptic_loop.design.bound.bound", short_bound)
 
 
+@pytest.mark.slow
 def test_the_report_says_that_seconds_ended_the_search(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"

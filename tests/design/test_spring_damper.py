@@ -1,6 +1,7 @@
 """Tests of the spring-damper designs: known optima, independence of the start, the exact gain set, and refusals."""
 
 import re
+from functools import cache
 
 import cvxpy as cp
 import msgspec
@@ -77,7 +78,7 @@ def test_the_objective_is_the_returned_norm():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draws", [60, pytest.param(200, marks=pytest.mark.validate)])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param("I", marks=pytest.mark.validate), "II"])
 def test_no_certified_gains_do_better(case, draws):
     loop = asked(CASES[case])
     best = design(loop)
@@ -125,6 +126,7 @@ def test_the_stiffness_scales_with_damping_and_rate():
     assert stiffest_at(0.2, 2, 2.0, 5e-4) == pytest.approx(4 * one, rel=1e-5)
 
 
+@cache
 def gains_of_least(cost, theta, sigma):
     """Return the least cost of (k, b) in the set (e) of docs/theory.md, by cvxpy with cones at 2001 frequencies.
 
@@ -144,15 +146,18 @@ def gains_of_least(cost, theta, sigma):
 
 @pytest.mark.parametrize(
     ("theta", "sigma", "most_stored"),
-    [(0, np.inf, 1000), (12, np.inf, 1000), (7, 3.0, 1000), (12, np.inf, 0), (7, 3.0, 0)],
+    [
+        *((0, np.inf, 1000), (7, 3.0, 1000), (7, 3.0, 0)),
+        *(pytest.param(12, np.inf, stored, marks=pytest.mark.slow) for stored in (1000, 0)),
+    ],
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """One matrix inequality or, for most_stored = 0, many that may fail by `_MISSED` between them agree with cvxpy."""
     loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
     certified = _GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
-    for cost in (np.array([-1.0, -0.2]), np.array([-0.2, -1.0]), np.array([-1.0, 1.0])):
-        found = certified.solve(cost, "a test")
-        assert cost @ found == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
+    for cost in ((-1.0, -0.2), (-0.2, -1.0), (-1.0, 1.0)):
+        found = certified.solve(np.array(cost), "a test")
+        assert np.dot(cost, found) == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.3])
@@ -208,7 +213,7 @@ def test_designs_for_delayed_environments_are_certified(psi):
 
 
 def test_zero_multiplier_gives_the_plain_condition():
-    for gains in random_starts(10, seed=4):
+    for gains in random_starts(4, seed=4):
         V = gains.compliance(T)
         plain = any_environment(V, (1, 2), DELTA)
         same = conditions.any_environment(V, asked(), np.zeros(2))
@@ -299,15 +304,15 @@ def test_an_unknown_condition_is_refused():
 
 
 def test_long_delay_designs_pass_a_dense_sweep():
-    """With 50 samples of delay (e) of docs/theory.md holds at 200001 frequencies, 7800 per ripple of its left side."""
-    made = stiffest(asked(theta=(50, 50)))
-    z, n = np.exp(1j * np.linspace(0, np.pi, 200_001)), 51
-    for K, B in zip(made.K, made.B, strict=True):
-        y = K * T * np.polyval(np.ones(n), 1 / z) + B * (1 - z**-n)
-        needed = (np.abs(y) ** 2).max() / (4 * (K * T / 2 + B))
-        assert 0.9997 * 1.37 < needed < 1.37
-        # No linear law is stiffer than 2 delta/(n T), and these designs exceed half of that.
-        assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
+    """With 50 samples of delay (e) of docs/theory.md holds at 40001 frequencies, 1560 per ripple of its left side."""
+    made = stiffest(asked((0,), WALL, (50,), (0,), (1.37,)))
+    z, n = np.exp(1j * np.linspace(0, np.pi, 40_001)), 51
+    (K,), (B,) = made.K, made.B
+    y = K * T * np.polyval(np.ones(n), 1 / z) + B * (1 - z**-n)
+    needed = (np.abs(y) ** 2).max() / (4 * (K * T / 2 + B))
+    assert 0.9997 * 1.37 < needed < 1.37
+    # No linear law is stiffer than 2 delta/(n T), and this design exceeds half of that.
+    assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
 
 
 def switching_loop(loop):
@@ -340,6 +345,7 @@ def test_designs_that_take_minutes_are_refused_early():
         spring_damper.design_with(late, "this-environment")
 
 
+@pytest.mark.slow
 def test_one_start_comes_close_to_all_starts(monkeypatch):
     """Above FEW channels the search has one start. The gains have five digits, which change the objective by 4e-6."""
     usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective

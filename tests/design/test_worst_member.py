@@ -12,7 +12,7 @@ from haptic_loop.cli.check import main as check_main
 from haptic_loop.controller.coupling import ForceFilter, _InternalModel
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
-from haptic_loop.design import optimal
+from haptic_loop.design import budgets, optimal
 from haptic_loop.design.api import certify, store
 from haptic_loop.design.assessment import SearchFigures, check_ranges
 from haptic_loop.design.certificate import prove, verify
@@ -188,7 +188,9 @@ def test_violations_between_vertices_take_the_guarantee_away(known):
     assert part["reason"].startswith("proved at every vertex, but violated between them: 1.04")
 
 
-def test_certify_searches_between_vertices():
+def test_certify_searches_between_vertices(monkeypatch):
+    for name, few in (("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)):
+        monkeypatch.setattr(budgets, name, few)
     requirement = certify(EDGE, VERTICES_ONLY)["this-environment"]  # certify draws no samples
     assert not requirement.certified
     assert requirement.ratio == pytest.approx(1.0428, abs=1e-3)
@@ -204,6 +206,7 @@ def test_couplings_violated_between_vertices_are_stored_without_ranges(known, tm
     assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 
 
+@pytest.mark.slow
 def test_design_check_repeats_the_search(tmp_path, capsys):
     file = tmp_path / "c.json"
     save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "this-environment")), file)
