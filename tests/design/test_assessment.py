@@ -64,10 +64,9 @@ def proved_here():
 )
 def test_another_loop_loses_the_guarantee(changes):
     assert on_its_own_loop().guarantee.environments == HERE
-    for known in (None, proved_here()):
-        elsewhere = assess(change(LOOP, **changes), HERE_ONLY, certificate=known)
-        assert elsewhere.guarantee is None
-        assert elsewhere.reason
+    elsewhere = assess(change(LOOP, **changes), HERE_ONLY, certificate=proved_here())
+    assert elsewhere.guarantee is None
+    assert elsewhere.reason
 
 
 def test_an_energy_account_covers_no_latency():
@@ -282,17 +281,21 @@ def stored(tmp_path, monkeypatch):
     (tmp_path / "one.toml").write_text(ONE_MASS)
 
 
-_COMMANDS = {
-    "audit": (audit, ["--coupling", "own.json"]),
-    "run": (run, ["--coupling", "own.json", "--duration", "0.1", "--no-plot"]),
-    "validate": (validate, ["--coupling", "own.json", "--humans", "2", "--duration", "0", "--no-plot"]),
+_COMMANDS = {  # a command, its options, and an option that changes the loop
+    "audit": (audit, ["--coupling", "own.json"], ["--delta", "1.2"]),
+    "run": (run, ["--coupling", "own.json", "--duration", "0.1", "--no-plot"], ["--psi", "1"]),
+    "validate": (
+        validate,
+        ["--coupling", "own.json", "--humans", "2", "--duration", "0", "--no-plot"],
+        ["--delta", "1.2"],
+    ),
 }
 
 
 @pytest.mark.usefixtures("stored")
-@pytest.mark.parametrize("name", _COMMANDS)
+@pytest.mark.parametrize("name", ["audit", "run", pytest.param("validate", marks=pytest.mark.slow)])
 def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
-    main, words = _COMMANDS[name]
+    main, words, elsewhere = _COMMANDS[name]
 
     def report(*more):
         main(
@@ -310,11 +313,10 @@ def test_a_command_claims_nothing_in_another_loop(name, tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     assert safe_with(report()) == HERE
-    for elsewhere in (["--delta", "1.2"], ["--psi", "1"]):
-        there = report(*elsewhere)
-        assert safe_with(there) is None
-        assert not there["assessment"]["holds"]
-        assert there["assessment"]["reason"]
+    there = report(*elsewhere)
+    assert safe_with(there) is None
+    assert not there["assessment"]["holds"]
+    assert there["assessment"]["reason"]
 
 
 # At one wall every command reports the damping for making and breaking contact, not that for permanent contact.

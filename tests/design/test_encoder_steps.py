@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,6 +39,17 @@ T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
 SOFT = SpringDamper([300.0, 300.0], [1.0, 1.0])
 F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
+
+
+def summed(G: Lti) -> np.ndarray:
+    """Return the sum of |D| and of |C A^k B| for k below 60,000, (outputs, inputs); 200 ticks are one product."""
+    ticks = [G.B]
+    for _ in range(199):
+        ticks.append(G.A @ ticks[-1])
+    total, X, later = np.abs(G.D), np.array(ticks), np.linalg.matrix_power(G.A, 200)
+    for _ in range(300):
+        total, X = total + np.abs(G.C @ X).sum(axis=0), later @ X
+    return total
 
 
 def test_ten_micrometre_steps_need_known_friction():
@@ -101,10 +113,7 @@ def test_friction_is_compared_in_the_running_environment():
     coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
     heavy = change(FIGURE_4, masses={name: 2 * mass for name, mass in FIGURE_4.masses.items()})
     at_heavy = LOOP.at(heavy).F(coupling)
-    response, X = np.abs(at_heavy.D), at_heavy.B
-    for _ in range(60_000):
-        response, X = response + np.abs(at_heavy.C @ X), at_heavy.A @ X
-    needed = response.sum(axis=1) * STEP / 2
+    needed = summed(at_heavy).sum(axis=1) * STEP / 2
     scenario = load().replace(environment=FIGURE_4, theta=LOOP.theta)
     devices = [
         change(device, friction=float(f), encoder_step=STEP)
@@ -144,14 +153,18 @@ _COMMANDS = {
 }
 
 
+#: `make test` runs these pairs, `make suite` also the slow ones, `make validate` all others.
+_QUICK = (("audit", "steps"), ("audit", "friction"))
+_SLOW = (("run", "friction"), ("design", "lost"), ("validate", "steps"), ("compare", "lost"))
+
+
 @pytest.mark.parametrize(
     ("name", "scenario"),
     # sim.validate refuses friction.
     [
-        pytest.param(name, s, marks=[pytest.mark.slow] if name in ("run", "compare") else [])
-        for name in _COMMANDS
-        for s in ("lost", "steps", "friction")
-        if (name, s) != ("validate", "friction")
+        pytest.param(*pair, marks=[] if pair in _QUICK else pytest.mark.slow if pair in _SLOW else pytest.mark.validate)
+        for pair in product(_COMMANDS, ("lost", "steps", "friction"))
+        if pair != ("validate", "friction")
     ],
 )
 def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, monkeypatch, capsys):
@@ -187,11 +200,10 @@ def test_traces_state_the_qualified_guarantee():
     scenario = load("omega-pair").replace(duration=0.05)
     lossy = scenario.replace(varying_delay=VaryingDelay(lo=(1, 2), hi=(2, 3), pattern="random", loss=0.2))
     assert simulate(lossy, SOFT).meta["assessment"]["guarantee"] is None
-    for friction, words in (0.0, "are not covered"), (2.0, "are covered with this object while forces stay below"):
-        devices = tuple(change(d, encoder_step=2e-4, friction=friction) for d in scenario.device)
-        meta = simulate(scenario.replace(device=devices), SOFT).meta
-        assert meta["assessment"]["guarantee"]
-        assert any(f"encoder steps {words}" in remark for remark in meta["remarks"])
+    devices = tuple(change(d, encoder_step=2e-4, friction=2.0) for d in scenario.device)
+    meta, words = simulate(scenario.replace(device=devices), SOFT).meta, "are covered with this object while forces"
+    assert meta["assessment"]["guarantee"]
+    assert any(f"encoder steps {words}" in remark for remark in meta["remarks"])
 
 
 def test_panels_and_bridge_tables_qualify_guarantees():
@@ -206,12 +218,14 @@ def test_panels_and_bridge_tables_qualify_guarantees():
         assert _certified(program)[-1].endswith(words)
 
 
+@pytest.mark.validate
 def test_sessions_count_the_steps_of_the_device(tmp_path, capsys):
     """A session's device always counts encoder steps, also if the scenario declares none."""
     bridge_command(["--rehearse", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)])
     assert "Not covered: the encoder steps" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_maps_say_their_guarantees_are_for_exact_positions(tmp_path, capsys):
     source = (Path(scenario_module.__file__).parent / "scenarios" / "omega-pair.toml").read_text()
     (tmp_path / "s.toml").write_text(source.replace("force_limit = 12.0", "encoder_step = 1e-5\nforce_limit = 12.0"))
@@ -221,9 +235,7 @@ def test_maps_say_their_guarantees_are_for_exact_positions(tmp_path, capsys):
 
 
 def test_the_l1_gain_is_a_close_upper_bound():
-    total, X = np.abs(F.D), F.B
-    for _ in range(60_000):
-        total, X = total + np.abs(F.C @ X), F.A @ X
+    total = summed(F)
     assert (_l1_gain(F) >= total * (1 - 1e-13)).all()  # rounding of 60,000 terms
     assert _l1_gain(F) == pytest.approx(total, rel=1e-8)
 

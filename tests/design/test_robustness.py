@@ -47,6 +47,7 @@ def test_tables_over_ranges_count_switching():
         assert row.violated == violated
 
 
+@pytest.mark.slow
 def test_robustness_is_that_of_the_simulated_vertex(tmp_path):
     """At the vertex of 500 N/m a spring that is 10 % stiffer needs 1.5 (1.1 500) T, not 1.5 (1.1 400) T."""
     (tmp_path / "spring.toml").write_text(
