@@ -5,7 +5,7 @@ import pickle
 import re
 import warnings
 
-from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
 from haptic_loop.hw.limits import SafetyLimits
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
@@ -26,6 +26,13 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **optio
     if recorder is not None:
         session.record = recorder
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
+
+
+def strike(rehearsal, *faults, board=0):
+    """Add faults, written as for --fault, to a device and its line, which have had none."""
+    faults, cable = tuple(map(FaultInjection.parse, faults)), rehearsal._cables[board]
+    cable.emulator._waiting = list(faults)
+    cable.up, cable.down = (Line(way, faults, rehearsal.seed, rehearsal.latency_us) for way in ("up", "down"))
 
 
 def in_fork(call, *arguments):

@@ -16,14 +16,14 @@ import msgspec
 import numpy as np
 
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
-from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, info_of, nobody
+from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Info
 from haptic_loop.hw.rehearsal import Plan, Rehearsal
 from haptic_loop.hw.session import Said, Session
 from haptic_loop.sim.scenario import Scenario, load
-from tests.sessions import MovesAxes
+from tests.sessions import MovesAxes, strike
 
 _WHEN = 0.6336  # [s] from arming to the fault: the gain is 1 after 0.52 s, the person moves after 0.49 s
 LATE = 0.595  # [s] from arming to a time before most faults
@@ -478,10 +478,8 @@ def begins_late(case: Fault) -> bool:
 
 def rehearse_late_case(case: Fault, rehearsal: Rehearsal) -> _FaultOutcome:
     """Continue a rehearsal of `CASES[0]`, which has reached LATE, with the fault of a case that `begins_late`."""
-    faults = tuple(FaultInjection.parse(text) for text in case.faults)
-    rehearsal.actions, rehearsal.emulator._waiting = _actions(case, rehearsal), list(faults)
-    (cable,) = rehearsal._cables
-    cable.up, cable.down = (Line(way, faults, rehearsal.seed, rehearsal.latency_us) for way in ("up", "down"))
+    strike(rehearsal, *case.faults)
+    rehearsal.actions = _actions(case, rehearsal)
     return _rehearsed(case, rehearsal)
 
 

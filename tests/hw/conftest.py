@@ -1,10 +1,12 @@
 """Provide, once per test run, the scenario of the sessions and couplings that are certified for its links."""
 
+from dataclasses import replace
+
 import pytest
 
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.sim.scenario import load as scenario_of
-from tests.checks.faults import _lively
+from tests.checks.faults import CASES, LATE, _lively, _prepared
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +19,19 @@ def scenario():
 def rungs(scenario):
     """Return certified couplings for links of one and two ticks."""
     return certified_couplings(scenario, "I", None, None, 1, spare=1)
+
+
+@pytest.fixture(scope="session")
+def harmless(scenario, rungs):
+    """Return a rehearsal without a fault, shortly before most faults begin. Tests continue it in a fork."""
+    rehearsal = _prepared(CASES[0], scenario, rungs)
+    rehearsal.run_until_armed(LATE)
+    return rehearsal
+
+
+@pytest.fixture(scope="session")
+def free_handles(scenario, rungs):
+    """Return a rehearsal as `harmless`, but nobody holds the handles."""
+    rehearsal = _prepared(replace(CASES[0], free=True), scenario, rungs)
+    rehearsal.run_until_armed(LATE)
+    return rehearsal

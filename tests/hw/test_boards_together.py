@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sessions import in_fork, strike
 from worlds import checkered
 
 from haptic_loop.cli import bridge, identify, session_cli
@@ -64,7 +65,7 @@ def watched(emulator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("deaf", [0, 1])
+@pytest.mark.parametrize("deaf", [pytest.param(0, marks=pytest.mark.validate), 1])
 def test_one_deaf_board_keeps_a_session_from_finishing(scenario, alone, made, deaf):
     """A deaf board ignores messages and keeps its force; the other one rests, which must not hide this force."""
     faults = [(), ()]
@@ -108,18 +109,28 @@ def test_two_clocks_keep_the_energy_account(scenario, alone, made, tmp_path):
 ENDING = ["unplug", "up:drop=1", "down:drop=1", "stall=0.03", "trip", "estop", "jump=5"]
 
 
+@pytest.fixture(scope="module")
+def armed(scenario, alone, made):
+    """Return a rehearsal 0.59 s after arming."""
+    rehearsal = rehearsal_of(scenario, alone, made)
+    rehearsal.run_until_armed(0.59)
+    return rehearsal
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("board", "fault"), checkered([0, 1], ENDING))
-def test_a_fault_of_one_board_stops_both(scenario, alone, made, board, fault):
+def test_a_fault_of_one_board_stops_both(armed, board, fault):
     """A fault of either board or link ends the session, and both motors are at zero within 50 ms."""
-    faults = [(), ()]
-    faults[board] = (f"{fault}@0.6",)
-    rehearsal = rehearsal_of(scenario, alone, made, faults=faults)
-    rehearsal.run_until_armed(0.7)
-    assert rehearsal.session.stage in ENDED - {Stage.FINISHED}
-    assert max(rehearsal.zero_after(0.6), 0) < 0.05
-    for emulator in (rehearsal.emulator, rehearsal.further[0][0]):
-        assert not emulator.applied.any()
+
+    def run():
+        strike(armed, f"{fault}@0.6", board=board)
+        armed.run_until_armed(0.7)
+        assert armed.session.stage in ENDED - {Stage.FINISHED}
+        assert max(armed.zero_after(0.6), 0) < 0.05
+        for emulator in (armed.emulator, armed.further[0][0]):
+            assert not emulator.applied.any()
+
+    in_fork(run)
 
 
 @pytest.mark.parametrize(

@@ -396,7 +396,7 @@ BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T
 def test_the_measured_delay_covers_answers_in_bursts(scenario, burst, where):
     """The measured delay in ticks covers the greatest age that the emulator noted, with at most one tick more."""
     (T, every), direction = burst, "" if where == "both" else f"{where}:"
-    session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 400)
+    session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 250)
     ages = session.measurement.result
     assert ages.missing == 0
     needed = int(-(-max(true) // (1e6 * T)))

@@ -7,7 +7,7 @@ from runpy import run_path
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from sessions import in_fork
+from sessions import in_fork, strike
 from worlds import checkered
 
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
@@ -323,8 +323,7 @@ def test_a_moving_hand_hides_no_sign(hand, sign):
         played(arming_test(), moved)
 
 
-@pytest.mark.parametrize("hand", [*REACH, *HANDS])
-@pytest.mark.parametrize("closing", [False, True])
+@pytest.mark.parametrize(("hand", "closing"), checkered([*REACH, *HANDS], [False, True]))
 def test_a_moving_hand_is_no_motor(hand, closing):
     with pytest.raises(SafetyStop, match="axis 1"):
         played(arming_test(closing=closing), lambda k, applied: (round(hand(k * T) / 1e-6), 0))
@@ -373,7 +372,7 @@ def ended(rehearsal, *faults, lets_go=9.0):
 
     Return stage, cause and log.
     """
-    rehearsal.emulator._waiting = list(map(FaultInjection.parse, faults))
+    strike(rehearsal, *faults)
     rehearsal.actions.append((lets_go, rehearsal.actions[0][1]))
     session = rehearsal.run_until_armed(8.0)
     return session.stage, session.cause, [event.cause for event in session.log]
@@ -449,7 +448,7 @@ def test_the_expected_motion_is_the_closed_form():
 # noise
 
 
-@pytest.mark.parametrize("noise", [0.3, 1.0])
+@pytest.mark.parametrize("noise", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_dead_encoders_with_noise_are_found(scenario, rungs, noise):
     """Dead encoders with noise are found, before and while forces act.
 
@@ -522,7 +521,7 @@ def test_sessions_of_coarse_free_handles_finish(scenario, rungs, cap):
     """After its test an axis shows no motion in counts of 0.1 mm, although the force has changed by the cap."""
     free = nobody(scenario.replace(device=[replace(d, encoder_step=1e-4) for d in scenario.device]))
     session = Session(free, SafetyLimits((cap, cap)), LinkSettings(measure=60, held=False))
-    stop = (2.0, lambda session, now: session.stop("asked to", now))
+    stop = (1.4, lambda session, now: session.stop("asked to", now))
     Rehearsal(session, Emulator(free), lambda ages: rungs, actions=[stop]).run_until_armed(4.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "asked to")
 
@@ -567,8 +566,7 @@ def test_impulses_without_motion_stop_sessions(axis, sign, newton, after):
     return None
 
 
-@pytest.mark.parametrize(("cap", "far"), [(0.05, "0.039"), (0.15, "0.12")])
-@pytest.mark.parametrize("closing", [False, True])
+@pytest.mark.parametrize(("cap", "far", "closing"), [(0.05, "0.039", False), (0.15, "0.12", True)])
 def test_motions_below_two_counts_test_nothing(cap, far, closing):
     """At 0.05 N the free mass swings by 0.039 mm, which an encoder with counts of 0.1 mm hardly shows."""
     with pytest.raises(SafetyStop, match=rf"axis 1 by {far} mm, less than 2 counts of 0\.1 mm: .* Raise --force-cap"):
@@ -621,7 +619,7 @@ def test_no_session_stops_for_a_still_hold():
     assert still_holds(300, seed=1)[0] == 0
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
     """A knock of 0.14 N s moves 0.25 kg at 0.56 m/s, and the motor swings by 1 mm at 90 Hz against the handle."""
     free = nobody(scenario)
@@ -640,7 +638,7 @@ def test_a_knock_on_a_handle_is_no_jump(scenario, rungs, axis):
 # the origin of positions
 
 
-@pytest.mark.parametrize("place", [0.03, -0.03])
+@pytest.mark.parametrize("place", [0.03, pytest.param(-0.03, marks=pytest.mark.slow)])
 def test_handles_off_centre_feel_little_force(scenario, rungs, place):
     """Free handles at 30 mm feel less than 0.5 N if positions count from there; counted from the middle, over 3 N."""
     still = nobody(scenario)

@@ -164,7 +164,7 @@ def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     """The session has handshake, delay, certificate, forces, ramp and replay, as over the serial link."""
     sdk = StandIn(scenario)
     sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # no push during arming
-    session, recorder, (made,) = held_session(scenario, sdk)
+    session, recorder, (made,) = held_session(scenario, sdk, own=SOFT)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     assert session.info.firmware == "omega.3"
     assert session.info.serial == 4711
@@ -225,7 +225,7 @@ def test_host_clocks_charge_microseconds_not_ticks(scenario):
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "write", "holds"), [(40, 50, True), (500, 500, False)])
 def test_sessions_with_too_late_forces_are_refused(scenario, read, write, holds):
-    session, *_ = held_session(scenario, StandIn(scenario, read, write), seconds=0.05)
+    session, *_ = held_session(scenario, StandIn(scenario, read, write), seconds=0.05, own=SOFT)
     if holds:
         assert session.stage == Stage.FINISHED
     else:
@@ -243,7 +243,7 @@ def test_forces_later_than_certified_end_in_a_ramp(scenario):
         if session.stage == Stage.ARMED:
             sdk.write = 0.4e-3
 
-    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch)
+    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch, own=SOFT)
     assert session.stage == Stage.STOPPED
     assert "answers were late, and nothing softer is left" in session.cause
     assert session.counters.late > 20
@@ -258,7 +258,7 @@ def test_a_host_that_cannot_keep_the_period_stops(scenario):
         if session.stage == Stage.ARMED:
             sdk.read = 1.6e-3
 
-    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch)
+    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch, own=SOFT)
     assert session.stage == Stage.STOPPED
     assert "no answer in time" in session.cause or "by its own clock" in session.cause
     assert sdk.force.tolist() == [0.0, 0.0]

@@ -149,6 +149,7 @@ DASHPOTS = {"faint": (0.0, 0.08, 0.0), "firm": (0.0, 0.3, 0.0)}
 BETWEEN = ("thins at 0.3 m/s", "memory of 3 ms, 2 N s/m", "memory of 2 ms, 0.5 N s/m", "trace of 30 ms, 0.1 N s/m")
 BETWEEN += ("dry friction that bends at 0.1 m/s", "Stribeck up to 0.06 m/s")
 BETWEEN += ("thins at 0.1 m/s", "memory of 3 ms, 20 N s/m", "resting", "finger")
+BETWEEN += ("eccentric 2e-05", "coulomb 0.05, slip 0.02", "constant 0.02, coulomb 0.03")
 BETWEEN += ("memory of 10 ms, 1 N s/m", "trace of 10 ms, 0.02 N s/m", "constant 0.001", "coulomb 0.05, slip 0.0005")
 
 
@@ -330,7 +331,7 @@ def test_undetectable_hands_add_no_damping(odd):
         settled([sitting(odd, "ideal")])
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_damping_in_one_sitting_needs_a_third(tmp_path, monkeypatch):
     """In the first sitting a dashpot of 0.3 N s/m is at the handles. Two sittings disagree, two of three agree."""
     sittings = {}  # only the first sitting has a hand, so the second one also serves as the third

@@ -123,7 +123,7 @@ def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
     assert world["given_J"] <= 2e-3 + world["released_J"]
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     """After SIGINT the command lowers the gain to zero in 100 ms of session time and exits with 130."""
     monkeypatch.chdir(tmp_path)
@@ -202,7 +202,9 @@ def test_signals_end_sessions_while_forces_act(scenario, name, stage):
     assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) > 0.09  # [s] on the session's clock
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
+@pytest.mark.parametrize(
+    "name", ["SIGINT", *(pytest.param(f"SIG{n}", marks=pytest.mark.slow) for n in ("TERM", "QUIT"))]
+)
 def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
     def watch(session):
         if session.stage == Stage.MEASURING and not sent:

@@ -136,8 +136,11 @@ def read_coupling_of(trace):
     return recipe.coupling.build(recipe.scenario.T)
 
 
-def in_the_ball_world(name, *faults):
-    """Run a session in the scenario `name`, a world. Return it and the total energy given at every tick [J]."""
+def in_the_ball_world(name, until, *faults):
+    """Run a session in the scenario `name`, a world, stopped `until` [s] after arming.
+
+    Return the session and the total energy given at every tick [J].
+    """
     scenario, rows = load(name), []
     faults = tuple(map(FaultInjection.parse, faults))
     session = session_for(scenario, LinkSettings(measure=60), 2.0)
@@ -145,9 +148,9 @@ def in_the_ball_world(name, *faults):
 
     def plan(ages):
         met, link = timed(scenario, ages, 0.99, 100.0)
-        return certified_couplings(met, "I", "moving-average", None, link)
+        return certified_couplings(met, "I", "moving-average", None, link, spare=0)
 
-    stop = [(1.1, lambda session, now: session.stop("asked to", now))]
+    stop = [(until, lambda session, now: session.stop("asked to", now))]
     Rehearsal(session, Emulator(scenario, faults), plan, faults, actions=stop).run_until_armed(2.6)
     x = np.array([row.x for row in rows])
     f = -4e-4 * np.array([row.state.applied for row in rows])[:-1]
@@ -158,14 +161,14 @@ def in_the_ball_world(name, *faults):
 @pytest.mark.slow
 def test_sessions_in_worlds_finish_within_their_account():
     """The devices give at most W0 and what was released; their motion and the applied forces show this."""
-    session, given = in_the_ball_world("world-space")  # two devices of three axes
+    session, given = in_the_ball_world("world-space", 1.1)  # two devices of three axes
     assert session.stage == Stage.FINISHED, session.cause
     assert given.max() <= 2e-3 + session.worlds[0].port.released
 
 
 @pytest.mark.slow
 def test_a_dead_motor_in_a_world_never_finishes():
-    session, _ = in_the_ball_world("world-ball", "axis2:motor=0@0.8")
+    session, _ = in_the_ball_world("world-ball", 0.7, "axis2:motor=0@0.6")
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith("motor or encoder of axis 2 did not answer a test force of up to 2 N")
 
