@@ -531,7 +531,7 @@ def test_rehearsed_forces_solve_coupling_and_wall_in_series():
     Here d is the deflection of the coupling, h the penetration of the wall, and dd and dh are their changes in a tick.
     """
     scenario = load_scenario("one-wall")
-    session = rehearse(scenario, seconds=2.0)
+    session = rehearse(scenario, seconds=3.0)
     assert (session.stage, session.assessment.guarantee.condition) == ("finished", "any-environment")
     (Kc,), (Bc,), wall, T = session.coupling.K, session.coupling.B, scenario.environment.walls[0], scenario.T
     pushes, d, h = [], 0.0, 0.0

@@ -168,7 +168,7 @@ def test_sessions_in_worlds_finish_within_their_account():
 
 @pytest.mark.slow
 def test_a_dead_motor_in_a_world_never_finishes():
-    session, _ = in_the_ball_world("world-ball", 0.7, "axis2:motor=0@0.6")
+    session, _ = in_the_ball_world("world-ball", 1.1, "axis2:motor=0@0.8")
     assert session.stage == Stage.STOPPED
     assert session.cause.startswith("motor or encoder of axis 2 did not answer a test force of up to 2 N")
 
