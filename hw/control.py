@@ -92,13 +92,13 @@ def host_controller(
     return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
 
 
-def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
+def _fill(previous: tuple[float, ...], x: tuple[float, ...], ticks: int) -> list[tuple[float, ...]]:
     """Interpolate linearly from `previous` to x (m,) [m] over `ticks` ticks, of which only the last was received.
 
     A step instead would make a damper B answer with a force of B dx/T.
     """
     line = [tuple(a + (b - a) * (i / ticks) for a, b in zip(previous, x, strict=True)) for i in range(1, ticks)]
-    return [*line, tuple(x)]
+    return [*line, x]
 
 
 @dataclass(frozen=True)
@@ -347,15 +347,17 @@ class Drive:
             self.reference = state.counts if self._rereference else (0,) * state.axes
         x = self.units.positions(map(sub, state.counts, self.reference))
         lasted, self._clock_us = (state.t_us - self._clock_us) % 2**32, state.t_us
-        self._check_motion(x, ticks, 1e-6 * lasted)
+        positions = _fill(self.x or x, x, ticks)  # one for each of the last `ticks` ticks
+        self._check_motion(positions, 1e-6 * lasted)
         if self._commands:
             self._counters.unlike += self._commands.unlike(state, ticks)
         if self.gain > 0:  # otherwise only test forces act
             self.encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
-        if ticks > 1 and self.x is not None:
-            self._miss(state, _fill(self.x, x, ticks)[:-1])
+        for k, between in enumerate(positions[:-1], start=1 - ticks):  # ticks without a STATE
+            tick, wanted = (state.tick + k) & 0xFFFF, self.controller.step(between)
+            self._record(TraceRow(tick, between, wanted, self.gain, (), None, self._arming))
         wanted = self.controller.step(x)
         test = None
         if direction > 0:
@@ -410,11 +412,12 @@ class Drive:
                 sent = tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
         return (force if allowed == steps else self.units.forces(allowed)), sent
 
-    def _check_motion(self, x: tuple[float, ...], ticks: int, seconds: float) -> None:
-        """Raise SafetyStop where handles jumped to x (m,) [m], or moved faster than the speed limit.
+    def _check_motion(self, positions: Sequence[tuple[float, ...]], seconds: float) -> None:
+        """Raise SafetyStop where handles jumped, or moved faster than the speed limit.
 
-        The last `ticks` ticks lasted `seconds`.
+        `positions` (m,) [m] are those of the ticks since the last STATE, which lasted `seconds`.
         """
+        x, ticks = positions[-1], len(positions)
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
         if ticks > 1:
@@ -424,19 +427,9 @@ class Drive:
         if len(self._path) == 4:
             longer = 2 * self.limits.speed * max(self._uneven)  # uneven ticks change displacements, not speeds
             self.limits.check_jolt(self._path, [most + longer for most in self._jolts])
-        recent = self._recent
-        if ticks == 1 or self.x is None:
-            recent.append(x)
-        else:
-            recent.extend(_fill(self.x, x, ticks))
-        if (since := len(recent) - 1) >= self._window // 2:
-            self.limits.check_speed(x, recent[0], since * self.T)
-
-    def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
-        """Advance the controller through ticks without a STATE, at interpolated positions (m,) [m]."""
-        for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
-            tick, wanted = (state.tick - back) & 0xFFFF, self.controller.step(x)
-            self._record(TraceRow(tick, x, wanted, self.gain, (), None, self._arming))
+        self._recent.extend(positions)
+        if (since := len(self._recent) - 1) >= self._window // 2:
+            self.limits.check_speed(x, self._recent[0], since * self.T)
 
 
 # couplings that are certified for a link

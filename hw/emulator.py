@@ -179,12 +179,10 @@ class Line:
         struck = rng.random() < fault.value
         if fault.kind == "reorder":
             held, self._held = self._held, None
-            if held is not None:
-                return [frame, held]
-            if struck:
+            if held is None and struck:
                 self._held = frame
                 return []
-            return [frame]
+            return [frame] if held is None else [frame, held]
         if not struck:
             return [frame]
         if fault.kind == "flip":
