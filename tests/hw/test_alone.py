@@ -104,19 +104,22 @@ class Bench:
         raise AssertionError("the motor tests do not end")
 
 
+NOISE = [0.0, pytest.param(0.5, marks=pytest.mark.slow), 1.0, 2.0]  # [counts]
+
+
 def seeds(board, noise):
     """Return seeds of the noise: without noise all runs are equal."""
     return board.seeds if noise else board.seeds[:1]
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("load", [{}, {"friction": 0.2}, {"gravity": 0.05}, {"speed": 0.03}], ids=str)
 def test_right_axes_are_armed(board, noise, load):
     for seed in seeds(board, noise):
         assert Bench(board, seed, noise, **load).armed() == (RUNNING, 0)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize(
     ("wrong", "causes"),
     [

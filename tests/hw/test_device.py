@@ -32,8 +32,7 @@ class Rig:
 
     def __init__(self, config: Config | None = CONFIG, first_tick: int = 0) -> None:
         self.device, self.decoder, self.now = Device(INFO), Decoder(), 0
-        for _ in range(first_tick):
-            self.tick()
+        self.device.k = first_tick
         if config:
             self.device.receive(encode(config), self.now)
             assert [type(m) for m in self.tick()] == [Ack, State]
