@@ -1,8 +1,9 @@
 """python -m design.compare: run the same devices and hands with every coupling, or compare couplings over frequency.
 
-Without --coupling, the table has one row for each coupling of sim.comparison that the loop admits. If the loop has
-neither walls nor friction, each coupling is also run with the scenario's hands, and couplings.png shows the forces
-(without those of the paper's gains). With --coupling, the named couplings are drawn over frequency.
+Without --coupling, the table has one row for each coupling of sim.comparison that suits the loop; it states why a
+design failed. If the loop has neither walls nor friction, each coupling is also run with the scenario's hands, and
+couplings.png shows the forces, except for the paper's gains. With --coupling, the named couplings are drawn over
+frequency.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _MOST = 6  # number of curves that can be distinguished in one panel
 def main(argv: list[str]) -> int:
     """Compare couplings. Return 0, or 1 if a coupling of --coupling could not be designed.
 
-    Ctrl-C ends the command without a report, because the best coupling of an incomplete table may not be the best.
+    Ctrl-C ends the command without a report, because an incomplete table may lack the best coupling.
     """
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
@@ -49,9 +50,9 @@ def _parser() -> options.Parser:
     )
     parser.add_loop()
     names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION designs for a condition"
-    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
+    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"compare over frequency: {names}")
     parser.add_condition(
-        "condition for names without :CONDITION (default: the coupling's); "
+        "condition for names without :CONDITION (default: depends on the coupling); "
         "a condition of your own is evaluated for every coupling"
     )
     parser.add_output(picture=True, seed=False)
@@ -251,7 +252,7 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 def _binds(part: ConditionCurve) -> str:
     hz = part.requirement.frequency_hz
-    # A sweep may place a maximum at 0 up to 1e-5 rad/sample too high; rounding to 1 mHz shows it as 0.
+    # A sweep finds a maximum at w = 0 to 1e-5 rad/sample (1.6 mHz at T = 1 ms), so finer digits mean nothing.
     return render.optional(hz and round(hz, 3), "{:.4g}")
 
 

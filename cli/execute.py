@@ -75,7 +75,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         nobody_reads()
     except OSError as error:
         code = _cannot(error)
-    # After a Ctrl-C in a call of exec(), as dataclass makes, Python would end by SIGINT unless exec() runs once more.
+    # After a Ctrl-C within exec(), which dataclass() calls, Python would end by SIGINT unless exec() runs once more.
     exec("")
     sys.exit(code)
 
@@ -120,7 +120,7 @@ _MOMENT = 0.05  # [s] time after which an ignored Ctrl-C is repeated
 
 
 def _repeat_interrupt(unraisable: Any, shown: Callable[[Any], object] = sys.__unraisablehook__) -> None:
-    """Repeat a moment later a Ctrl-C that came during a clean-up such as __del__, where Python ignores it.
+    """Repeat a Ctrl-C after a moment if it came during a clean-up such as __del__, in which Python ignores it.
 
     `shown` is an argument because Python deletes `sys` at its end.
     """

@@ -1,4 +1,4 @@
-"""Parts of hw.bridge and hw.identify: options, the keyboard, and the session from HELLO to its end."""
+"""Parts of hw.bridge and hw.identify: options, the keyboard, and a session from opening the port to its end."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def add_safety_options(parser: options.Parser) -> None:
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
     add("--no-dead-man", action="store_true", help="let forces act without a dead-man switch")
-    unchecked = "arm without having asked to move every axis in its + direction by hand"
+    unchecked = "arm without asking the user to move every axis in its + direction by hand"
     add("--no-axis-check", action="store_true", help=unchecked)
     add("--no-preflight", action="store_true", help="skip the two-second check of this machine")
     parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man", "no_axis_check")
@@ -108,7 +108,7 @@ def add_safety_options(parser: options.Parser) -> None:
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
-    """Return the scenario. Raises InputError if it has Coulomb friction, uneven ticks or varying delays."""
+    """Return the scenario. Raises InputError for Coulomb friction, `period`, `latency` or varying delays."""
     scenario = options.scenario_from(args)
     require_linear(scenario, command, walls=True)
     for require in (require_constant_delay, require_even_ticks):
@@ -156,7 +156,7 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Return `touched` for the file of --deadman; None without a dead-man switch on this machine."""
+    """Return `touched` for FILE, a function that returns False for `key`, or None without a switch on this machine."""
     if named in (None, "device"):
         return None
     return touched(named) if named != "key" else lambda: False  # The driver reads the keys.

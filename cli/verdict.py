@@ -67,7 +67,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     if guarantee is None:
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
-        swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
+        swept = " A refined sweep shows this, without an exact proof." if guarantee.proof == "sampled" else ""
         steps = f" {encoder.sentence}" if encoder and guarantee.counts_positions else ""
         return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}{steps}"
     figures = assessment.transparency
@@ -80,7 +80,7 @@ def verdict(assessment: Assessment, nearby: Robustness | None = None) -> str:
     if guarantee.forces == BELOW_LIMITS and assessment.force_limits.force_limit:
         words.append("Only while forces stay below their limits.")
     if guarantee.proof != "rational":
-        words.append("By a refined sweep, without an exact proof.")
+        words.append("A refined sweep shows this, without an exact proof.")
     if encoder:
         words.append(encoder.sentence)
     return " ".join([*words, *filter(None, [lost(assessment, nearby), _useless(assessment)])])

@@ -176,9 +176,9 @@ def _parser() -> options.Parser:
     add(
         "--script",
         metavar="EVENTS",
-        help=f"events SECONDS:EVENT (default of a video without --coupling, --case none and world: '{_SCRIPT}')",
+        help=f"events SECONDS:EVENT (default for a video, except with --coupling, --case none or a world: '{_SCRIPT}')",
     )
-    until = "length (default: until the window is closed, or 3 s after a video's script; in a world the scenario's)"
+    until = "length (default: until the window is closed, or 3 s after a video's script; the scenario's in a world)"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
     parser.add_json()
     add = parser.add_argument_group("without a display").add_argument

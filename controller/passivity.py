@@ -1,4 +1,4 @@
-"""Bound the least eigenvalue of He G = (G + G*)/2 from below on the whole unit circle, and |G| near points of it."""
+"""Bound the least eigenvalue of He G = (G + G*)/2 from below on the unit circle, and |G| from above near points."""
 
 from __future__ import annotations
 

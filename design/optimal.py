@@ -200,9 +200,9 @@ def _for_known_devices(
 ) -> Optimal:
     """Return the best coupling under known-device, or under this-environment if that is better.
 
-    For fixed beta and fixed multipliers of the facts the block is affine in the forces. The filter over the smallest
-    basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola through the three
-    merits, and the multipliers of the last accepted filter.
+    For fixed beta and fixed multipliers of the facts (design.facts) the block is affine in the forces. The filter over
+    the smallest basis is designed for three values of beta. Larger bases use the beta at the minimum of a parabola
+    through the three merits, and the multipliers of the last accepted filter.
 
     Raises ValueError for a loop that `design` refuses or known-device does not cover.
     """
@@ -587,8 +587,8 @@ class _Search:
     def _start(self, problem: program.Problem) -> Array:
         """Return unknowns of R = kappa I that satisfy every constraint strictly.
 
-        For F = 0 every constraint holds strictly. That includes the limiter's: its Schur complement is
-        rho (Re M/z - beta/4), with the multiplier M and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
+        For F = 0 every constraint holds strictly. For LimitedForces the Schur complement is
+        rho (Re M/z - beta/4), where the multiplier M satisfies Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) >= 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:

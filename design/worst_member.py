@@ -30,7 +30,7 @@ Progress = Callable[[int, int], None]  # points tried, points expected
 _SEED = 0xFACE
 _MANY = 7  # With more parameters, vertices, points on edges and points inside are drawn at random, and none on faces.
 _APART, _SAME = 0.2, 0.05  # least distances of two starts of the compass search and of two maxima, in range widths
-_FIRST, _LAST = 1 / 16, 1 / 128  # first (up to _MANY parameters) and last step of the compass search, in range widths
+_FIRST, _LAST = 1 / 16, 1 / 128  # first step for up to _MANY parameters, and last step, in range widths
 
 #: the search in words, for reports
 SEARCH = "along edges, on faces (up to 7 parameters) and inside, then uphill from the worst points"
@@ -161,7 +161,7 @@ def search_ranges(
     over: Callable[[], bool] = lambda: False,
     ratio: Callable[[Loop], float] | None = None,
 ) -> Searched:
-    """Find the members of the loop's ranges where `ratio`, by default that of this-environment, is largest."""
+    """Find the members of the ranges that need the most damping under this-environment, or have the largest `ratio`."""
     assert loop.ranges
     parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
     return search(parts, lambda member: ratio(loop.at(member.network)), progress, over=over)

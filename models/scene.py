@@ -628,7 +628,7 @@ class Crowd:
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
-    axes: tuple[int, ...] = ()  # (devices,) of free axes if links have 1 + 2 max(axes)^2 numbers; () if they have three
+    axes: tuple[int, ...] = ()  # (devices,) numbers of free axes if links have 1 + 2 max(axes)^2 numbers; () for three
     mechanics: _Drawn = ()  # (nsim, devices), or empty if all hands hold the scenario's devices
 
     def __post_init__(self) -> None:

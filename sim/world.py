@@ -45,10 +45,10 @@ class WorldFigures(ShellFigures):
     """Energies and other figures at the port of a world."""
 
     given_J: float  # largest energy that hands and devices received, less what the devices' damping dissipated
-    port_least_J: float  # least sum over ticks of f'(u[k] - u[k-1]) at the contacts, with positions u
+    port_least_J: float  # least energy that had entered at a tick: sums of f'(u[k] - u[k-1]) with contact positions u
     released_J: float  # largest energy that gravity and springs of the scene have released
     created_J: float  # bound on the energy that constraints created, by the lemma in docs/theory.md, MuJoCo worlds
-    unsettled_steps: int  # number of steps in which limited forces still changed after the last repetition
+    unsettled_steps: int  # number of steps whose limited forces did not settle in the allowed repetitions
     warnings: list[str]  # texts of MuJoCo's warnings
 
 
@@ -102,7 +102,7 @@ class Claim:
         if guarantee is None or guarantee.energy_J is None:
             return cls(False, f"No guarantee: {assessment.reason}.{_elsewhere(assessment, certified_for)}")
         energy = f"W0 = {_energy(guarantee.energy_J)}"
-        swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
+        swept = " A refined sweep shows this, without an exact proof." if guarantee.proof == "sampled" else ""
         return cls(
             True,
             f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
@@ -115,7 +115,7 @@ def _elsewhere(assessment: Assessment, network: Network | None) -> str:
         return ""
     scene = getattr(assessment.environment, "world", None)
     stale = scene is None or network.scene_digest != scene.digest
-    changed = ", of a scene with other contents than this one: call linearise again" if stale else ""
+    changed = ", of a scene with other contents: call linearise again" if stale else ""
     return f" The coupling is certified for the linear network of {network.linear_model_of} only{changed}."
 
 
@@ -126,8 +126,8 @@ def _energy(joules: float) -> str:
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
-    Raises InputError for a coupling without V, or whose direct part D_V is not symmetric and positive definite or
-    couples devices, and for a scene that is invalid or has changed since the scenario was loaded.
+    Raises InputError if the coupling has no V, if its direct part D_V couples devices or is not symmetric and positive
+    definite, and if the scene is invalid or has changed since the scenario was loaded.
     """
     world = scenario.environment.world
     assert world is not None
@@ -214,7 +214,7 @@ class Touched:
 
 
 def live(simulation: Simulation) -> Simulation:
-    """Return the simulation with its world as a net, which also delays the forces, for any number of ticks."""
+    """Return the simulation with a net that simulates its world and delays the forces; runs may have any length."""
     touched, process = Touched(START_J), simulation.process
 
     def late(nsim: int) -> Net:
@@ -323,7 +323,7 @@ def thrown(
 ) -> list[HandsInWorld]:
     """Simulate hands of the scenario's population with random initial speeds in the world for `duration` seconds.
 
-    In every second set all chains have no dampers. `start` is W0 [J].
+    The chains of the sets with odd numbers have no dampers. `start` is W0 [J].
     """
     from haptic_loop.sim.crowds import Validation
 
@@ -351,7 +351,7 @@ def thrown(
 
 
 def _lossless(hand: Any) -> Any:
-    """Return a chain without dampers and voluntary motion, and any other hand unchanged."""
+    """Remove the dampers and the voluntary motion of a chain; return any other hand unchanged."""
     if not isinstance(hand, Human):
         return hand
     links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
@@ -359,7 +359,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def _hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, done: Callable[[int], None]) -> float:
-    """Return the least energy [J] that entered the port in runs of 1 s; the springs' ends stop and turn at random.
+    """Return the least energy [J] that entered the port in runs of 1 s with random device motions that stop and turn.
 
     `done` is called with the number of finished runs.
     """
@@ -385,7 +385,7 @@ def least_at_port(
 ) -> dict[str, float]:
     """Return for each adversary the least energy [J] that entered the port; it is negative if the scene gave energy.
 
-    The scene has no shell, or one that never acts. `progress` is called with the finished runs and their number.
+    The scene has no shell, or one that never acts. `progress` is called with the numbers of finished and of all runs.
     """
     total = _BRAKED + _ADVERSARIES
     least = {"hit and brake": _hit_and_brake(scenario, coupling, seed, lambda done: progress(done, total))}
@@ -406,7 +406,7 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
     Args:
         world: A scenario with a world, or an MJCF file.
         pose: Positions (nq,) of the scene, the name of a keyframe, or None for the initial pose.
-        contacts: For an MJCF file: names of bodies, which slide along x.
+        contacts: For an MJCF file: the bodies that devices touch. The contacts slide along x.
         T: For an MJCF file: the period [s].
 
     Returns:

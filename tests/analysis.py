@@ -74,7 +74,7 @@ class Analysis:
 
 
 def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float]) -> Analysis:
-    """Check whether V satisfies Theorem 4 with this environment. Raises ValueError for one that is not passive.
+    """Check whether V satisfies Theorem 4 with this environment. Raises ValueError if the environment is not passive.
 
     The problem minimises s subject to E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
     Delta_V + s >= 0; the margin is -s.
@@ -117,7 +117,7 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
 
 
 def solve(problem: cp.Problem, solver: str = "CLARABEL") -> float:
-    """Return the optimal value; the variables then have the optimum."""
+    """Solve the problem, which sets its variables, and return the optimal value."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem.solve(solver=solver)

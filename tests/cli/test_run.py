@@ -1,6 +1,6 @@
 """sim.run reports the expected figures, writes its files, and answers bad input with one line and exit code 2.
 
-Expected figures are rounded, and tolerances of figures without a comment allow for this.
+Expected figures are rounded. A tolerance without a comment allows for the rounding.
 """
 
 import json

@@ -32,8 +32,9 @@ def process(F: Lti, limit=np.inf, step=0.0) -> Process:
 
 
 def test_three_ticks_by_hand():
-    """A spring-damper of 1000 N/m and 2 N s/m is behind a spring of 1000 N/m; theta = 1, the limit is 5 N.
+    """A spring-damper of 1000 N/m and 2 N s/m is behind a coupling spring of 1000 N/m; theta = 1, the limit is 5 N.
 
+    The force f_e moves its end to u; the end was at u- one tick before:
     f_e = 1000 u + 2 (u - u-)/T = 3000 u - 2000 u-,  u = x - f_e/1000  =>  f_e = (3000 x - 2000 u-) / 4
         k   x[mm]   u-[mm]   f_e[N]     u[mm]     f[N] = f_e one tick later, within 5 N
         0   4       0        3          1         0
@@ -167,7 +168,7 @@ def test_passivity_layers_count_ticks_of_the_run():
             heard.append(k)
 
     delays = np.zeros((100, 1, 1), dtype=int)
-    delays[:50] = 1  # counted from the block's start, packets would be late
+    delays[:50] = 1  # These delays would act if the block counted its ticks from 0.
     F = wall(1000.0)
     buffer = StepBuffer(Process(Law(F), np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
     buffer.first = 50

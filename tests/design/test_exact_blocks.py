@@ -1,4 +1,4 @@
-"""Tests of the exact blocks and of the search for their proofs, without the sweep that usually runs first.
+"""Test the blocks that must be positive real for each condition, and the search for proofs.
 
 Each family of blocks is built over Fractions at a damping just above and just below a limit. A closed form or a dense
 sweep of formulas in this file gives the limit. Above the limit a proof is found. Below it the same proof is refused
@@ -51,7 +51,7 @@ def assert_limit(block: Callable[[float], Lti], limit: float) -> None:
 
 
 def highest(value: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return the supremum of value(w), (k,) -> (k,), over the circle: search around the best points of a grid."""
+    """Return the supremum of value(w) over w in [0, pi], by searches around the best points of a grid."""
     grid = np.unique(np.concatenate([np.geomspace(1e-4, np.pi, 20_000), np.linspace(1e-4, np.pi, 20_000)]))
     values = value(grid)
     best = float(values.max())
@@ -295,7 +295,7 @@ def test_a_spring_with_latency_needs_the_closed_form(first, last, longest):
 
 @pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
 def test_a_limited_spring_needs_the_computed_damping(theta, c):
-    """The damping d adds [1, 1; 1, 1] d/T to the block, and 0 on inputs (1, -1): a Schur complement gives the limit."""
+    """The damping d adds [1, 1; 1, 1] d/T, which is 0 for the input (1, -1), so a Schur complement gives the limit."""
     K, rho = 1000.0, 20.0
 
     def needed(w):
@@ -303,7 +303,7 @@ def test_a_limited_spring_needs_the_computed_damping(theta, c):
         n = -sum(z**-i for i in range(theta + 1)) - c
         corner = -rho * z ** -(theta + 1) + rho * (z**-theta - (z - 1) * n) / z
         a, b = np.real(K * z**-theta / (z - 1)), (-rho * z ** -(theta + 1) + np.conj(n * K)) / 2
-        both_ways = np.real(corner) - 2 * np.real(b) + a  # on (1, -1)
+        both_ways = np.real(corner) - 2 * np.real(b) + a  # the block's form at the input (1, -1)
         return T * (np.abs(a - b) ** 2 / both_ways - a)
 
     G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
@@ -390,7 +390,7 @@ def test_delay_ranges_are_proved_by_their_block():
     asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
     assert limits[1] > 1.01 * limits[0]
-    assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2 needs no more than a constant delay 1
+    assert limits[0] == pytest.approx(1.5 * K * T)  # alpha = K/2: the damping for a constant delay of 1
     assert_loop_limit(asked, NoCoupling(), "this-environment", limits[1])
 
 
@@ -409,11 +409,11 @@ NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of f
 def test_proofs_serve_only_their_own_condition():
     asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
     here, anywhere = (prove(asked, coupling, condition) for condition in ("this-environment", "any-environment"))
-    assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # so the size does not reveal the exchange
+    assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # The size must not reveal an exchanged P.
     assert forged(asked, coupling, anywhere) is None
     assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
     assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
-    soft = change(asked, environment=to_ground(100.0))  # this changes the block of this-environment
+    soft = change(asked, environment=to_ground(100.0))  # The block for this-environment depends on the spring.
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 

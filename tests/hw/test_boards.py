@@ -1,4 +1,4 @@
-"""Sketches without a host run an exported tick on a simulated ATmega328P and Cortex-M7, as `make firmware` checks."""
+"""Sketches without a host run an exported tick on a simulated ATmega328P and Cortex-M7 (`make firmware`)."""
 
 import re
 import subprocess
@@ -119,7 +119,8 @@ HOME, DUTY = f32(-0.045), f32(255) * PER_RADIAN / f32(0.03)
 def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
     """Run a session under hand(k) [N].
 
-    Return counts, cycles of process and of tick, PWM and its sign per tick, and the last phase and cause.
+    `motor` and `sensor` scale the force and the measured motion; held(k) is the state of the switch. Return the counts,
+    [cycles of the process, cycles of the tick, PWM, sign] of each tick, and the last (phase, cause) or None.
     """
     handle, counts, told = Handle(0.07, 0.5, 1.25e-3), [], []
     with (folder / "said.txt").open("w") as said, Board(folder / "board", folder / "hapkit.elf", 1, said=said) as board:
@@ -138,13 +139,14 @@ def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
 
 
 def swing(k):
-    """Return a slow swing of 3 N from tick 700 on, and 2.2 N more in 30 of 250 ticks: at times above 4.8 N."""
+    """Return the hand's force: from tick 700 on a sine of 3 N, with 2.2 N more in 30 of 250 ticks, to exceed 4.8 N."""
     return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
 
 
 def test_the_hapkit_repeats_the_test_vector(hapkit):
+    """The exit code is 10 plus the number of wrong ticks."""
     folder, _ = hapkit
-    assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10  # 10 + wrong ticks
+    assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10
 
 
 def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):

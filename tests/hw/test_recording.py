@@ -195,7 +195,7 @@ def test_damaged_traces_raise_only_input_errors(trace, tmp_path):
 
 @pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
 def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
-    """Steady ticks end within two ticks of the first cut that the session's counters saw, by cap or by slew rate.
+    """Steady ticks end 0 to 2 ticks after the session first counts a cut by cap or by slew rate.
 
     Trace and counters may differ, since a force that is cut by less than a step is sent unchanged.
     """
@@ -229,7 +229,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
 
     With the certified coupling nothing grows. Only ticks at full gain before the first cut force count.
     """
-    scenario = scenario_of()  # people who begin slowly
+    scenario = scenario_of()  # Here people begin slowly, unlike in the fixture's scenario.
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)

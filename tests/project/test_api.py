@@ -69,7 +69,7 @@ def test_help_and_completion_show_the_api():
 
 
 def test_the_options_are_those_that_the_designs_take():
-    """The options in KINDS are those of DesignOptions and of the designs' signatures."""
+    """The options in KINDS are those of DesignOptions, and the designs take them."""
     from haptic_loop.design import fixed_order as ccl
     from haptic_loop.design import optimal, spring_damper
 
@@ -107,10 +107,10 @@ def test_rehearsed_sessions_finish_with_their_guarantee():
     assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
     designed = design_coupling(scenario.loop("I")).coupling
     np.testing.assert_array_equal(session.coupling.K, designed.K)
-    assert 0.364 - 1e-9 <= session.zero_after <= 0.52  # a ramp of 100 to 250 ms, then 132 ms for each motor
+    assert 0.364 - 1e-9 <= session.zero_after <= 0.52  # a ramp of 100 to 250 ms, then a test of 132 ms for each motor
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
-    assert force[-1] <= 2.5 + 1e-9  # [N] of the last test, after the coupling's forces have ended
+    assert force[-1] <= 2.5 + 1e-9  # [N] The last force is that of the motor test, which follows the coupling.
     given = rehearse(scenario, SOFT, seconds=0.1)
     assert given.coupling is SOFT
     assert given.assessment.requirements["this-environment"].certified

@@ -151,7 +151,7 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
     for printed, found in (("noise\n3 rows in 9 s\n", 0), ("9 rows in 0.2 s\n", 1), ("", 1)):
         monkeypatch.setattr(regenerate, "run", lambda *words, out=printed: SimpleNamespace(stdout=out, returncode=0))
         assert regenerate.check() == found
-    assert "and there is    9 rows in 0.2 s" in capsys.readouterr().out
+    assert "the command prints  9 rows in 0.2 s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

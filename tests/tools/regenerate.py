@@ -1,7 +1,7 @@
 """python tests/tools/regenerate.py: run the commands of README and docs, and write their output where pages ask for it.
 
 `--check` (part of `make validate`) runs only the slow and the measured commands, and compares their output with that on
-the pages (`same_line`). The exit code is 1 if they differ.
+the pages (`same_line`). The exit code is 1 if they differ or if a command fails.
 
     <!-- output: certified|binds -->      lines that match this regular expression; <!-- output --> shows all lines
     ```console
@@ -13,7 +13,8 @@ the pages (`same_line`). The exit code is 1 if they differ.
     $ python -m sim.accuracy
 
 A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
-`<!-- picture: FROM TO -->` copies a picture that a command has drawn. tests/project/test_docs.py compares the rest.
+`<!-- picture: FROM TO -->` copies a picture that a command has drawn. tests/project/test_docs.py compares the output of
+the other commands.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges|zwidth -
 class Step(NamedTuple):
     kind: str  # file | command | python
     text: str
-    name: str = ""  # of the file
+    name: str = ""  # file name of a step of the kind `file`
 
 
 def steps(text: str) -> Iterator[Step]:
@@ -65,7 +66,7 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a documented command, for a width of 100 columns."""
     here = ("examples/", "tests/")
     words = [str(ROOT / w) if w.startswith(here) else w for w in shlex.split(command, comments=True)]
-    shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
+    shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # more threads would only wait
     environment = shared | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     return subprocess.run(
         [sys.executable, *words[1:]], cwd=folder, env=environment, capture_output=True, text=True, check=False
@@ -79,7 +80,7 @@ def kept(output: str, pattern: str | None) -> str:
 
 
 def renewed(text: str, printed: dict[str, str]) -> str:
-    """Return a page with the output `printed` by its commands."""
+    """Return a page with new output; `printed` maps commands to their output."""
 
     def shown(block: re.Match[str]) -> str:
         return block[1] + kept(printed[block[3]], block[2]) if block[3] in printed else block[0]
@@ -98,7 +99,7 @@ _ROUNDING = 1e-6  # smaller errors may be rounding, which depends on the machine
 
 
 def same_line(shown: str, line: str, measured: bool = False) -> bool:
-    """Return whether the words are equal, and the numbers to two units in the last place shown or two thousandths.
+    """Return whether words are equal, and numbers differ by at most 2 units in the last place shown or by 0.2 %.
 
     In measured output times do not count, and errors (`1.2e-05`) may differ by a factor of two or be below 1e-6.
     """
@@ -141,13 +142,15 @@ def check() -> int:
                 for was, now in itertools.zip_longest(shown.splitlines(), fresh, fillvalue=""):
                     if not same_line(was, now, measured):
                         found += 1
-                        print(f"  the page shows  {was}\n  and there is    {now}")
+                        print(f"  the page shows      {was}\n  the command prints  {now}")
     return 1 if found else 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
+    parser.add_argument(
+        "--check", action="store_true", help="run and compare the slow and the measured commands, and write nothing"
+    )
     parser.add_argument(
         "pages", nargs="*", metavar="PAGE", help="pages to renew, by name or path; their measured output stays"
     )
