@@ -229,13 +229,13 @@ class Late:
 
     def __init__(self, world: InWorld, theta: Sequence[int]) -> None:
         self.world = world
-        self._lines = [deque([0.0] * n) for n in theta]
+        self._lines: list[deque[Array | float]] = [deque([0.0] * n) for n in theta]
 
     def send(self, x: Array, force: Array, /) -> None:
         self.world.send(x, force)
         for line, f in zip(self._lines, force, strict=True):
-            line.append(float(f[0]))
-            f[0] = line.popleft()
+            line.append(f.copy())
+            f[:] = line.popleft()
 
     def apply(self, k: int, force: Array, /) -> None:
         self.world.apply(k, force)

@@ -33,6 +33,7 @@ from haptic_loop.sim.world import (
     Claim,
     HandsInWorld,
     InWorld,
+    Late,
     Touched,
     _contacts_of,
     linearise,
@@ -604,3 +605,20 @@ def test_claims_name_a_sweep_without_proof():
     )
     assert "without an exact proof" in swept
     assert "without an exact proof" not in proved
+
+
+def test_a_live_world_delays_every_simulation():
+    """Channel 0 is late by two ticks and channel 1 by none, in each of two simulations."""
+
+    class Ramp:
+        def send(self, x, force):
+            force[...] = x
+
+    late, felt = Late(Ramp(), (2, 0)), []
+    for k in range(5):
+        force = np.zeros((2, 2))
+        late.send(np.array([[1.0, 10.0], [2.0, 20.0]]) * (k + 1), force)
+        felt.append(force)
+    sent = np.arange(1, 6)
+    assert np.array_equal(np.array(felt)[:, 0].T, np.outer([1, 10], [0, 0, 1, 2, 3]))
+    assert np.array_equal(np.array(felt)[:, 1].T, np.outer([2, 20], sent))
