@@ -1,4 +1,4 @@
-"""tests/tools/kernels.py counts what pytest's last line says."""
+"""tests/tools/kernels.py counts what pytest's last line says, and names tests that exist."""
 
 import importlib.util
 from pathlib import Path
@@ -21,3 +21,9 @@ _spec.loader.exec_module(kernels)
 )
 def test_errors_count_as_failures(summary, counts):
     assert kernels.counted(summary) == counts
+
+
+def test_tests_of_rounding_exist():
+    for name in kernels.ROUNDING:
+        file, _, test = name.partition("::")
+        assert f"\ndef {test or 'test_'}" in (kernels.ROOT / file).read_text(), name
