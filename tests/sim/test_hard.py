@@ -99,7 +99,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_certified_loops_may_keep_clipping_with_lossless_hands():
     """From over a fifth of far starts, a loop certified without limits keeps clipping, but never with damped hands."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
@@ -127,7 +127,7 @@ def test_encoder_steps_move_traces_less_than_a_step():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("minutes", [10, pytest.param(60, marks=pytest.mark.validate)])
+@pytest.mark.parametrize("minutes", [3, pytest.param(60, marks=pytest.mark.validate)])
 def test_long_runs_do_not_drift(minutes):
     """Motions of 0.6 Hz repeat every 12500 ticks of 1.2 ms, so the last period equals one after the first minute."""
     loop = assemble(load().replace(tap=None), PUBLISHED["I"])

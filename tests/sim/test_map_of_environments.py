@@ -65,8 +65,8 @@ def densely(sweep, coupling_force, K, B):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
-def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
+@pytest.mark.parametrize(("scenario", "K", "B"), [(PAIR, 1213.2, 2.54), (STAR, 90.0, 0.3)], ids=["pair", "star"])
+def test_the_figures_are_those_of_a_dense_sweep(scenario, K, B, optimal):
     """Ratios agree to 1e-5: a peak of width 0.01 exceeds points 5e-5 apart by at most (2.5e-5/0.01)^2 = 6e-6 of it.
 
     With the slowest pole 0.0015 from 1, a supremum at 0 exceeds the value at 1e-6 rad/sample by a share of 4e-7.
@@ -77,10 +77,9 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     def filtered(z, E):
         return coupling.filter(scenario.T).at(z) @ E
 
-    for K, B in ((90.0, 0.3), (1213.2, 2.54)):
-        found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
-        assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
-        assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
+    found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
+    assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
+    assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
 
 
 def test_a_kept_model_is_the_scenarios_environment():

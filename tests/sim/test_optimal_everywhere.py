@@ -129,7 +129,7 @@ class _Never(Executor):
         return Future()
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS[:2], pytest.param("pair", marks=pytest.mark.slow)])
 def test_the_live_window_equals_the_simulator(files, form):
     scenario, _, path = files[form]
     shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
@@ -141,7 +141,7 @@ def test_the_live_window_equals_the_simulator(files, form):
     np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("form", ["filter", "pair"])
+@pytest.mark.parametrize("form", [pytest.param("filter", marks=pytest.mark.slow), "pair"])
 def test_the_bridge_rehearses_optimal_couplings(files, form):
     scenario, _, path = files[form]
     couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)

@@ -117,7 +117,7 @@ def test_a_budget_acts_on_clipped_forces():
     assert budget.figures().limited_ticks > 100
 
 
-@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+@pytest.mark.parametrize("engine", ["exact", pytest.param("mujoco", marks=pytest.mark.slow)])
 def test_a_budget_that_does_not_act_changes_nothing(engine):
     """With W0 = 0 and from rest the budget does not act on a coupling that is certified with 95 % of the damping."""
     weaker = SHORT.replace(delta=tuple(0.95 * d for d in SHORT.delta)).loop("I")

@@ -121,7 +121,9 @@ def test_without_gravity_energy_rises_within_the_account(name):
         assert risen + kinetic <= START_J + touch.port.released + 1e-9
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("cube", "space") else pytest.mark.slow) for name in NAMES]
+)
 def test_a_packaged_world_runs_and_is_guaranteed(name):
     loop = load(f"world-{name}").replace(duration=0.2)
     design = certified(loop)

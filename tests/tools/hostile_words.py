@@ -137,7 +137,7 @@ def silence() -> Iterator[Case]:
     if not SHORT:
         accuracy = ("accuracy", "--scenario", "s.toml")
         yield Case("accuracy of a feather", accuracy, before=written("s.toml", FEATHER))
-    yield Case("run of a feather", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", FEATHER))
+        yield Case("run of a feather", split("run --scenario s.toml"), (BUT, 0), before=written("s.toml", FEATHER))
 
 
 #: command -> options that are refused
