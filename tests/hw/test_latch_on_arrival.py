@@ -28,7 +28,7 @@ TAU = 130  # [us] delay of an emulated link
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.1])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.validate), 0.1])
 def test_the_last_force_holds_until_the_answer(share):
     """Recompute the trace's positions from its forces, by matrix exponentials before and after each latch.
 
