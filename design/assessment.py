@@ -65,7 +65,7 @@ from haptic_loop.design.result import (
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
-#: A user's function u -> force (m,) [N]; u (m,) [m] are the displacements at the environment if it exerts no force now.
+#: A user's function u -> force (m,) [N]; u (m,) [m] would be the environment's displacements without the present force.
 PluggedEnvironment = Callable[[Array], Array]
 
 
@@ -154,7 +154,7 @@ class SearchFigures:
     violated: bool  # whether the worst environment violates the condition
     ended_early: bool  # whether a limit of time or work ended the search
     ended_by_clock: bool  # whether the user's time limit (--seconds) ended the search
-    how: str = SEARCH
+    how: str = SEARCH  # the places that the search covers, in words
 
     @classmethod
     def of(cls, searched: Searched) -> SearchFigures:
@@ -237,17 +237,17 @@ def _proved_ranges(
 
 
 def violated_between(where: str, place: Member, ratio: float) -> str:
-    """Return the reason why ranges are not guaranteed although they are proved at the vertices `where`."""
+    """Return the reason why ranges are not guaranteed although members are proved; `where` names them in words."""
     needs = f"{ratio:.4f} times the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at {where}, but violated between them: {needs} at {place.name}"
 
 
-_OWN_PROOF = "by a separate proof for this environment"  # part of a printed line
+_OWN_PROOF = "by a separate proof for this environment"  # `ForceLimits.reason` of a limiter from `_by_its_own_block`
 
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """The limiter or the clipping of forces, and the condition that covers it.
+    """The limiter and the condition that covers it, or the clipping of forces.
 
     Attributes:
         rho: (m,) stiffnesses of the limiter [N/m]; None if forces are clipped.
@@ -256,8 +256,8 @@ class ForceLimits:
         c: The multiplier of the condition `limiter`, one row per device, no unit.
         certificate: The proof of the condition `limiter`, or None.
         force_limit: (m,) largest forces [N].
-        less: Whether the limiter is proved in one environment only, while the guarantee covers more.
-        bounded: Whether the limiter is proved only for devices within their guaranteed bounds.
+        less: Whether the limiter is covered in one environment only, while the guarantee covers more.
+        bounded: Whether the limiter is covered only for devices within their guaranteed bounds.
         energy_budget: The start W0 [J] of an energy account of the forces; None without one.
         void: Whether the loop that runs has no guarantee, so that the limiter's proof does not apply to it.
         proof: "rational" if exact arithmetic proves the condition that covers the limiter in this loop, else "sampled".
@@ -276,7 +276,7 @@ class ForceLimits:
     proof: str = "sampled"
 
     def within(self, force_limit: Sequence[float]) -> ForceLimits:
-        """Return the record with other limits (m,) [N]; no proof depends on them."""
+        """Return the record with other force limits (m,) [N]; no proof depends on them."""
         return replace(self, force_limit=tuple(force_limit))
 
     @property
@@ -315,12 +315,12 @@ def _covered_limits(
     known: Certificate | None = None,
     c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
-    """Return the limiter that a certified condition covers, or clipping with the reason.
+    """Return the limiter that a certified condition covers, or clipping and the reason why none is covered.
 
     A condition that covers a limiter without a further proof is preferred. Otherwise this-environment or known-device
-    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop. Otherwise the
-    multipliers `c` are tried, and then others are searched for a limiter of the same beta (LimitedForces). `known` is a
-    certificate that has been verified.
+    is extended to limited forces. The limiter of `proof` is used if the proof holds in this loop. If it does not,
+    multipliers are searched for a limiter of the same beta (LimitedForces). Without a `proof`, this-environment first
+    tries the multipliers `c`. `known` is a certificate that has been verified.
     """
     covering = [each for each in requirements.values() if each.certified and each.lag is not None]
     for each in sorted(covering, key=lambda each: each.proof != "rational"):
@@ -348,7 +348,7 @@ def _by_its_own_block(
     base: str,
     c: Sequence[Sequence[float]] | None = None,
 ) -> ForceLimits:
-    """Return the limiter that the condition `base` covers after its extension, or clipping with the reason."""
+    """Return the limiter that `base`, extended to limited forces, covers, or clipping with the reason."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
@@ -393,7 +393,7 @@ class EncoderSteps:
     encoder_step: tuple[float, ...]  # (m,) [m]
     friction: tuple[float, ...]  # (m,) [N] lower bound per axis, from the declared friction
     friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which decide nothing
-    friction_needed: tuple[float, ...] | None  # (m,) [N]; None with walls, a world or `beyond`: nothing is proved
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None if no friction is proved to suffice
     covered: bool
     words: str
 
@@ -522,19 +522,19 @@ class Assessment:
         loop: The loop for which the conditions were evaluated.
         coupling: The coupling as it runs.
         requirements: Required and available damping (m,) [N s/m] and binding frequency [Hz] of each condition. With
-            delays that switch, that of this-environment is for constant delays, and "switching" is for any delays.
+            delays that switch, "this-environment" is for constant delays, and "switching" for any switching in range.
         environment: The environment that runs: a network, or a plugged-in function.
-        ranges: The results at the vertices of the ranges and of the search between them; None without ranges.
+        ranges: The results at the vertices of the ranges and between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
         transparency: The mismatch; None if it cannot be computed, for example because the environment has no E(z).
         certificate: The exact proof that the caller supplied and that holds, or the proof for the ranges, or None.
         guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold for `holds`; another condition of the package may give the
-            guarantee, but a user's own condition must give it itself, because others leave out its facts.
+        condition: The name of the condition that `holds` requires. Another condition of the package may give the
+            guarantee, unless the required condition is the user's own.
         own: The user's own condition, or None.
-        encoder: Whether friction covers the devices' encoder steps; None without steps, with a shell, or if
-            only a loop was given.
+        encoder: Whether friction covers the devices' encoder steps; None without steps, with a shell, or in the
+            result of `assess`, because a loop has no encoder steps.
     """
 
     loop: Loop
@@ -564,7 +564,7 @@ class Assessment:
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """The loop's properties beyond constant delays, even periods and one linear environment."""
+        """The loop's properties beyond constant delays, equal periods and one linear environment."""
         return _facts_of(self.loop, self.environment, self.force_limits)
 
     @property
@@ -643,15 +643,15 @@ def assess(
         certificate: A stored proof. It counts only if it holds for exactly this loop and coupling; it is verified
             unless this process has made or verified it.
         condition: The name of the condition that must hold, or a user's own condition. The default is this-environment,
-            or known-device if the loop has bounds of its devices. With a user's own, no other condition gives the
+            or known-device if the loop has bounds of its devices. With a user's own condition, no other gives the
             guarantee.
         ranges_seed: Seed of the environments that are drawn from inside the ranges.
         ranges_samples: Number of environments that are drawn.
         searched: A design's search between the vertices for this loop and coupling.
         limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
-        limiter_c: Multipliers of the limiter, one row per device, which a design has found. They are tried first;
-            others are searched only if these certify no limiter.
+        limiter_c: Multipliers of the limiter, one row per device, which a design has found. Without a `limiter_proof`,
+            others are searched only if these certify no limiter; known-device does not use them.
         force_limit: (m,) largest forces [N], for reports; no proof depends on them.
         band_hz: Frequency band [Hz] of the mismatch.
         progress: Called with (points done, number of points) of the search over ranges.
@@ -668,7 +668,7 @@ def assess(
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
     if isinstance(coupling, Design):
         certificate, condition = certificate or coupling.certificate, condition or coupling.asked
-        made = coupling.certificate  # The design's search is of this loop's ranges only if its proof is.
+        made = coupling.certificate  # The design's search is for this loop only if its proof is.
         own_search = coupling.searched if made and made.scenario == digest(loop, coupling.coupling.form()) else None
         searched, limiter_c, coupling = searched or own_search, limiter_c or coupling.c, coupling.coupling
     of_kind("coupling", coupling, Coupling, "a coupling (controller.coupling; NoCoupling() for none), or a Design")
@@ -767,7 +767,7 @@ def shelled(environment: Environment | PluggedEnvironment) -> bool:
 def _facts_of(
     loop: Loop, environment: Environment | PluggedEnvironment | None = None, limits: ForceLimits | None = None
 ) -> tuple[str, ...]:
-    """Return the loop's properties beyond constant delays, even periods and one linear environment, in fixed order."""
+    """Return the loop's properties beyond constant delays, equal periods and one linear environment, in fixed order."""
     network = loop.environment if environment is None or callable(environment) else environment
     plugged = shelled(network if environment is None else environment)
     there = {
@@ -842,7 +842,7 @@ def _over_ranges(assessment: Assessment) -> Guarantee | None:
 
 
 def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:
-    """Return the guarantee of a certified requirement in these environments."""
+    """Return the guarantee that the certified requirement `by` gives in these environments."""
     loop, limits = assessment.loop, assessment.force_limits
     forces = BELOW_LIMITS if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
     proof = by.proof if limits.rho is None or limits.proved else "sampled"
@@ -860,7 +860,7 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """Return (the shell's guarantee or None, the reason); it needs any-environment, psi = 0 and constant delays."""
+    """Return (the shell's guarantee or None, the reason); it needs psi = 0, constant delays and any-environment."""
     loop, needs = assessment.loop, assessment.requirements[(assessment.own or ANY_ENVIRONMENT).name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
@@ -868,7 +868,7 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
         return None, "the shell needs constant delays: its account is not proved for delays that switch"
     if not needs.certified or needs.guarantee != ANY:
         why = f"{needs.condition} holds in {needs.guarantee}" if needs.certified else needs.shortfall
-        return None, f"the coupling is not certified for any environment: {why}"
+        return None, f"the coupling is not certified for every environment: {why}"
     world = not callable(assessment.environment)
     where = "and gravity and springs of the scene released, whatever the scene does" if world else None
     return _account(assessment, where or "whatever computes the force"), None

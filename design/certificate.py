@@ -1,4 +1,4 @@
-"""Judge a coupling (`requirements_of`), prove it over the rationals (`prove`), check a stored proof (`verify`)."""
+"""Judge a coupling by conditions (`requirements_of`), prove a condition exactly (`prove`), check a proof (`verify`)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.result import NotProved, Requirement, refusal, switching_guarantee
 
-#: Allowed error of figures on file, relative to the largest available damping or to the margin. Sweeps agree to 1e-9.
+#: Allowed error of stored figures, relative to the largest available damping or the margin. Sweeps repeat to 1e-9.
 _CLAIM_TOLERANCE = 1e-6
 
 
@@ -62,9 +62,9 @@ def _in_time() -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The proof shows that static matrices are symmetric, and positive semidefinite where required, and that each block of
-# the condition at the available damping is strictly positive real (design.exact). This implies that F, or V-hat, is
-# stable. For any-environment with psi = 0, Phi = 0 satisfies Lemma 4, because the environment is passive.
+# The proof shows that a demand's static matrices are symmetric, and positive semidefinite where required, and that
+# each block of the condition at the available damping is strictly positive real (design.exact). This implies that F, or
+# V-hat, is stable. For any-environment with psi = 0, Phi = 0 satisfies Lemma 4, because the environment is passive.
 # With ranges, a condition that uses the environment is proved for the nominal environment (matrix P) and for at most
 # 128 vertices (P1, P2, ..). Environments between the vertices, or environments that change with time, have no proof.
 
@@ -135,7 +135,7 @@ def _proof(
     """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
-    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep omits multipliers.
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # A quick sweep may omit them.
     requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)
@@ -205,7 +205,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     except SingularLoop:
         return  # The sweep reports the singular loop.
     members = len(condition.members(loop))
-    # Conditions for any environment have no members and add the delays to the size of their own maps.
+    # Conditions for any environment have no members and check the size of their blocks themselves.
     states += sum(loop.theta) if members else 0
     budgets.require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
@@ -266,7 +266,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 
 def covered(loop: Loop, claim: Certificate) -> Iterator[str]:
     """Yield what a certificate covers in words: switching delays, periods, latencies, and devices within bounds."""
-    known = "q_below" in claim.multipliers  # also for a user's condition that is derived from KnownDevice
+    known = "q_below" in claim.multipliers  # true for KnownDevice and for a user's subclasses of it
     if loop.varying_delay:
         yield switching_guarantee(loop.varying_delay)
     if loop.T_max or (known and loop.T_min):
@@ -292,9 +292,9 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
 
 
 def condition_of(certificate: Certificate, condition: Condition | None = None) -> Condition:
-    """Return the condition that a certificate proves. Raises ValueError for an unknown name or wrong multipliers.
+    """Return the condition that a certificate proves. Raises ValueError if the name or the limiter is wrong.
 
-    A certificate of a user's own condition needs this `condition`.
+    For a certificate of a user's own condition, `condition` must be that condition.
     """
     base = named(condition or certificate.condition)
     if not certificate.limiter:
@@ -316,8 +316,8 @@ def condition_of(certificate: Certificate, condition: Condition | None = None) -
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     """Check the stored certificate's digest, seal and figures, and repeat the exact proof with its matrices.
 
-    A certificate of a user's own condition needs this `condition`. Its block is proved again; that the block keeps the
-    loop safe is the claim of the condition's author.
+    For a certificate of a user's own condition, `condition` must be that condition. Its block is proved again, but that
+    the block keeps the loop safe is the claim of its author.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -333,7 +333,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         resolved = condition_of(certificate, condition)
         with _in_time():
             _check(loop, coupling, resolved, certificate)
-    except ValueError as refused:  # raised by a proof or by a user's own condition
+    except ValueError as refused:  # NotProved, or an error of `condition_of` or of a user's own condition
         return Verdict(False, str(refused))
     if is_ours(resolved):
         _made.add(certificate.seal)
@@ -376,9 +376,9 @@ def _check_part(
     claim: Certificate,
     matrices: Mapping[str, Rows] | None,
 ) -> Requirement:
-    """Return the requirement with the multipliers on file, and prove it with `matrices` unless they are None.
+    """Return the requirement with the multipliers of `claim`, and prove it with `matrices` unless they are None.
 
-    Raises NotProved if the figures differ from those on file, or the matrices are no proof.
+    Raises NotProved if the figures differ from those of `claim`, or the matrices are no proof.
     """
     _require_limits(loop, coupling, condition)
     multiplier = on_file(condition, loop, claim.multipliers)
@@ -400,7 +400,7 @@ def _check_part(
 
 
 def _other_figures(claim: Certificate, needed: Requirement) -> str | None:
-    """Return a message if the figures on file differ from those of the sweep, or None."""
+    """Return a message if the damping or margin in `claim` differs from that of the sweep, or None."""
     required, allowed = needed.required, _CLAIM_TOLERANCE * max(needed.available)
     if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=0, atol=allowed):
         return f"required is {list(claim.required)}, the sweep finds {list(required)}"
@@ -414,7 +414,10 @@ def _margin(requirement: Requirement) -> float:
 
 
 def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
-    """Return the `stored` multipliers in one sequence, or None if there are none. Raises NotProved for wrong ones."""
+    """Return the `stored` multipliers without the condition's parameters, or None if the condition has no multipliers.
+
+    Raises NotProved unless names and lengths are those of the condition.
+    """
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
     if {name: len(values) for name, values in stored.items()} != expected:

@@ -485,7 +485,7 @@ class Resonant(Environment):
 
 
 def test_active_environments_get_no_any_environment_guarantee():
-    """A narrow active resonance is not certified for any environment; a passive resonance of the same width is."""
+    """A narrow active resonance is not certified for every environment; a passive resonance of the same width is."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):
         loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), Resonant(size, angle))

@@ -301,7 +301,7 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
     loop = load("world-peg").replace(duration=0.05)
     stiff = simulate(loop, SpringDamper([50000.0, 50000.0], [0.0, 0.0]), engine="exact")
     assert not stiff.meta["guaranteed"]
-    assert stiff.meta["guarantee"].startswith("No guarantee: the coupling is not certified for any environment")
+    assert stiff.meta["guarantee"].startswith("No guarantee: the coupling is not certified for every environment")
     coarse = loop.replace(
         device=[{**d, "encoder_step": 1e-5} for d in [{"kind": "rigid", "mass": 0.25, "damping": 1.37}] * 2]
     )
@@ -501,7 +501,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     store(linear.loop("I"), design, tmp_path / "design.json")
     for coupling in (design, tmp_path / "design.json"):
         said = simulate(loop.replace(duration=0.05), coupling).meta["guarantee"]
-        assert said.startswith("No guarantee: the coupling is not certified for any environment: needs ")
+        assert said.startswith("No guarantee: the coupling is not certified for every environment: needs ")
         assert said.endswith(where)
     monkeypatch.setattr("haptic_loop.cli.world.least_at_port", lambda *given: {})
     words = ("--scenario", str(tmp_path / "loop.toml"), "--coupling", str(tmp_path / "design.json"))
