@@ -81,12 +81,11 @@ def test_an_energy_account_covers_no_latency():
 
 @pytest.mark.slow
 def test_the_limiter_is_judged_with_switching_delays():
-    """The limiter needs 0.70 of the damping with constant delays, 1.04 if they switch, also for a given environment."""
+    """The limiter needs 0.70 of the damping with constant delays, and 1.04 if they switch, for a given environment."""
     loop, coupling = load().loop("I").switching(DelayRange((1, 2), (2, 3))), SpringDamper((970.0, 970.0), (0.4, 0.4))
-    for runs in ({}, {"environment": loop.environment}):
-        limits = assess(loop, coupling, **runs).force_limits
-        assert limits.rho is None
-        assert limits.requirement.ratio > 1
+    limits = assess(loop, coupling, environment=loop.environment).force_limits
+    assert limits.rho is None
+    assert limits.requirement.ratio > 1
 
 
 def test_another_coupling_does_not_inherit_a_certificate():
@@ -368,11 +367,14 @@ def test_guarantees_name_the_environment_that_runs():
 
 SPRING = Network(("tip",), (Spring(("tip", GROUND), 500.0),))
 ALONE = Loop(1.2e-3, (1,), (0,), (0,), (1.37,), SPRING)
+FEW_TRIALS = ("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)  # of a search between vertices
 
 
 @pytest.mark.slow
-def test_a_search_of_other_ranges_is_repeated():
+def test_a_search_of_other_ranges_is_repeated(monkeypatch):
     """Alone a spring k needs 3/2 k T: 0.66 of the damping for 505 N/m (1 % more), 0.92 for 700 N/m (40 % more)."""
+    for name, few in FEW_TRIALS:
+        monkeypatch.setattr(budgets, name, few)
     narrow, wide = (change(ALONE, ranges=ranges_around(SPRING, percent)) for percent in (1.0, 40.0))
     needs, searched = THIS_ENVIRONMENT.required(narrow, NoCoupling()), search_ranges(narrow, NoCoupling())
     proof = prove(narrow, NoCoupling(), THIS_ENVIRONMENT)
@@ -384,7 +386,7 @@ def test_a_search_of_other_ranges_is_repeated():
 
 def test_a_search_of_another_condition_is_repeated(monkeypatch):
     """Known-device judges these ranges, but the search that is passed in was for this-environment."""
-    for name, few in (("RANGE_ALONG", (2, 2)), ("RANGE_DRAWN", 0), ("RANGE_STARTS", 1)):
+    for name, few in FEW_TRIALS:
         monkeypatch.setattr(budgets, name, few)
     bounds = (DeviceBounds(0.06, 14500.0, 0.5, 0.5),)
     loop = change(ALONE, ranges=ranges_around(SPRING, 10.0), known_devices=bounds)

@@ -134,7 +134,7 @@ def test_the_stiffest_gains_respect_full_levels():
     assert "no multiple of K" in beyond.reason
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_stiffest_axes_of_late_devices_hold_together():
     """The stiffest K of the two axes are certified together, not only axis by axis."""
     plane = Network(("a.x", "a.y"), (Spring(("a.x", GROUND), 300.0), Spring(("a.y", GROUND), 200.0)))
@@ -307,10 +307,8 @@ def test_edges_of_smooth_ratios_take_few_sweeps(ratio, inverse, inside, outside)
 @pytest.mark.parametrize(
     ("argv", "code", "required"),
     [
-        (["--rigid", "--K", "5000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1.37"], 1, 2.5),
         (["--rigid", "--K", "2000", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "3.1"], 0, 3.0),
         (["--device", "omega.3"], 1, 32.5),
-        (["--device", "omega.3", "--B", "0"], 1, 2.5),
         (["--device", "omega.3", "--B", "0", "--K", "2000", "--rigid", "--T", "1e-3", "--theta", "0"], 0, 1.0),
         (["--device", "falcon", "--delta", "0.5"], 1, 21.5),
         (["--device", "omega", "--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
@@ -450,7 +448,7 @@ def test_the_catalogue_has_a_source_for_every_number(run):
     assert "unknown" in err
 
 
-@pytest.mark.parametrize("B", [0.0, 0.37])
+@pytest.mark.parametrize("B", [pytest.param(0.0, marks=pytest.mark.validate), 0.37])
 def test_a_rigid_audit_names_the_stiffest_wall(run, B):
     """Without delay a wall behind K and B needs K T/2 + B (Colgate and Schenkel)."""
     _, out, _ = run(*f"--rigid --K 5000 --B {B} --T 1e-3 --theta 0 --delta 1.37".split())

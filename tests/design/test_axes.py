@@ -234,6 +234,7 @@ def test_any_environment_with_switching_takes_levels() -> None:
     assert left(needs.ratio * (1 - 1e-4)) < 0
 
 
+@pytest.mark.slow
 def test_any_environment_with_psi_takes_full_levels() -> None:
     """At the requirement s, E-hat + Phi is passive and V-hat has the level (Phi^-1 - s^-1 Delta^-1)^-1 (theory.md)."""
     soft = Plane(4, MASS.matrices[0], MASS.matrices[1], 0.25 * SPRINGS)
@@ -467,7 +468,7 @@ def test_known_devices_take_full_levels(loop: Loop) -> None:
     assert least(needs.ratio * (1 - 1e-3)) < 0
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_known_devices_permit_stiffer_moving_averages() -> None:
     loop = ONE_KNOWN
     known, every = (design_by_kind(loop, "moving-average", name) for name in ("known-device-any", "any-environment"))

@@ -46,7 +46,7 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
     return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
-@pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
+@pytest.mark.parametrize("psi", [pytest.param((1, 1), marks=pytest.mark.validate), (1, 0)])
 def test_loops_with_psi_are_proved_with_phi(psi):
     """With psi = 1 in a channel, Theorem 4 needs a large enough Phi and guarantees this environment only."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
@@ -508,6 +508,7 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
         design_certificate._blocks(loop, coupling, THIS_ENVIRONMENT, [1.0] * 4)
 
 
+@pytest.mark.slow
 def test_a_loop_with_a_long_delay_is_stored(tmp_path):
     """A delay of 101 samples, one more than an audit allows, is proved with 110 states, saved, loaded and verified."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))

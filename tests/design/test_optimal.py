@@ -397,11 +397,12 @@ def test_designs_keep_their_objective_and_their_cap():
     assert capped.figures.rms_mismatch > rms.figures.rms_mismatch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("further", "asked"),
     [
         ({"high_gain": 1.2, "limiter": True}, {"T_max": 0.0015}),
-        pytest.param({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}, marks=pytest.mark.slow),
+        ({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}),
         pytest.param({"objective": "sup", "limiter": True}, {}, marks=pytest.mark.validate),
         pytest.param({"objective": "sup", "high_gain": 1.2}, {}, marks=pytest.mark.validate),
         pytest.param({"objective": "sup"}, {"varying_delay": DelayRange((4,), (6,))}, marks=pytest.mark.validate),
@@ -593,7 +594,7 @@ def test_a_bound_on_one_unknown_adds_one_derivative():
     np.testing.assert_allclose(hessian, np.diag([0, 1 / 16, 0]), rtol=1e-15, atol=0)
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_entrywise_program_equals_dense_for_three_devices(monkeypatch):
     loop = loop_of("n5")
     case = program.Case(loop, loop.E(), (program.this_environment(loop),))

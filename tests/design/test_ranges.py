@@ -24,7 +24,7 @@ from haptic_loop.design import optimal
 from haptic_loop.design.assessment import assess, check_ranges
 from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import prove, required_damping, verify
-from haptic_loop.design.coupling_file import Stored, digest, load, sealed
+from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
@@ -352,7 +352,7 @@ def test_files_without_ranges_keep_their_digest():
 
 
 @pytest.mark.slow
-def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeypatch):
+def test_designs_checks_and_runs_report_the_ranges(scenario_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(BoundBeside, "of", lambda *arguments: BoundBeside(reason="not computed"))
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     common = ["--scenario", str(scenario_file), "--json", str(report)]
@@ -387,13 +387,25 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys, monkeyp
         "--engine",
         "exact",
         "--duration",
-        "1",
+        "0.2",
         "--no-plot",
     ]
     code, run = told(run_main, *at_vertex, *out)
     assert (code, safe_with(run)) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert not np.load(tmp_path / "out" / "trace.npz")["f"].any()  # The device touches nothing at this vertex.
+
+
+@pytest.mark.validate
+def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path, capsys):
+    save(stored, tmp_path / "c.json")
+    file, report = tmp_path / "c.json", tmp_path / "r.json"
+    out = ["--scenario", str(scenario_file), "--json", str(report), "--out", str(tmp_path / "out")]
+
+    def told(main, *options) -> tuple[int, dict]:
+        code = main([*options])
+        capsys.readouterr()
+        return code, json.loads(report.read_text())
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
     assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, "these ranges", True)

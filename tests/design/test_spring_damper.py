@@ -148,7 +148,7 @@ def gains_of_least(cost, theta, sigma):
     ("theta", "sigma", "most_stored"),
     [
         *((0, np.inf, 1000), (7, 3.0, 1000), (7, 3.0, 0)),
-        *(pytest.param(12, np.inf, stored, marks=pytest.mark.slow) for stored in (1000, 0)),
+        *(pytest.param(12, np.inf, stored, marks=pytest.mark.validate) for stored in (1000, 0)),
     ],
 )
 def test_the_gain_set_is_exact(theta, sigma, most_stored):
