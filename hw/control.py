@@ -321,8 +321,7 @@ class Drive:
         ]
         self._clock_us = 0  # the device's clock at the last STATE
         self.world = self.controller if isinstance(self.controller, WorldController) else None
-        self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
-        self._test_plan = arming.test_plan
+        self._counters, self._record, self._arming = counters, record, arming
         # With several boards, each board has its own monitor (hw/boards.py).
         self._commands = None if settings.behind else monitor.CommandMonitor(config)
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
@@ -357,7 +356,7 @@ class Drive:
             self._heat.check(self.units.forces(state.applied), ticks)
         for k, between in enumerate(positions[:-1], start=1 - ticks):  # ticks without a STATE
             tick, wanted = (state.tick + k) & 0xFFFF, self.controller.step(between)
-            self._record(TraceRow(tick, between, wanted, self.gain, (), None, self._arming))
+            self._record(TraceRow(tick, between, wanted, self.gain, (), None, self._arming.number))
         wanted = self.controller.step(x)
         test = None
         if direction > 0:
@@ -372,8 +371,8 @@ class Drive:
             self.ended = self.gain == 0 and test is None
         shaped = self.limits.shape(wanted, self.force, self.gain, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
-        if self._budget:
-            limited = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
+        if budget := self._arming.budget:
+            limited = budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
             if limited != steps:
                 force, steps = self.units.forces(limited), limited
                 self._counters.limited += 1
@@ -384,7 +383,7 @@ class Drive:
         self._counters.slowed += shaped.slowed
         if self._commands:
             self._commands.tell(state.tick, steps)
-        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming, test))
+        self._record(TraceRow(state.tick, x, wanted, self.gain, steps, state, self._arming.number, test))
         return steps
 
     def _through_shell(
@@ -398,7 +397,7 @@ class Drive:
         test: tuple[float, ...] | None,
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
         """Return force (m,) [N] and steps within a world's energy accounts. A test force replaces the scene's force."""
-        nothing, plan = (0,) * len(steps), self._test_plan
+        nothing, plan = (0,) * len(steps), self._arming.test_plan
         pushes = plan is not None and test is not None and any(test)
         allowed = world.limit(nothing if pushes else steps, self.units.force_step)
         sent = world.later(allowed, ticks)
