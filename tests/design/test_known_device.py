@@ -72,7 +72,7 @@ def known_device_block(F, cost, beta):
 
 
 def known_device_any_block(V, theta, cost, beta):
-    """Return V(1) and the block on (dx, v, df_e)."""
+    """Return V(1) and the block of known-device-any on (dx, v, df_e)."""
     made = compose_any(V, loop_of(V.T, (1.0,) * V.inputs, theta), hands=KnownMotor(cost, beta))
     return made.static["V(1)"], made.free
 
@@ -95,7 +95,8 @@ def test_constants_of_a_period_match_separate_figures():
     cost = period_cost(one(1.2e-3, 1.37), 1.0, np.array([3e-5]))
     c0, c2, q, T = 1.2753875, 1.7998875e-6, 1.1073999408e-3, 1.2e-3
     expected = c0 / (T - q), c0 * q / (T - q), c0 * q * T / (T - q), c2 / q
-    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)  # the digits of q fix T - q to 5e-10
+    # The digits of q leave a relative error of 5e-10 in T - q.
+    assert [part[0] for part in cost] == pytest.approx(expected, rel=1e-6)
     own, first, last = cost.move[0], cost.mean[0] / 4 + cost.step[0], cost.mean[0] / 4 - cost.step[0]
     assert (own, -cost.cross[0] / 2) == pytest.approx((1.37730743e4, -7.62615086), rel=1e-8)
     assert (first, last) == pytest.approx((6.20101795e-3, 2.95036309e-3), rel=1e-8)
@@ -131,14 +132,14 @@ def test_damped_walls_need_the_known_damping(K, B, theta, T, present, required):
 
 
 def test_a_bare_spring_gains_nothing():
-    """The motor alone oscillates on a spring without damper as soon as delta < K T/2."""
+    """The motor alone oscillates on a spring without damper as soon as delta < K T/2, so no beta suffices below it."""
     found = sweep_of(wall(1000.0, 0.0, 0, 1e-3), one(1e-3, 1.0)).best(0.4999)
     assert found.share == np.inf
 
 
 @pytest.mark.parametrize(("theta", "known", "present"), [(0, 5913.6, 2283.3), (1, 1887.4, 1141.7), (2, 1029.7, 761.1)])
 def test_chi_gives_the_stiffest_linear_coupling(theta, known, present):
-    """V(1) is twice the mean of `chi_by_hand` over the circle; for beta -> 0 this mean is n T/(4 delta)."""
+    """The stiffest coupling has V(1) = 2 mean(chi) over the circle, or (theta + 1) T/(2 delta) for beta -> 0."""
     z = np.exp(2j * np.pi * (np.arange(512) + 0.5) / 512)
     loop, top = one(1.2e-3, 1.37, theta), 2 * np.sqrt(1.37 * 0.5) / 14500
 
@@ -147,7 +148,7 @@ def test_chi_gives_the_stiffest_linear_coupling(theta, known, present):
 
     best = minimize_scalar(lambda share: -stiffness(share * top), bounds=(0.3, 0.9999), method="bounded")
     assert -best.fun == pytest.approx(known, abs=0.06)
-    assert stiffness(1e-9 * top) == pytest.approx(present, rel=1e-3)  # beta > 0 leaves 7e-5
+    assert stiffness(1e-9 * top) == pytest.approx(present, rel=1e-3)  # beta > 0 leaves a relative error of 7e-5
 
 
 def chi_by_hand(z, n, loop, beta):
@@ -168,7 +169,7 @@ def cost_by_hand(z, loop, beta):
     c0, c2 = loop.delta[0] - beta**2 * P / 4, beta * m - beta**2 * b / 4
     rate = np.sqrt(c0 / c2)
     q = 2 / rate * np.tanh(rate * T / 2)
-    mean, step = (1 + z) / 2, z - 1  # v times these is vb = (v + v+)/2 and v+ - v
+    mean, step = (1 + z) / 2, z - 1  # mean v = (v + v+)/2 = vb, step v = v+ - v
     rows = [(np.sqrt(c0 * q), 0, mean), (np.sqrt(c0 / (T - q)), 1, -q * mean), (np.sqrt(c2 / q), 0, step)]
     Lam = sum(
         scale**2 * np.array([[d * d * np.ones_like(z), d * v], [d * np.conj(v), np.abs(v) ** 2]])
@@ -178,7 +179,7 @@ def cost_by_hand(z, loop, beta):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Each step of the proof, checked with separate computations.
+# Steps of the proof, checked with separate computations.
 
 
 def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
@@ -199,7 +200,7 @@ def discretised_cost(c0, c2, T, dx, v0, v1, n=2000):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_discretised_costs_lie_just_above_the_least(seed):
-    """The least cost for v in 600 linear pieces is above the least cost, by less than 1e-4 of it."""
+    """With v in 600 linear pieces the least cost is larger than with any v, but by less than 1e-4."""
     rng = np.random.default_rng(seed)
     T, beta = 1e-3, 5e-5 * rng.uniform(0.1, 0.9)
     loop = one(T, 1.3)
@@ -235,9 +236,9 @@ def test_the_cost_is_concave_in_damping_and_beta():
 
 @pytest.mark.slow
 def test_tangents_bound_a_sweep_over_beta():
-    """Though the first tangents are at the share 3, six bounds are below a sweep's least share, the last within 10 %.
+    """Six bounds are at most the least share of sweeps over beta, and the last bound is within 10 % of it.
 
-    Here c2 > 0 limits beta.
+    The first tangents touch at share 3 of the damping. Here c2 > 0 limits beta.
     """
     T, high = 1e-3, 3.0
     loop = one(T, 2.09, 1, DeviceBounds(0.0324, 11550.0, 9.73, 207.0))
@@ -253,7 +254,7 @@ def test_tangents_bound_a_sweep_over_beta():
     assert x[-1] > 0.9 * least
 
 
-def test_a_ranges_cost_bounds_each_periods_cost():
+def test_varying_periods_cost_is_a_lower_bound():
     rng = np.random.default_rng(3)
     loop = one(1e-3, 1.3, T_max=1.4e-3, T_min=0.7e-3)
     for _ in range(20):
@@ -296,11 +297,11 @@ def rubbing_motor(rng, promised, delta, beta, ticks, T, mass=None):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_held_forces_supply_the_least_cost(seed):
-    """The inequality of step 4 holds from rest for hands with friction, a clutch and a stiffening spring."""
+def test_held_forces_supply_the_cost_and_storage(seed):
+    """The inequality of step 4 holds from rest for motors and hands with friction and a stiffening spring."""
     rng = np.random.default_rng(seed)
     sides = rubbing_motor(rng, DEVICE, 1.3, 5e-5 * rng.uniform(0.2, 0.9), 60, 1e-3)
-    assert (sides[:, 0] >= sides[:, 1] - 1e-7 * np.abs(sides[:, 0]).max()).all()  # 60 ticks with rtol = 1e-9
+    assert (sides[:, 0] >= sides[:, 1] - 1e-7 * np.abs(sides[:, 0]).max()).all()  # errors of 60 ticks with rtol = 1e-9
 
 
 def test_a_lighter_motor_breaks_the_inequality():
@@ -394,7 +395,7 @@ def radii(F: Lti, loop: Loop, delta: float, ladders: np.ndarray) -> np.ndarray:
             K[:, 2 + j, 2 + j] += ladders[:, j, 1]
             K[:, 1 + j, 2 + j] -= ladders[:, j, 1]
             K[:, 2 + j, 1 + j] -= ladders[:, j, 1]
-    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # unit of speeds
+    fast = np.sqrt((K[:, range(size), range(size)] / mass).max(axis=1))[:, None, None]  # speeds are divided by it [1/s]
     G = np.zeros((n, 2 * size + 1, 2 * size + 1))
     G[:, :size, size:-1] = fast * np.eye(size)
     G[:, size:-1, :size], G[:, size:-1, size:-1] = -K / mass[..., None] / fast, -D / mass[..., None]
@@ -457,7 +458,7 @@ def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Changes that the guarantee permits, and limit cases.
+# The limit of small beta, and periods that vary.
 
 
 def required(F, loop, high=30.0) -> float:
@@ -474,7 +475,7 @@ def test_a_small_beta_gives_this_environment():
 
 
 def test_uneven_periods_need_more_damping():
-    """At three beta; if the shortest and the longest period equal T, the requirement is that of even periods."""
+    """For each of three beta a range of periods requires more than the period T, and the range [T, T] as much."""
     F, beta = wall(800.0, 0.6, 1, 1e-3), np.array([1e-5, 2e-5, 3e-5])
     even, same, wide = (
         [sweep_of(F, one(1e-3, 1.0, 1, **periods)).required(np.array([b]), 5.0)[0] for b in beta]
@@ -528,7 +529,7 @@ def test_the_paper_loop_is_proved_exactly():
 @pytest.mark.validate
 @ONE_OR_PAIR
 def test_the_block_is_singular_at_the_requirement(loop, coupling):
-    """The least eigenvalue of the block vanishes at the required damping, for this and for any environment."""
+    """The block's least eigenvalue changes sign within 0.2 % of the requirement, for this and any environment."""
     V, F = coupling.compliance(loop.T), loop.F(coupling)
     forms = [
         (sweep_of(F, loop), lambda cost, beta: known_device_block(F, cost, beta)),
@@ -662,7 +663,7 @@ def test_impossible_bounds_are_refused_in_one_line(fields, said):
 
 
 def test_the_sampled_conditions_slope_equals_differences():
-    """The slope in the gains equals central differences. That in beta is itself taken from differences."""
+    """The slope in the gains equals central differences. The code takes the slope in beta from differences."""
     sampled = KnownDeviceLoop(KNOWN)
     x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
     steps = 1e-6 * np.eye(x.size)[:4]
@@ -758,7 +759,7 @@ def test_no_coupling_is_optimal_where_it_is_certified():
 
 
 @pytest.mark.validate
-def test_spring_dampers_before_walls_use_the_device():
+def test_spring_dampers_before_walls_use_known_devices():
     loop = on_a_wall(3000.0, 2.0, 1, 2.0)
     assert design_coupling(loop).condition == "known-device-any"
     plain = design_coupling(loop, "spring-damper", "this-environment")
@@ -844,7 +845,7 @@ def needs_by_hand(room, loop, near):
     return brentq(most, near / 2, 2 * near, rtol=1e-5)
 
 
-#: Relative error of `needs_by_hand`: its beta is 1e-4 of the largest from the best, its grids miss 1e-5 of a peak.
+#: Relative error of `needs_by_hand`: its beta may miss the best by 1e-4 of the largest, its grids a peak by 1e-5.
 SETTLED = 3e-4
 
 
@@ -857,7 +858,7 @@ SETTLED = 3e-4
     ],
 )
 def test_any_environment_requirements_are_those_of_chi(K, B, theta):
-    """He[V/(1-z)] >= chi at every frequency; the best beta and the least damping come from a dense sweep."""
+    """The requirement is the least damping for which some beta gives He[V/(1-z)] >= chi on a dense grid."""
     loop, z = one(1e-3, 1.0, theta), np.exp(1j * np.linspace(2e-3, np.pi, 600))
     have = (1 / (K + B * (1 - 1 / z) / loop.T) / (1 - z)).real
 
@@ -890,7 +891,7 @@ def test_no_lossless_hand_and_environment_grow_together(theta):
 
 @pytest.mark.slow
 def test_no_lossless_hand_grows_under_varying_periods():
-    """At 1.01 of the requirement for T_min to T_max no product of steps of random periods grows, for 200 hands."""
+    """For 200 hands no product of steps with random periods in [T_min, T_max] grows at 1.01 of the requirement."""
     K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
     loop, F = one(T, 1.0, theta, T_max=high, T_min=low), wall(K, B, theta, T)
     needed = required(F, loop, this_environment(F, loop.delta, T_max=high).ratio)
@@ -975,9 +976,9 @@ def bounded_needs():
 
 
 def test_unequal_bounds_need_what_a_dense_sweep_needs():
-    """At the requirement some beta makes `block_by_hand` positive.
+    """The requirement is the least damping at which some beta makes `block_by_hand` positive.
 
-    P is computed with the least damping of the transmission, c2 with the largest.
+    P_t is computed with the least damping of the transmission, c2 with the largest.
     """
     loop, z = one(1e-3, 1.0, 1, BOUNDS), np.exp(1j * np.linspace(2e-3, np.pi, 600))
     contact = contact_by_hand(z, loop.T, stiffness=800.0, damping=0.6)
@@ -1115,7 +1116,7 @@ def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, p
 
 @pytest.mark.slow
 def test_hands_that_never_leave_walls_need_less_damping():
-    """A hand that never leaves the wall feels a spring-damper; at 0.9 of its need some lossless hand grows."""
+    """Permanent contact is with a spring-damper, which needs less; at 0.9 of this need some lossless hand grows."""
     loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
     left = left_over(loop, NoCoupling(), required_damping(loop, NoCoupling(), "known-device"))
     assert left.attained
@@ -1201,7 +1202,7 @@ def test_no_hand_gains_energy_from_limited_forces(name):
 
 
 def test_the_block_is_the_energy_of_limited_periods():
-    """The block's supply over a motion between rests equals sum f'(dx + beta dv) + sum L - sum (M f_e)'de."""
+    """The block's supply over a motion from rest to rest equals sum f'(dx + beta dv) + sum L - sum (M f_e)'de."""
     rng, N, active, T, K, B = np.random.default_rng(6), 300, 40, 1e-3, 900.0, 0.7
     loop, beta, c = one(T, 1.3, 1), np.array([3e-5]), 0.4
     G = taps([K + B / T, -B / T], T)
@@ -1224,7 +1225,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     c0, c2 = 1.3 - beta[0] ** 2 * 14500**2 / 2, beta[0] * 0.06 - beta[0] ** 2 * 0.5 / 4
     # In 300 pieces the costs are too large, by 1e-5 of the whole sum.
     cost_of = [discretised_cost(c0, c2, T, dx[k], v[k], after[k], 300) for k in range(active + 1)]
-    M = fe[1 : N + 1] + c * (fe[1 : N + 1] - fe[:N])  # M f_e with M = z + c_1 (z - 1)
+    M = fe[1 : N + 1] + c * (fe[1 : N + 1] - fe[:N])  # M f_e with M = z + c (z - 1)
     assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
 
 
@@ -1275,7 +1276,7 @@ def together_needs(name):
     ],
 )
 def test_facts_on_known_devices_are_proved_from_files(name):
-    """The proof needs less damping than that of unknown devices; a file without a multiplier is refused."""
+    """The proof needs less damping than one without known devices; a file that lacks a multiplier is refused."""
     loop, condition = TOGETHER[name]
     needs = together_needs(name)
     assert needs < 0.8 * condition.plain.required(loop, COUPLING).required[0]
@@ -1303,7 +1304,7 @@ def test_a_search_weighs_axes_by_their_damping():
         1e-3, (0, 0), (0, 0), (0, 0), delta, network, varying_delay=span, known_devices=(DEVICE,) * 2, axes=(2,)
     )
     search = _Search(KNOWN_DEVICE.sweep(loop, SpringDamper([800.0, 600.0], [0.5, 0.5])), 5.0)
-    x = np.array([1e-3, 0.7, 5.0])  # beta [s], 1/alpha in its unit, share of the damping
+    x = np.array([1e-3, 0.7, 5.0])  # beta [s], 1/alpha in the search's unit, share of the damping
     (alpha,), z = search.values(x), search.sampled[0][0]
     speed = np.diagonal(search.idle(z, search.sampled[0][1], x), axis1=1, axis2=2)[:, 2:4]
     expected = -alpha / 2 * np.array(delta) / 1.25 * (1e-3 * np.abs(z - 1)[:, None]) ** 2
@@ -1315,7 +1316,7 @@ def test_a_search_weighs_axes_by_their_damping():
     "name",
     ["switching", *(pytest.param(n, marks=pytest.mark.validate) for n in ("limiter-switching", "walls-switching"))],
 )
-def test_no_hand_gains_energy_from_ages_of_forces(name):
+def test_no_hand_gains_energy_from_switching_delays(name):
     """With the worst age of the force at every tick no hand gains energy at 1.01 of the need; at 0.1 some do."""
     loop, condition = TOGETHER[name]
     bound = {"limit": [1.0], "rho": [RHO]} if condition is LIMITED else {}

@@ -1,4 +1,4 @@
-"""The live loop runs without a window; the tests supply the clock, the keys and the mouse.
+"""Test the live loop of sim/view without a window; the tests supply the clock, the keys and the mouse.
 
 A frame is what the window shows at one time. Tolerances without a comment cover rounding, in pictures that of single
 precision.
@@ -141,7 +141,7 @@ def test_the_session_is_the_simulation(none):
     assert np.array_equal(frame.q, running.state[: frame.q.size])
 
 
-def test_frames_tell_the_forces_since_the_last_one(none):
+def test_frames_show_forces_since_the_previous_frame(none):
     running = session(none)
     running.frame(0.3)
     frame = running.frame(0.35)
@@ -310,7 +310,7 @@ def test_the_mouse_adds_a_spring_and_damper(none):
     firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
     expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, range(1), SCENARIO.T)
-    # both are one matrix exponential of the same matrix, whose entries reach 1e5
+    # `held` and `expected` are exponentials of the same matrix, whose entries reach 1e5
     assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
 
@@ -466,7 +466,7 @@ def test_the_drawn_springs_carry_the_forces(psi, K, B):
 
 
 def test_the_drawn_tip_feels_the_walls_force():
-    """A wall at 5 mm pushes by max(0, 3000 h + 2 dh/T) [N], h its depth and dh the change of h, one tick late."""
+    """A wall at 5 mm pushes by max(0, 3000 h + 2 dh/T) [N], one tick late; h is the penetration, dh its change."""
     scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
     h = np.maximum(q[:, 0] - 0.005, 0.0)
     force = np.maximum(3000 * h + 2 * np.diff(h, prepend=0.0) / scenario.T, 0.0) * (h > 0)
@@ -572,7 +572,7 @@ def test_the_window_loop_follows_an_injected_clock(none):
 
     _loop(running, stage, window, lambda: time[0], sleep)
     assert window.synced == len(window.said) == 40
-    assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)  # a tick
+    assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)
     assert running.pace.overruns == 0
     assert "coupling\ndelays\ngrowth" in window.said[-1][0][2]
     assert "push" in window.said[-1][0][2]
@@ -648,7 +648,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
     ]
     assert [round(e["exact_growth_rate_per_s"], 2) for e in told["events"]] == [1.48, 3.13, 0.69]
     assert [round(e["t_s"], 2) for e in told["events"]] == [0, 0.2, 0.3]
-    assert told["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)  # a tick
+    assert told["simulated_s"] == pytest.approx(0.5, abs=SCENARIO.T)
     assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 6, "fps": 10}
     assert "NOT certified" in capsys.readouterr().out
 
@@ -667,7 +667,7 @@ def test_flat_pictures_show_a_handles_displacement(none):
         ]  # between the words and the plots
         return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
 
-    # Edges are rounded to pixels, both ends of a motion by whole pixels alike.
+    # A motion by whole pixels rounds each edge of the handle alike at both ends.
     assert middle(60 * 0.42 / 520) - middle(0.0) == pytest.approx(60, abs=1e-9)
 
 
@@ -723,7 +723,7 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
 
 
 def test_case_none_takes_a_coupling_later(tmp_path):
-    """No coupling is designed for case none, so one that is chosen later is designed for case I."""
+    """No coupling is designed for case none, so a coupling that is chosen later is designed for case I."""
     where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
     words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--fps", "5")
     run(*words, "--video", where, "--json", str(told))
