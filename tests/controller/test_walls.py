@@ -187,7 +187,11 @@ def boxed(scenario):
 
 
 @pytest.mark.parametrize(
-    ("name", "humans", "seconds"), [("exact", 40, 3.0), pytest.param("mujoco", 6, 3.0, marks=pytest.mark.slow)]
+    ("name", "humans", "seconds"),
+    [
+        pytest.param("exact", 40, 3.0, marks=pytest.mark.slow),
+        pytest.param("mujoco", 6, 3.0, marks=pytest.mark.validate),
+    ],
 )
 def test_any_environment_hands_on_walls_slow_down(name, humans, seconds):
     """Behind a certified coupling all hands slow down from the first to the last quarter, despite many contacts."""

@@ -384,6 +384,7 @@ def test_a_search_of_other_ranges_is_repeated(monkeypatch):
     assert most == pytest.approx(1.5 * 700.0 * 1.2e-3 / 1.37, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_search_of_another_condition_is_repeated(monkeypatch):
     """Known-device judges these ranges, but the search that is passed in was for this-environment."""
     for name, few in FEW_TRIALS:

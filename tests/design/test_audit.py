@@ -474,7 +474,7 @@ def test_help_has_an_example(run):
     assert "python -m design.audit --K 2870,2320 --B 5.47,5.55" in out
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
     argv = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
     needless = {"cvxpy", "scipy.linalg", "scipy.sparse"}  # SciPy's imports take a tenth of an audit

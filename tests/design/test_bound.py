@@ -110,6 +110,7 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
     assert 0 < found.rms <= found.sampled_rms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "high"), [("n1-omega-II", 1e4), pytest.param("o12-free-mass-late", 100.0, marks=pytest.mark.validate)]
 )

@@ -283,6 +283,7 @@ def moving_average(theta, delta):
     return Lti(np.eye(theta, k=-1), first, taps, [[T / (2 * delta)]], T)
 
 
+@pytest.mark.slow
 def test_no_linear_coupling_exceeds_the_stiffness_limit():
     """A random stable V of one channel needs a damping of at least (theta+1) T / (2 V(1))."""
     rng = np.random.default_rng(4)

@@ -225,7 +225,9 @@ def test_no_hand_gains_energy_under_worst_timing(share, some):
     assert (growing(loop, COUPLING, share * need(loop, COUPLING), None, ticks=TICKS // 8) > 0) == some
 
 
-@pytest.mark.parametrize("names", [("walls", "limiter"), ("latency", "switching")], ids="-".join)
+@pytest.mark.parametrize(
+    "names", [pytest.param(("walls", "limiter"), marks=pytest.mark.slow), ("latency", "switching")], ids="-".join
+)
 def test_some_hands_gain_energy_far_below_the_requirement(names):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 0.5 * least_of(names), rho, ticks=TICKS // 8) > 0

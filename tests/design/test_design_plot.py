@@ -159,6 +159,7 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys, monkeypatch):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_delays_turn_the_phase_of_each_curve(tmp_path):
     """Without a coupling device i feels z^-n of the ideal E_ii for its delay of n samples; --no-plot draws nothing."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]

@@ -197,6 +197,7 @@ def test_commands_state_the_same_qualified_guarantee(name, scenario, tmp_path, m
         assert record["stored"]["switching"]["guarantee"] is None
 
 
+@pytest.mark.slow
 def test_traces_state_the_qualified_guarantee():
     scenario = load("omega-pair").replace(duration=0.05)
     lossy = scenario.replace(varying_delay=VaryingDelay(lo=(1, 2), hi=(2, 3), pattern="random", loss=0.2))

@@ -780,6 +780,7 @@ def test_known_device_designs_refuse_limiter_or_missing_bounds():
 # Maps, and the gap between necessary and proved damping.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["known-device", pytest.param("known-device-any", marks=pytest.mark.validate)])
 def test_a_map_agrees_with_single_sweeps(name):
     """Each ratio of a map is at least 0.98 times that of a single sweep; above 0.05 the two agree to 3 %."""

@@ -280,6 +280,7 @@ def test_any_environment_with_psi_covers_no_limiter():
 # Designs
 
 
+@pytest.mark.slow
 def test_limiter_designs_use_all_the_damping():
     """The limited loop needs over 99.9 % of the damping, and the design is over 1.3 dB better than BUILT."""
 

@@ -61,6 +61,7 @@ def test_moving_averages_beat_spring_dampers(name, case):
     assert certify(loop, stiff)["any-environment"].proof == "rational"
 
 
+@pytest.mark.slow
 def test_moving_averages_are_proved_with_psi():
     """With psi = (1, 0) the design is proved under any-environment, and its exact simulation is stable."""
     scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))

@@ -352,7 +352,9 @@ def test_scaled_walls_need_the_closed_form(theta):
     assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, whole) / 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("theta", [1, pytest.param(16, marks=pytest.mark.validate)])
+@pytest.mark.parametrize(
+    "theta", [pytest.param(1, marks=pytest.mark.slow), pytest.param(16, marks=pytest.mark.validate)]
+)
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     """F(1) T/2 is at most delta/(theta + 1).
 

@@ -215,6 +215,7 @@ class Anywhere(Plain):
         return "any passive environment"
 
 
+@pytest.mark.slow
 def test_own_conditions_state_environments_and_limits():
     stiff, own = SpringDamper([2000.0, 1500.0], [0.2, 0.2]), Anywhere()
     needs = requirements_of(PAIR, stiff, own=own)

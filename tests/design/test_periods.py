@@ -165,7 +165,8 @@ def grown(damping, mean, seed=7):
 
 
 @pytest.mark.parametrize(
-    "mean", [50, pytest.param(1000, marks=pytest.mark.validate), pytest.param(None, marks=pytest.mark.slow)]
+    "mean",
+    [pytest.param(50, marks=pytest.mark.slow), *(pytest.param(n, marks=pytest.mark.validate) for n in (1000, None))],
 )
 def test_hands_grow_only_below_the_longest_periods_requirement(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]

@@ -417,7 +417,7 @@ def test_audit_and_validate_report_the_ranges(stored, scenario_file, tmp_path, c
     assert validated["worst"]["environment"] in validated["environments"]["names"]
 
 
-@pytest.mark.slow
+@pytest.mark.validate
 def test_a_violated_vertex_exits_with_1(scenario_file, capsys):
     """These gains need 0.978 of the damping in the nominal environment, and 1.007 at the stiffest vertex."""
     stiff = ["--K", "2150", "--B", "1.0"]

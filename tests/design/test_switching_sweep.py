@@ -226,6 +226,7 @@ def test_audit_refuses_a_range_without_the_constant(tmp_path, varying_delay, mes
         main(["--K", "879,552", "--B", "0.39,0.52", "--varying-delay", varying_delay, "--out", str(tmp_path)])
 
 
+@pytest.mark.slow
 def test_the_multiplier_is_best_in_random_loops():
     """In stars of random springs with one to five channels the bound over all multipliers meets the requirement."""
     rng = np.random.default_rng(5)
