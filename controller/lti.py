@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -255,15 +255,9 @@ class Lti(ReadOnly):
         if _is_lower(A):
             return None
         C = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
-        try:
-            (poles, others), (V, U) = np.linalg.eig(np.stack([A, A.T]))
-            long, same = np.abs(poles) > _SHORT, np.abs(others) > _SHORT
-            if long.sum() != same.sum():
-                return None
-            poles, V, W = poles[long], V[:, long], U[:, same].T
-            W = np.linalg.solve(W @ V, W)
-        except np.linalg.LinAlgError:
+        if (modes := _long_modes(A)) is None:
             return None
+        poles, V, W = modes
         rest = np.eye(core.size) - (V @ W).real
         # Y holds N^j (I - P) B side by side, and `rows` holds C N^j (I - P) one below the other
         Y, rows, power = rest @ B, C @ rest, rest @ A
@@ -327,16 +321,7 @@ class Lti(ReadOnly):
         Schur form, and S keeps the zeros of A. The blocks of S are in reverse order.
         """
         core = self._lines[0]
-        A, n = self.A[core[:, None], core], core.size
-        last = np.maximum.accumulate(np.where((A != 0) | np.eye(n, dtype=bool), np.arange(n), 0).max(axis=1))
-        ends = 1 + np.flatnonzero(last == np.arange(n))
-        if ends.size == 1 < n:
-            return _schur_form(A)
-        U = np.zeros((n, n), dtype=np.complex128)
-        for first, end in pairwise([0, *ends.tolist()]):
-            own = A[first:end, first:end]
-            U[first:end, n - end : n - first] = 1 if end - first == 1 else _schur_form(own)[1]
-        return np.triu(U.conj().T @ A @ U), U
+        return _schur_blocks(self.A[core[:, None], core])
 
     def dc(self) -> Array:
         """Return G(1), shape (..., p, m). Raises SingularLoop if A has the eigenvalue one."""
@@ -365,7 +350,7 @@ class Lti(ReadOnly):
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]
-        eigenvalues = np.linalg.eigvals(self.A[core[:, None], core])
+        eigenvalues = _eigenvalues(self.A[core[:, None], core])
         return np.append(eigenvalues, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:
@@ -458,6 +443,53 @@ class Lti(ReadOnly):
         D = inverse(self.D)
         B, C = times(self.B, D), times(D, self.C)
         return Lti(self.A - times(B, self.C), B, -C, D, self.T)
+
+
+_Result = TypeVar("_Result")
+
+
+def _remembered(function: Callable[[Array], _Result]) -> Callable[[Array], _Result]:
+    """Remember the results of a function for the last two matrices (n, n), because many blocks share their A."""
+
+    @lru_cache(maxsize=2)
+    def of(entries: bytes, n: int) -> _Result:
+        return function(np.frombuffer(entries).reshape(n, n))
+
+    return lambda A: of(np.asarray(A, np.float64).tobytes(), len(A))
+
+
+@_remembered
+def _eigenvalues(A: Array) -> Complex:
+    return np.linalg.eigvals(A).astype(np.complex128)
+
+
+@_remembered
+def _long_modes(A: Array) -> tuple[Complex, Complex, Complex] | None:
+    """Return the poles of A with |z| > _SHORT, and their right and left eigenvectors V and W with W V = I, or None."""
+    try:
+        (poles, others), (V, U) = np.linalg.eig(np.stack([A, A.T]))
+        long, same = np.abs(poles) > _SHORT, np.abs(others) > _SHORT
+        if long.sum() != same.sum():
+            return None
+        poles, V, W = poles[long], V[:, long], U[:, same].T
+        return poles, V, np.linalg.solve(W @ V, W)
+    except np.linalg.LinAlgError:
+        return None
+
+
+@_remembered
+def _schur_blocks(A: Array) -> tuple[Complex, Complex]:
+    """Return S and U of `Lti._schur` for the core matrix A."""
+    n = len(A)
+    last = np.maximum.accumulate(np.where((A != 0) | np.eye(n, dtype=bool), np.arange(n), 0).max(axis=1))
+    ends = 1 + np.flatnonzero(last == np.arange(n))
+    if ends.size == 1 < n:
+        return _schur_form(A)
+    U = np.zeros((n, n), dtype=np.complex128)
+    for first, end in pairwise([0, *ends.tolist()]):
+        own = A[first:end, first:end]
+        U[first:end, n - end : n - first] = 1 if end - first == 1 else _schur_form(own)[1]
+    return np.triu(U.conj().T @ A @ U), U
 
 
 def _schur_form(A: Array) -> tuple[Complex, Complex]:

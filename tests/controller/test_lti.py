@@ -37,6 +37,15 @@ def test_response_is_the_definition(blocks):
     close(G.at(Z), expected)
 
 
+def test_blocks_with_equal_matrices_have_their_own_responses(blocks):
+    """Eigenvectors and Schur forms are remembered for the last matrices A."""
+    G, other = blocks
+    for H in (G, other, Lti(G.A, 2 * G.B, G.C[::-1], G.D, G.T), Lti(G.A.T, G.C.T, G.B.T, G.D.T, G.T)):
+        for z in (Z, 1.5 * Z):  # sums over poles, and substitution
+            close(H.at(z), [H.C @ np.linalg.solve(one * np.eye(H.order) - H.A, H.B) + H.D for one in z])
+        close(np.sort_complex(H.poles()), np.sort_complex(np.linalg.eigvals(H.A)))
+
+
 @pytest.mark.validate
 def test_response_agrees_with_python_control(blocks):
     import control  # the import takes a second, and every worker collects this file
