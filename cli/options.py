@@ -95,7 +95,7 @@ class Parser(argparse.ArgumentParser):
         return text.format_help()
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # argparse's parse_args calls this
-        """Parse. Raises InputError for unknown or excluded options, empty values, and an impossible --json file."""
+        """Parse options. Raises InputError for unknown or excluded ones, empty values, or an impossible --json file."""
         self._words = args[0] if args else None
         parsed, rest = super().parse_known_args(*args, **how)
         if rest:
@@ -391,8 +391,8 @@ def given(value: Any) -> bool:
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
     """Turn a ValueError or ArithmeticError into InputError, with `name` in front of its message.
 
-    Errors raised in a user's own class pass. If the message begins with the name of an argument in `args`, the option's
-    name replaces it.
+    DesignFailed and errors raised in a user's own class pass. If the message begins with the name of an argument in
+    `args`, the option's name replaces it.
     """
     try:
         yield

@@ -1,8 +1,8 @@
 """Discrete-time linear systems x+ = A x + B u, y = C x + D u, in any arithmetic, and their sampled responses.
 
-A stability condition is written once as an expression over blocks, and is evaluated in several ways. `Lti` holds
-floats, a stack of systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit circle. Both have
-the operators
+A stability condition is written once as an expression over blocks, and is evaluated in several ways. `Lti` holds one
+system or a stack of systems (leading axes) in floats, or one system in Fractions. `Sampled` holds G(z) at points of
+the unit circle. Both have the operators
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
     G.feedback(H)           (I + G H)^-1 G
@@ -55,7 +55,7 @@ def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
 
 
 def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError:
-    """Return the error of `frozen`, which is made only when needed, because formatting a matrix takes long."""
+    """Return the error for an unsuitable array. It is created only if needed, as formatting a matrix takes long."""
     expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
     return ValueError(f"{name} is {value!r}, expected {expected}{got}" if name else f"expected {expected}{got}")
 
@@ -241,7 +241,7 @@ class Lti(ReadOnly):
         within 2^_DOUBLINGS samples, so that its response is a finite sum.
 
         The error follows from the residual of (z I - A) X = B. The states
-        X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 leave the residual
+        X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1, with Y_j = N^j (I - P) B, leave the residual
         (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1. Its entries, and the
         response of the outputs to it, are bounded over the unit circle. The bound does not depend on the units of the
         states. It is compared with the response at a few points, because terms may cancel.
@@ -644,7 +644,7 @@ def hstack(*blocks: Any) -> Any:
 
 
 def _with_parts(block: Any, rest: Callable[[], tuple[Array, ...]]) -> Any:
-    """Remember how to compute G(1) and C (I - A)^-1 from the parts of an exact block."""
+    """Return the block; if it is exact, it remembers `rest`, which computes `_rest` from its parts."""
     if block.is_exact:
         object.__setattr__(block, "_parts", rest)
     return block

@@ -1,8 +1,8 @@
 """Conditions for devices with a known motor mass and a known lossy transmission (Theorem B).
 
 this-environment assumes a hand of any stiffness at the motor's shaft. The devices here have a transmission between
-motor and hand: a spring k and a damper b in parallel. No hand behind it is stiffer than the transmission, and the
-motor's mass keeps its speed continuous. The bounds are the motor's least mass m and least damping delta,
+motor and hand: a spring k and a damper b in parallel. The motor feels no hand as stiffer than the transmission, and
+its mass keeps its speed continuous. The known bounds are the motor's least mass m and least damping delta,
 P = k_max^2/b_min, and b_max. Let beta > 0 [s] be any number, and let the force f be held in each period. Then the
 motor, its transmission and every passive hand behind the transmission satisfy
 
@@ -90,7 +90,7 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
 
 
 def largest_beta(loop: Loop, share: float = 1.0) -> Array:
-    """Return the beta (m,) [s] at which c0 or c2 becomes 0, for devices with the damping `share` times Delta."""
+    """Return the least beta (m,) [s] at which c0 or c2 is 0, for devices with the damping `share` times Delta."""
     known = _known(loop, loop.T)
     return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
 
@@ -199,7 +199,7 @@ def _q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], 
 
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
-    """Return the first double, from the ball's midpoint to `towards`, whose decimal lies beyond the ball."""
+    """Return the first double from the ball's midpoint on, in the direction `towards`, that is `beyond` the ball."""
     import flint
 
     value = float(ball.mid())
@@ -281,9 +281,9 @@ def _exact_cost(
 # tangents at the binding frequencies form a linear matrix inequality, whose least s bounds the required s from below.
 
 _LARGEST_ETA = 0.9999  # largest tried ratio of beta to `largest_beta`, where c0 or c2 is 0
-_LEAST_ETA = 1e-5  # least tried ratio; there the requirement is about 0.1 % below that of the plain condition
+_LEAST_ETA = 1e-5  # least tried ratio; there the requirement is about 0.1 % below that for beta -> 0
 _BISECTIONS = 40  # bisections of an interval of shares, down to 1e-12 of its length
-_TOGETHER = 100  # A stack of this many matrices takes hardly longer than one, so a step tries several shares at once.
+_TOGETHER = 100  # A stack of this many matrices takes hardly longer than one, so a step tries up to 31 shares at once.
 _WORST, _IN_A_CUT = 6, 28  # worst frequencies that `_Search.least` bisects at once, and bisections there
 _VIOLATED = 3  # largest number of local minima at which `_Search.cut` adds tangents
 _DIFFERENCE = 1e-5  # relative step of the central differences of a tangent
@@ -303,7 +303,7 @@ class _Best(NamedTuple):
 
 
 class Sweep:
-    """The block of Theorem B in the environments of a loop, for sweeps over frequency.
+    """The block of Theorem B in the environments of `loop`, for sweeps over frequency.
 
     The block without L is independent of the share of the damping; L is added for each share.
 
@@ -327,6 +327,7 @@ class Sweep:
         self.P, self.highest = known.P, 4 * known.mass / known.damping  # `highest` is the beta [s] with c2 = 0
         self.usual = tuple(v for each in unknowns for v in (each.units if each.start is None else each.start))
         self.grids = [np.concatenate([[0.0], frequencies(self.idle(i, np.zeros(m)).free)]) for i in range(len(maps))]
+        # Index arrays (m,) of the inputs whose sum is dx.
         self.moves = [np.arange(m), 2 * m + np.arange(m)] if limited else [np.arange(m)]
 
     def idle(self, environment: int, beta: Any, values: Sequence[float] | None = None) -> Demand[Lti]:
@@ -455,7 +456,7 @@ class _Search:
         return block
 
     def concave(self, z: Complex, parts: Complex, x: Array, at: Array) -> Complex:
-        """Return the block (k, n, n) with L; rows of switching delays are scaled, by 1 at `at`, to make it concave."""
+        """Return the block (k, n, n) with L, where inputs of switching delays are scaled by x/at to make it concave."""
         cost = period_cost(self.sweep.loop, np.full(z.size, x[-1]), self.beta(x))
         block, ratio = _with_cost(self.idle(z, parts, x), z, cost, self.sweep.moves), np.ones(parts.shape[-1])
         for a in np.flatnonzero(self.inverse) + self.m:  # 1/alpha
@@ -480,7 +481,10 @@ class _Search:
         return root * constant, root * slopes
 
     def least(self, x: Array, most: float) -> tuple[float, tuple[int, int] | None]:
-        """Return the least share below `most` at x, or inf, and (environment, index of the frequency) or None."""
+        """Return the least share below `most` at x, or inf, and (environment, index of the binding frequency).
+
+        The second is None if the share is inf or `Sweep.floor`.
+        """
         beta, share, binding = self.beta(x), self.sweep.floor(self.beta(x)), None
         for e, (z, parts) in enumerate(self.sampled):
             idle = self.idle(z, parts, x)
@@ -553,7 +557,7 @@ class _Search:
             self.sampled[i] = np.append(z, more_z), np.concatenate([parts, more], axis=1)
 
     def cut(self, x: Array, binding: tuple[int, int] | None = None) -> None:
-        """Add tangents at x for the place `binding`, or for the frequencies of least room if it is None."""
+        """Add tangents at x for `binding`, (environment, index of a frequency), or if it is None for `lowest`."""
         places = [binding] if binding else self.lowest(x)
         for e, at in places:
             z, parts = self.sampled[e]
@@ -699,7 +703,7 @@ class KnownDevice(Condition):
         return Sweep(_straightened(one), maps, form, self.unknowns(loop), limited)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """Return the block at the loop's damping. For beta > 0 its gain is 0: L is not proportional to the damping."""
+        """Return the demand at the loop's damping; for beta > 0 `gain` is 0, as L is not proportional to damping."""
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m, straight = loop.channels, _straightened(loop)
@@ -782,7 +786,7 @@ class KnownDevice(Condition):
         return sweep.response(0, beta, tuple(values[3 * m :]), max(_MOST_SHARE, 2 * sweep.floor(beta)))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid.
+        """Return the required share of the damping (n,) for a stack of couplings, to 3 %, on a grid of frequencies.
 
         Shares from _LEAST_DRAWN to _MOST_DRAWN, or to the share of the plain condition if that is less, are tried, with
         beta = _DRAWN times the largest beta of each channel. Returns None for matrix levels, for a user's subclass, or
@@ -906,13 +910,13 @@ _DRAWN_POINTS = 240  # number of frequencies, half of them evenly and half logar
 
 
 def described(loop: Loop) -> str:
-    """Return the devices in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 N s/m'."""
+    """Return the devices in words: 'devices with at least 60 g behind transmissions of at most 9 N/m and 0.5 N s/m'."""
     words = []
     for device in dict.fromkeys(loop.known_devices or ()):
         mass, k = f"{1e3 * device.motor_mass_min:.4g} g", f"{device.transmission_stiffness_max:.6g} N/m"
         least, most = device.transmission_damping_min, device.transmission_damping_max
         losses = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
-        words.append(f"at least {mass} behind at most {k} and {losses} N s/m")
+        words.append(f"at least {mass} behind transmissions of at most {k} and {losses} N s/m")
     return f"devices with {' or '.join(words)}"
 
 

@@ -1,10 +1,10 @@
 """Validate a loop with many random passive humans, by two engines, in batches over processes.
 
-Set i of humans depends on the seed, the population and i alone. Batches do not depend on the number of processes, so
-the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes from the map of its RK4
-integrator over one period (its period map), which shares only the model with the exact engine. MuJoCo's traces use the
-exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4. The exact engine simulates
-all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`).
+The humans of set i depend on the scenario, the seed and the number of links, not on other sets. Batches do not depend
+on the number of processes, so the merged result equals that of a single process, bit for bit. MuJoCo's verdict comes
+from the map of its RK4 integrator over one period (its period map), which shares only the model with the exact engine.
+MuJoCo's traces use the exponential integrator, at a fifth of RK4's cost; under varying delays or ticks they use RK4.
+The exact engine simulates all humans; the other engine, MuJoCo or a user's own, all or a sample (`_witnessed`).
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from haptic_loop.sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
 _BATCH = 500  # largest number of sets of humans in a batch
-_NEAREST = 8  # number of humans nearest to the stability limit that are sampled in each group of a batch
-_AT_RANDOM = 64  # size of the random sample of all humans
+_NEAREST = 8  # number of sets nearest to the stability limit that are sampled in each group of a batch
+_AT_RANDOM = 64  # number of sets in the random sample of all sets
 
 
 # ---- random passive humans
@@ -134,12 +134,13 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """The results for every set of humans, sorted by index. Without engine or trace, figures are nan and counts 0.
+    """The results for every set of humans, sorted by index.
 
-    W(N) [J] is the work of the forces plus the least dissipation of the devices, up to tick N.
+    Figures are nan and counts 0 without the engine or the trace that they need. W(N) [J] is the work of the forces plus
+    the least dissipation of the devices, up to tick N.
 
     Attributes:
-        index: (n,) number of each set; index and seed determine the set.
+        index: (n,) number of each set; in one validation, it determines the set.
         radius: (n,) spectral radius of the exact loop, no unit.
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
         frequency: (n,) frequency of the exact loop's dominant mode [Hz].
@@ -195,7 +196,7 @@ class Findings:
 
     @property
     def trace_decides(self) -> NDArray[np.bool_]:
-        """(n,) whether the growth rate of the trace is larger than its error."""
+        """(n,) whether the size of the trace's growth rate is larger than its error."""
         return np.abs(self.trace) > self.trace_error
 
 
@@ -289,7 +290,7 @@ def _other_engine(
     crowd: Crowd | HumanSets,
     frozen: Collection[Lti],
 ) -> tuple[_Other | None, Array | None]:
-    """Return the engine that is compared with the exact one, and the growth rates of its period maps; or (None, None).
+    """Return what makes the other engine, and the growth rates of its period maps; (None, None) if there is no other.
 
     `frozen` has the force map for each set of touching walls. A user's own engine gives its map by one step from each
     basis state.
@@ -332,7 +333,7 @@ def _geometric_mean(values: Array) -> Array:
 def _witnessed(
     validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return the positions in a group of the humans that the other engine also simulates.
+    """Return the positions in a group of the sets that the other engine also simulates.
 
     These are all sets with a lossless hand, the _NEAREST whose `growth` [1/s] is nearest to zero, and the members of
     the random sample; with `all_traces`, all sets.
@@ -381,7 +382,7 @@ def _traced(
 
 
 def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine all batches in `shards` processes. After Ctrl-C or an error, return the findings of finished batches."""
+    """Examine all batches in `shards` processes; after Ctrl-C, a worker's death or lack of memory, return a part."""
     parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:

@@ -65,7 +65,7 @@ _AHEAD = 8  # number of blocks for which external forces are sampled together
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Engine, integrator and steps of a run; None means the default for the plant."""
+    """Engine, integrator and steps of a run; a None of `integrator` or `substeps` means the default for the plant."""
 
     engine: AnyEngine = "mujoco"
     integrator: str | None = None  # name in sim.engines.INTEGRATORS
@@ -75,7 +75,7 @@ class EngineSettings:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A scenario with its coupling, ready to run: the computer's process of a tick, and the plant."""
+    """The computer's process and the plant of a scenario with its coupling, ready to run."""
 
     scenario: Scenario
     coupling: Coupling
@@ -175,7 +175,7 @@ def run(
     Args:
         simulation: The loop.
         engine: An engine, a class or function that makes one, or a name; a named engine takes its default step.
-        outside: External forces on the hands; default: those of the scenario.
+        outside: External forces on hands and handles; default: `outside_forces`.
         ticks: Number of ticks; default: the scenario's.
         start: Initial plant state (states, 1); default: rest.
         progress: Called with (ticks done, number of ticks).
@@ -247,7 +247,7 @@ def _columns(rows: Array, which: tuple[int, ...]) -> Array:
 def _room(width: int, ticks: int, T: float) -> Array:
     """Return an array (ticks, width) in memory, or in a temporary file if the memory is too small.
 
-    Raises InputError if the report of such a trace does not fit into memory, or if the trace does not fit on the disk.
+    Raises InputError if the report of such a trace does not fit into memory, or if twice the trace exceeds the disk.
     """
     shape, each = (ticks, width), 8 * width
     free = _free_memory() if each * ticks > _SMALL else np.inf
@@ -330,8 +330,8 @@ def outside_forces(
 ) -> Array:
     """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, external inputs).
 
-    The voluntary force acts on the end of each human, the tap on one handle. Raises InputError for a voluntary force
-    of wrong shape, or one that is not finite.
+    The voluntary force, left out if `voluntary` is False, acts on the end of each human, the tap on one handle. Raises
+    InputError for a voluntary force of wrong shape, or one that is not finite.
     """
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))

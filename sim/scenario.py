@@ -36,7 +36,7 @@ from haptic_loop.design.own import called, named, place_of
 from haptic_loop.models.device import AXES, MOST_DAMPING, Device, Mechanics, fields_of, require, symmetric
 from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
-CASES = ("none", "I", "II")
+CASES = ("none", "I", "II")  # no coupling, or the paper's case of the reference delays
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
@@ -132,13 +132,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             has = len(device.free)
             for field, value in human.vectors() if isinstance(human, Human) else ():
                 if len(value) != has:
-                    expected = f"expected {has} entries, as the device has free axes"
+                    expected = f"expected {has} entries, one for each free axis of the device"
                     raise ValueError(f"human #{i}.{field} is {list(value)}, {expected}")
         for i, person in enumerate(self.person, start=1):
             free = [self.device[k - 1].axis_names for k in person.holds]
             if len(set(free)) > 1:
                 shown = "; ".join(", ".join(name[1:] for name in names) for names in free)
-                expected = f"expected devices with the same free axes; theirs are {shown}"
+                expected = f"expected devices with the same free axes; the free axes are {shown}"
                 raise ValueError(f"person #{i}.holds is {list(person.holds)}, {expected}")
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
@@ -306,7 +306,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def shortest_period(self) -> float | None:
-        """The shortest period that certificates must cover: T_min, or the shortest simulated one; None if unknown."""
+        """The shortest period that certificates must cover: T_min, or the shortest simulated one; None without both."""
         if self.T_min is not None or self.period is None:
             return self.T_min
         return min(self.period.shortest, self.T)
@@ -768,7 +768,7 @@ _DEFAULT_DIRECTION = [1.0, 0.0, 0.0]  # x
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Add the path and the digest of a world's MJCF file, and directions. Raises ValueError for an impossible world."""
+    """Add path and digest of a world's MJCF file, and directions of contacts. Raises ValueError for a wrong world."""
     table = raw.get("environment")
     if not isinstance(table, dict) or "world" not in table:
         _require_no_along(table)

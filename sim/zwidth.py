@@ -49,7 +49,7 @@ MODEL_KEPT = "model kept"  # the second case of `EnvironmentSweep`, listed besid
 
 @dataclass(frozen=True, eq=False)
 class _Sweep(ABC):
-    """A sweep over K and B for these devices, delays and environment; arguments K and B are arrays (n,) of n cells."""
+    """A sweep over K and B for these devices, delays and environment; arrays K and B (n,) hold the gains of n cells."""
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
@@ -169,11 +169,11 @@ class CouplingSweep(_Sweep):
 class EnvironmentSweep(_Sweep):
     """A sweep over K and B of every spring at a contact, for a fixed coupling.
 
-    An optimal coupling is a fixed filter R, and its model is that of the cell's environment E: F = Theta R Psi E. A
+    An optimal coupling is a fixed filter R with a model of the cell's environment E: F = Theta R Psi E. A
     coupling of kind internal-model is a fixed Q and a model of the environment, with two cases:
 
-        this-environment   the model is that of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
-        model kept         the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
+        this-environment   the model is the cell's E: F = Theta (Psi E - Psi E Q Psi E), as with ranges
+        model kept         the model is the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
     Raises ValueError if the network has walls or a block, or no spring at a contact.
     """
@@ -366,7 +366,7 @@ class Map:
     ratio: dict[str, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the tried humans (`_population`)
     unstable: Array  # number of tried humans that make the cell unstable
-    points: limit_cycles.Points
+    points: limit_cycles.Points  # results of MuJoCo in a few cells
     seconds: dict[str, float]  # wall time of each stage
     interrupted: bool
 
